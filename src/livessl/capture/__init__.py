@@ -1,0 +1,1 @@
+"""Capture nodes: audio devices become frames on the wire."""

@@ -1,0 +1,605 @@
+"""The site file: what is where, checked whole before anything starts. It opens no device and no socket."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
+from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
+
+DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
+COINCIDENT_M: Final = 1e-3
+"""Two microphones nearer than this are a slip of the pen: no capsule is that small."""
+
+MAP_BYTES_PER_PAIR_AND_NODE: Final = 8
+"""A sparse-matrix entry: float32 weight and int32 column."""
+
+MAP_BYTES_PER_NODE: Final = 64
+"""Coordinates, delays while they are worked out, and the maps themselves."""
+
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+Interval = tuple[Coordinate, Coordinate]
+Bounds = tuple[Interval, Interval, Interval]
+BandHz = tuple[Annotated[float, Field(ge=0)], Positive]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing wrong: where it stands, and what, expected, got and cure in one sentence."""
+
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}"
+
+
+class ConfigError(Exception):
+    """Everything that is wrong with what the user gave, at once."""
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        super().__init__("\n".join(str(fault) for fault in faults))
+        self.faults = tuple(faults)
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Room(_Model):
+    """The room: a box from the origin."""
+
+    size_m: tuple[Positive, Positive, Positive]
+
+
+class GridConfig(_Model):
+    """The search grid."""
+
+    spacing_m: Positive = 0.1
+    bounds_m: Bounds | None = None
+    max_memory_mb: Positive = 1024.0
+
+    @field_validator("bounds_m")
+    @classmethod
+    def _ordered(cls, bounds: Bounds | None) -> Bounds | None:
+        for axis, (low, high) in zip("xyz", bounds or (), strict=False):
+            if low > high:
+                raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
+        return bounds
+
+
+class Tetrahedron(_Model):
+    """A regular tetrahedron: channel 1 the apex, 2 to 4 the base counter-clockwise, 2 towards +x."""
+
+    edge_m: Positive
+
+
+class Circle(_Model):
+    """A horizontal circle: channel 1 towards +x, counter-clockwise unless told otherwise."""
+
+    radius_m: Positive
+    count: Annotated[int, Field(ge=MIN_MICROPHONES, le=MAX_MICROPHONES)]
+    clockwise: bool = False
+
+
+class Line(_Model):
+    """A straight line along x, channel 1 at the smallest x."""
+
+    spacing_m: Positive
+    count: Annotated[int, Field(ge=MIN_MICROPHONES, le=MAX_MICROPHONES)]
+
+
+class Shape(_Model):
+    """Exactly one shape."""
+
+    tetrahedron: Tetrahedron | None = None
+    circle: Circle | None = None
+    line: Line | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Shape:
+        given = [name for name in ("tetrahedron", "circle", "line") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected exactly one of tetrahedron, circle, line; got {', '.join(given) or 'none'}")
+        return self
+
+    def microphones_m(self) -> FloatArray:
+        """Positions (K, 3) around the shape's own origin, metres."""
+        if self.tetrahedron is not None:
+            return tetrahedron(self.tetrahedron.edge_m)
+        if self.circle is not None:
+            return circle(self.circle.radius_m, self.circle.count, self.circle.clockwise)
+        assert self.line is not None
+        return line(self.line.spacing_m, self.line.count)
+
+
+class GeometryFile(_Model):
+    """A file under `calibration/`: measured positions around the array's own origin."""
+
+    microphones_m: Annotated[list[Position], Field(min_length=MIN_MICROPHONES, max_length=MAX_MICROPHONES)]
+    description: str = ""
+
+
+class Orientation(_Model):
+    """Roll about x, then pitch about y, then yaw about z."""
+
+    yaw: Coordinate = 0.0
+    pitch: Coordinate = 0.0
+    roll: Coordinate = 0.0
+
+
+class ArrayConfig(_Model):
+    """One microphone array: absolute positions, or a shape (or geometry file) and a pose."""
+
+    microphones_m: Annotated[list[Position], Field(min_length=MIN_MICROPHONES, max_length=MAX_MICROPHONES)] | None = (
+        None
+    )
+    geometry: Shape | str | None = None
+    position_m: Position | None = None
+    orientation_deg: Orientation | None = None
+    band_hz: BandHz | None = None
+    wav_offset_s: Coordinate = 0.0
+
+    @field_validator("geometry", mode="before")
+    @classmethod
+    def _shape_or_file(cls, geometry: Any) -> Any:
+        return Shape.model_validate(geometry) if isinstance(geometry, dict) else geometry
+
+    @model_validator(mode="after")
+    def _one_form(self) -> ArrayConfig:
+        if (self.microphones_m is None) == (self.geometry is None):
+            raise ValueError(
+                "expected either microphones_m (absolute positions) or geometry with position_m, "
+                f"got {'neither' if self.geometry is None else 'both'}"
+            )
+        if self.geometry is not None and self.position_m is None:
+            raise ValueError("geometry needs position_m: where the array's origin is in the room")
+        if self.microphones_m is not None and (self.position_m or self.orientation_deg):
+            raise ValueError("microphones_m are absolute; take position_m and orientation_deg away, or use geometry")
+        return self
+
+
+class SoundDeviceConfig(_Model):
+    """An audio interface, by name."""
+
+    type: Literal["sound"] = "sound"
+    name: str
+    sample_rate_hz: Positive = 48000.0
+    block_s: Annotated[float, Field(gt=0, le=1)] = 0.02
+
+
+class WavDeviceConfig(_Model):
+    """The fake device: recorded files at real speed."""
+
+    type: Literal["wav"]
+    files: dict[str, str]
+    sample_rate_hz: Positive | None = None
+    loop: bool = False
+
+
+class SceneDeviceConfig(_Model):
+    """A simulated scene at real speed."""
+
+    type: Literal["scene"]
+    rt60_s: Annotated[float, Field(ge=0)] = 0.7
+    events: Annotated[int, Field(ge=1)] = 8
+    seed: int = 0
+    sample_rate_hz: Positive = 44100.0
+    loop: bool = True
+
+
+DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
+
+
+class NodeConfig(_Model):
+    """A capture node: one device, one or more arrays on its channels (counted from 1)."""
+
+    server: str = "tcp://127.0.0.1:5570"
+    device: DeviceConfig
+    arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sound_by_default(cls, data: Any) -> Any:
+        device = data.get("device") if isinstance(data, dict) else None
+        if isinstance(device, dict) and "type" not in device:
+            return {**data, "device": {"type": "sound", **device}}
+        return data
+
+    @field_validator("device", mode="before")
+    @classmethod
+    def _of_its_type(cls, device: Any) -> Any:
+        if not isinstance(device, dict):
+            return device
+        kinds: dict[str, type[_Model]] = {
+            "sound": SoundDeviceConfig,
+            "wav": WavDeviceConfig,
+            "scene": SceneDeviceConfig,
+        }
+        kind = kinds.get(device.get("type", ""))
+        if kind is None:
+            raise ValueError(f"type: expected one of {', '.join(kinds)}, got {device.get('type')!r}")
+        return kind.model_validate(device)
+
+    @field_validator("server")
+    @classmethod
+    def _endpoint(cls, endpoint: str) -> str:
+        return check_endpoint(endpoint)
+
+
+class HttpConfig(_Model):
+    """Where the API and the dashboard listen."""
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+
+
+class ServerConfig(_Model):
+    """The fusion server."""
+
+    bind: str = "tcp://127.0.0.1:5570"
+    http: HttpConfig = HttpConfig()
+    events_db: str | None = None
+
+    @field_validator("bind")
+    @classmethod
+    def _endpoint(cls, endpoint: str) -> str:
+        return check_endpoint(endpoint)
+
+
+class ActivityConfig(_Model):
+    """The rule that finds sound: see `livessl.core.activity`."""
+
+    threshold: Annotated[float, Field(gt=0, le=1)] = 0.1
+    release_s: Positive = 1.0
+    floor_window_s: Positive = 3.0
+    floor_factor: Annotated[float, Field(ge=1)] = 4.0
+    min_level_dbfs: Coordinate = -90.0
+    pre_roll_s: Annotated[float, Field(ge=0, le=5)] = 0.4
+    hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = 0.3
+
+
+class FusionConfig(_Model):
+    """How arrays are joined."""
+
+    method: str = "srp-phat"
+    deadline_s: Annotated[float, Field(gt=0, le=10)] = 0.5
+    window_s: Annotated[float, Field(ge=0.05, le=2)] = 0.2
+    update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1
+    max_event_s: Annotated[float, Field(ge=0.5, le=60)] = 10.0
+    min_arrays: Annotated[int, Field(ge=1)] = 1
+
+
+class Zone(_Model):
+    """A named box of interest."""
+
+    bounds_m: Bounds
+
+    def contains(self, position_m: Sequence[float]) -> bool:
+        """Whether a position lies in it."""
+        return all(low <= x <= high for x, (low, high) in zip(position_m, self.bounds_m, strict=True))
+
+
+class Site(_Model):
+    """A whole site file."""
+
+    site: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]
+    room: Room
+    speed_of_sound_m_s: Annotated[float, Field(gt=100, lt=2000)] | None = None
+    temperature_c: Annotated[float, Field(gt=-60, lt=80)] | None = None
+    band_hz: BandHz = (100.0, 6000.0)
+    grid: GridConfig = GridConfig()
+    arrays: Annotated[dict[str, ArrayConfig], Field(min_length=1)]
+    nodes: dict[str, NodeConfig] = {}
+    server: ServerConfig = ServerConfig()
+    activity: ActivityConfig = ActivityConfig()
+    fusion: FusionConfig = FusionConfig()
+    zones: dict[str, Zone] = {}
+    specs: Annotated[tuple[ArraySpec, ...], Field(exclude=True, default=())]
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    @property
+    def c_m_s(self) -> float:
+        """Speed of sound, m/s: as given, from the temperature, or 343."""
+        if self.speed_of_sound_m_s is not None:
+            return self.speed_of_sound_m_s
+        if self.temperature_c is not None:
+            return speed_of_sound_m_s(self.temperature_c)
+        return DEFAULT_SPEED_OF_SOUND_M_S
+
+    def search_grid(self) -> Grid:
+        """The shared grid: the bounds given, or the whole room."""
+        x, y, z = self.room.size_m
+        return Grid(self.grid.bounds_m or ((0.0, x), (0.0, y), (0.0, z)), self.grid.spacing_m)
+
+    def array(self, name: str) -> ArraySpec:
+        """The array of that name, with absolute positions."""
+        return next(spec for spec in self.specs if spec.name == name)
+
+    def zones_of(self, position_m: Sequence[float] | None) -> list[str]:
+        """Names of the zones that hold a position."""
+        return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
+
+
+def check_endpoint(endpoint: str) -> str:
+    """Return `endpoint` if it is a ZeroMQ TCP or IPC address.
+
+    Raises
+    ------
+    ValueError
+        With what was expected.
+    """
+    scheme, _, rest = endpoint.partition("://")
+    host, _, port = rest.rpartition(":")
+    tcp = scheme == "tcp" and host != "" and (port == "*" or (port.isdigit() and int(port) <= 65535))
+    if not (tcp or (scheme == "ipc" and rest)):
+        raise ValueError(f"expected tcp://HOST:PORT or ipc://PATH, got {endpoint!r}")
+    return endpoint
+
+
+def load_site(path: Path) -> Site:
+    """Read and check a site file.
+
+    Raises
+    ------
+    ConfigError
+        With every fault found, each with its line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError([Fault(str(path), f"cannot be read: {_reason(error)}")]) from error
+    return parse_site(text, str(path), path.parent)
+
+
+def parse_site(text: str, source: str = "site file", directory: Path | None = None) -> Site:
+    """Check the text of a site file; geometry files are looked up from `directory`.
+
+    Raises
+    ------
+    ConfigError
+        With every fault found, each with its line.
+    """
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{source}:{mark.line + 1}" if mark else source
+        raise ConfigError([Fault(where, f"not valid YAML: {getattr(error, 'problem', error)}")]) from error
+    lines = dict(_lines(root))
+    at = _Places(source, lines)
+    if not isinstance(data, dict):
+        raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
+    if "specs" in data:
+        raise ConfigError([at.fault(("specs",), "unknown key; take it away")])
+    faults = [at.fault(path, what) for path, what in _duplicate_keys(root)]
+    try:
+        site = Site.model_validate(data)
+    except ValidationError as error:
+        faults += [at.fault(_path(item["loc"]), _sentence(item)) for item in error.errors()]
+        raise ConfigError(faults) from error
+    specs, wrong = _array_specs(site, directory or Path())
+    site = site.model_copy(update={"specs": specs})
+    faults += [at.fault(path, what) for path, what in [*wrong, *_cross_faults(site)]]
+    if faults:
+        raise ConfigError(faults)
+    return site
+
+
+_Place = tuple[str | int, ...]
+_Finding = tuple[_Place, str]
+
+
+class _Places:
+    """Turns a path inside the file into "file:line: path"."""
+
+    def __init__(self, source: str, lines: Mapping[_Place, int]) -> None:
+        self._source = source
+        self._lines = lines
+
+    def fault(self, path: _Place, what: str) -> Fault:
+        known = path
+        while known and known not in self._lines:
+            known = known[:-1]
+        line = self._lines.get(known)
+        where = self._source if line is None else f"{self._source}:{line}"
+        dotted = ".".join(str(part) for part in path)
+        return Fault(f"{where}: {dotted}" if dotted else where, what)
+
+
+def _lines(node: yaml.Node | None, path: _Place = ()) -> Iterator[tuple[_Place, int]]:
+    if node is None:
+        return
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            here = (*path, key.value)
+            yield here, key.start_mark.line + 1
+            yield from _lines(value, here)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            yield (*path, index), value.start_mark.line + 1
+            yield from _lines(value, (*path, index))
+
+
+def _duplicate_keys(node: yaml.Node | None, path: _Place = ()) -> Iterator[_Finding]:
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            here = (*path, key.value)
+            if key.value in seen:
+                yield here, "stands here twice and only the last would count; take one away"
+            seen.add(key.value)
+            yield from _duplicate_keys(value, here)
+
+
+_UNION_PARTS: Final = frozenset({"Shape", "str", "SoundDeviceConfig", "WavDeviceConfig", "SceneDeviceConfig"})
+
+
+def _path(location: tuple[str | int, ...]) -> _Place:
+    """A pydantic location without the names of union members, which the user never wrote."""
+    return tuple(part for part in location if part not in _UNION_PARTS)
+
+
+def _sentence(item: Any) -> str:
+    kind, got = item["type"], item.get("input")
+    if kind == "extra_forbidden":
+        return "unknown key; correct its spelling or take it away"
+    if kind == "missing":
+        return "missing; add it"
+    message = str(item["msg"]).removeprefix("Value error, ")
+    simple = isinstance(got, str | int | float | bool) or got is None
+    return f"{message}, got {got!r}" if simple and "got" not in message else message
+
+
+def _array_specs(site: Site, directory: Path) -> tuple[tuple[ArraySpec, ...], list[_Finding]]:
+    specs: list[ArraySpec] = []
+    wrong: list[_Finding] = []
+    for name, array in site.arrays.items():
+        try:
+            positions = _microphones_m(array, directory)
+        except ConfigError as error:
+            wrong.append((("arrays", name, "geometry"), "; ".join(str(fault) for fault in error.faults)))
+            continue
+        if array.band_hz is not None and array.band_hz[0] >= array.band_hz[1]:
+            wrong.append(
+                (
+                    ("arrays", name, "band_hz"),
+                    f"expected [low, high] with low < high, got {list(array.band_hz)}",
+                )
+            )
+            continue
+        if site.band_hz[0] < site.band_hz[1]:
+            specs.append(ArraySpec(name, positions, array.band_hz or site.band_hz))
+    return tuple(specs), wrong
+
+
+def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
+    if array.microphones_m is not None:
+        return as_positions_m(array.microphones_m)
+    if isinstance(array.geometry, str):
+        shape = as_positions_m(_geometry_file(directory / array.geometry).microphones_m)
+    else:
+        assert array.geometry is not None
+        shape = array.geometry.microphones_m()
+    turn = array.orientation_deg or Orientation()
+    assert array.position_m is not None
+    return posed(shape, array.position_m, turn.yaw, turn.pitch, turn.roll)
+
+
+def _geometry_file(path: Path) -> GeometryFile:
+    try:
+        return GeometryFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError([Fault(str(path), f"geometry file cannot be read: {_reason(error)}")]) from error
+    except ValidationError as error:
+        raise ConfigError(
+            [
+                Fault(f"{path}: {'.'.join(str(part) for part in item['loc'])}", _sentence(item))
+                for item in error.errors()
+            ]
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
+
+
+def _cross_faults(site: Site) -> Iterator[_Finding]:
+    """Faults that only show when parts of the file are held side by side."""
+    if site.speed_of_sound_m_s is not None and site.temperature_c is not None:
+        yield (
+            ("temperature_c",),
+            "expected either speed_of_sound_m_s or temperature_c, got both; take one away",
+        )
+    if site.band_hz[0] >= site.band_hz[1]:
+        yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
+    if site.fusion.min_arrays > len(site.arrays):
+        yield (
+            ("fusion", "min_arrays"),
+            f"expected at most the number of arrays, {len(site.arrays)}, got {site.fusion.min_arrays}",
+        )
+    for spec in site.specs:
+        yield from _array_faults(site, spec)
+    yield from _grid_faults(site)
+    yield from _node_faults(site)
+
+
+def _array_faults(site: Site, spec: ArraySpec) -> Iterator[_Finding]:
+    positions = spec.microphones_m
+    for i in range(len(positions)):
+        for k in range(i + 1, len(positions)):
+            if np.linalg.norm(positions[i] - positions[k]) < COINCIDENT_M:
+                yield (
+                    ("arrays", spec.name),
+                    f"microphones {i + 1} and {k + 1} are at one place {_xyz(positions[i])}; correct one of them",
+                )
+    size = np.array(site.room.size_m)
+    outside = [k for k, position in enumerate(positions) if (position < 0).any() or (position > size).any()]
+    if outside:
+        k = outside[0]
+        yield (
+            ("arrays", spec.name),
+            f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; "
+            "correct the array's position or room.size_m",
+        )
+
+
+def _grid_faults(site: Site) -> Iterator[_Finding]:
+    grid = site.search_grid()
+    pairs = sum(len(spec.microphones_m) * (len(spec.microphones_m) - 1) // 2 for spec in site.specs)
+    need_mb = grid.size * (pairs * MAP_BYTES_PER_PAIR_AND_NODE + MAP_BYTES_PER_NODE) / 1e6
+    if need_mb > site.grid.max_memory_mb:
+        fits = site.grid.spacing_m * (need_mb / site.grid.max_memory_mb) ** (1 / max(1, len(grid.free_axes)))
+        yield (
+            ("grid", "spacing_m"),
+            f"a grid of {grid.size:,} nodes and {pairs} pairs needs {need_mb:,.0f} MB, allowed are "
+            f"{site.grid.max_memory_mb:,.0f} MB; use a spacing of {np.ceil(fits * 1000) / 1000:g} m or more, "
+            "smaller bounds_m, or raise grid.max_memory_mb",
+        )
+
+
+def _node_faults(site: Site) -> Iterator[_Finding]:
+    claimed: dict[str, str] = {}
+    for node_name, node in site.nodes.items():
+        used: dict[int, str] = {}
+        for name, channels in node.arrays.items():
+            here: _Place = ("nodes", node_name, "arrays", name)
+            if name not in site.arrays:
+                yield here, f"no such array; arrays are {', '.join(site.arrays)}"
+                continue
+            if name in claimed:
+                yield here, f"already captured by node {claimed[name]!r}; an array belongs to one node"
+            claimed[name] = node_name
+            spec = next((spec for spec in site.specs if spec.name == name), None)
+            if spec is not None and len(channels) != len(spec.microphones_m):
+                yield (
+                    here,
+                    f"expected {len(spec.microphones_m)} channels, one for each microphone of {name!r}, "
+                    f"got {len(channels)}",
+                )
+            for channel in channels:
+                if channel in used:
+                    yield here, f"channel {channel} is already used by {used[channel]!r}"
+                used[channel] = name
+            rate = node.device.sample_rate_hz
+            if spec is not None and rate is not None and spec.band_hz[1] >= rate / 2:
+                yield (
+                    here,
+                    f"band_hz up to {spec.band_hz[1]:g} Hz needs a sample rate above {2 * spec.band_hz[1]:g} Hz, "
+                    f"the device has {rate:g} Hz; lower band_hz or raise sample_rate_hz",
+                )
+
+
+def _xyz(position: Sequence[float] | FloatArray) -> str:
+    return "(" + ", ".join(f"{x:g}" for x in np.round(np.asarray(position, dtype=float), 4)) + ")"

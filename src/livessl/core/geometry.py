@@ -1,0 +1,186 @@
+"""Array shapes, poses, directions and the search grid: metres, right-handed, z up, room corner at the origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from livessl.core.types import FloatArray
+
+SPEED_OF_SOUND_0C_M_S: Final = 331.3
+
+
+def speed_of_sound_m_s(temperature_c: float) -> float:
+    """Speed of sound in dry air, m/s, at a temperature in degrees Celsius: 331.3 sqrt(1 + T/273.15)."""
+    return SPEED_OF_SOUND_0C_M_S * float(np.sqrt(1.0 + temperature_c / 273.15))
+
+
+def as_positions_m(positions: ArrayLike) -> FloatArray:
+    """Turn anything like (n, 3) metres into a float64 array of that shape.
+
+    Raises
+    ------
+    ValueError
+        Where the shape is another or a coordinate is not finite.
+    """
+    array = np.array(positions, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"positions: expected shape (n, 3), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError("positions: expected finite coordinates in metres, got NaN or infinity")
+    return array
+
+
+def tetrahedron(edge_m: float) -> FloatArray:
+    """Regular tetrahedron of four microphones around the origin, base down.
+
+    Channel 1 is the apex (+z); channels 2 to 4 are the base, counter-clockwise seen from above, channel 2 towards +x.
+
+    Returns
+    -------
+    (4, 3) float64
+        Metres.
+    """
+    circumradius = edge_m / np.sqrt(3.0)  # of the base triangle
+    height = edge_m * np.sqrt(2.0 / 3.0)
+    azimuth = np.array([0.0, 2.0, 4.0]) * np.pi / 3.0
+    base = np.column_stack([circumradius * np.cos(azimuth), circumradius * np.sin(azimuth), np.full(3, -height / 4.0)])
+    return np.vstack([[0.0, 0.0, 0.75 * height], base])
+
+
+def circle(radius_m: float, count: int, clockwise: bool = False) -> FloatArray:
+    """Horizontal circle of `count` microphones around the origin, channel 1 towards +x, counter-clockwise.
+
+    Returns
+    -------
+    (count, 3) float64
+        Metres.
+    """
+    azimuth = 2.0 * np.pi * np.arange(count) / count * (-1.0 if clockwise else 1.0)
+    return np.column_stack([radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), np.zeros(count)])
+
+
+def line(spacing_m: float, count: int) -> FloatArray:
+    """Line of `count` microphones along x around the origin, channel 1 at the smallest x.
+
+    Returns
+    -------
+    (count, 3) float64
+        Metres.
+    """
+    x = (np.arange(count) - (count - 1) / 2.0) * spacing_m
+    return np.column_stack([x, np.zeros(count), np.zeros(count)])
+
+
+def posed(
+    shape_m: FloatArray,
+    position_m: ArrayLike,
+    yaw_deg: float = 0.0,
+    pitch_deg: float = 0.0,
+    roll_deg: float = 0.0,
+) -> FloatArray:
+    """Turn and move a shape: roll about x, then pitch about y, then yaw about z (right-hand rule), then shift.
+
+    Parameters
+    ----------
+    shape_m : (K, 3) float64
+        Relative to the array's own origin.
+    position_m : (3,)
+        Where that origin goes.
+    yaw_deg, pitch_deg, roll_deg : float
+        Degrees. Yaw is counter-clockwise seen from above; a positive pitch lowers the +x end.
+    """
+    rotation = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True)
+    return np.asarray(rotation.apply(shape_m) + np.asarray(position_m, dtype=np.float64))
+
+
+def direction_deg(origin_m: FloatArray, target_m: FloatArray) -> tuple[float, float, float]:
+    """Azimuth (counter-clockwise from +x) and elevation in degrees, and distance in metres, of target from origin."""
+    x, y, z = np.asarray(target_m, dtype=np.float64) - origin_m
+    horizontal = float(np.hypot(x, y))
+    return (
+        float(np.degrees(np.arctan2(y, x))),
+        float(np.degrees(np.arctan2(z, horizontal))),
+        float(np.hypot(horizontal, z)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Nodes at the centres of the cells that fill a box.
+
+    The cells are as near to `spacing_m` as fills the box evenly, so no part of it lies more than half a cell from a
+    node. An axis whose bounds are equal has one node: the search is then in a plane.
+
+    Parameters
+    ----------
+    bounds_m : ((x0, x1), (y0, y1), (z0, z1))
+        The search volume, metres.
+    spacing_m : float
+        Wanted distance between neighbouring nodes, metres.
+
+    Raises
+    ------
+    ValueError
+        Where a lower bound lies above its upper one, or the spacing is not positive.
+    """
+
+    bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    spacing_m: float
+
+    def __post_init__(self) -> None:
+        if not self.spacing_m > 0:
+            raise ValueError(f"grid: expected spacing_m > 0, got {self.spacing_m}")
+        for axis, (low, high) in zip("xyz", self.bounds_m, strict=True):
+            if not low <= high:
+                raise ValueError(f"grid: expected lower <= upper bound on {axis}, got [{low}, {high}]")
+
+    @property
+    def lower_m(self) -> FloatArray:
+        """Lower corner (3,), metres."""
+        return np.array([low for low, _ in self.bounds_m], dtype=np.float64)
+
+    @property
+    def upper_m(self) -> FloatArray:
+        """Upper corner (3,), metres."""
+        return np.array([high for _, high in self.bounds_m], dtype=np.float64)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of nodes along x, y and z."""
+        x, y, z = (max(1, round(float(extent) / self.spacing_m)) for extent in self.upper_m - self.lower_m)
+        return x, y, z
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        x, y, z = self.shape
+        return x * y * z
+
+    @property
+    def cell_m(self) -> FloatArray:
+        """Edges of a cell (3,), metres; 0 on a fixed axis."""
+        return np.asarray((self.upper_m - self.lower_m) / np.array(self.shape))
+
+    @property
+    def free_axes(self) -> tuple[int, ...]:
+        """Axes along which there is anything to search."""
+        return tuple(axis for axis, (low, high) in enumerate(self.bounds_m) if high > low)
+
+    def axis_m(self, axis: int) -> FloatArray:
+        """Node coordinates along one axis, metres."""
+        return np.asarray(self.lower_m[axis] + (np.arange(self.shape[axis]) + 0.5) * self.cell_m[axis])
+
+    def nodes_m(self) -> FloatArray:
+        """All nodes (G, 3), metres, z fastest: node g is at `numpy.unravel_index(g, shape)`."""
+        mesh = np.meshgrid(*(self.axis_m(axis) for axis in range(3)), indexing="ij")
+        return np.stack([coordinate.ravel() for coordinate in mesh], axis=1)
+
+    def node_m(self, index: int) -> FloatArray:
+        """Position (3,) of one node, metres."""
+        cell = np.array(np.unravel_index(index, self.shape), dtype=np.float64)
+        return np.asarray(self.lower_m + (cell + 0.5) * self.cell_m)

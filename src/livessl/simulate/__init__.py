@@ -1,0 +1,1 @@
+"""Simulated sound: a room by the image method, sources in it, and what the arrays would record."""
