@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from livessl.core.activity import ActivityParameters
+from livessl.core.estimators import ESTIMATORS
+from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
 
@@ -326,6 +330,39 @@ class Site(_Model):
         """The array of that name, with absolute positions."""
         return next(spec for spec in self.specs if spec.name == name)
 
+    def activity_parameters(self) -> ActivityParameters:
+        """The activity rule's numbers, for the core."""
+        a = self.activity
+        return ActivityParameters(
+            threshold=a.threshold,
+            release_s=a.release_s,
+            floor_window_s=a.floor_window_s,
+            floor_factor=a.floor_factor,
+            min_power=10.0 ** (a.min_level_dbfs / 10.0),
+            pre_roll_s=a.pre_roll_s,
+            hang_over_s=a.hang_over_s,
+        )
+
+    def make_fusion(self, method: str | None = None, *, updates: bool = True) -> Fusion:
+        """A new fusion of this site's arrays, by the site's method or another of `ESTIMATORS`."""
+        f, a = self.fusion, self.activity
+        estimator = ESTIMATORS[method or f.method](self.specs, self.search_grid(), self.c_m_s)
+        parameters = FusionParameters(
+            deadline_s=f.deadline_s,
+            window_s=f.window_s,
+            update_s=f.update_s,
+            max_event_s=f.max_event_s,
+            min_arrays=f.min_arrays,
+            threshold=a.threshold,
+            pre_roll_s=a.pre_roll_s,
+            hang_over_s=a.hang_over_s,
+        )
+        return Fusion(self.site, self.specs, estimator, parameters, updates=updates)
+
+    def node_of(self, array: str) -> str | None:
+        """Name of the node that captures an array."""
+        return next((name for name, node in self.nodes.items() if array in node.arrays), None)
+
     def zones_of(self, position_m: Sequence[float] | None) -> list[str]:
         """Names of the zones that hold a position."""
         return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
@@ -443,6 +480,8 @@ def _duplicate_keys(node: yaml.Node | None, path: _Place = ()) -> Iterator[_Find
             yield from _duplicate_keys(value, here)
 
 
+_NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
 _UNION_PARTS: Final = frozenset({"Shape", "str", "SoundDeviceConfig", "WavDeviceConfig", "SceneDeviceConfig"})
 
 
@@ -524,6 +563,12 @@ def _cross_faults(site: Site) -> Iterator[_Finding]:
         )
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
+    if site.fusion.method not in ESTIMATORS:
+        yield ("fusion", "method"), f"expected one of {', '.join(ESTIMATORS)}, got {site.fusion.method!r}"
+    for kind, names in (("arrays", site.arrays), ("nodes", site.nodes), ("zones", site.zones)):
+        for name in names:
+            if not _NAME.fullmatch(name):
+                yield (kind, name), "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
     if site.fusion.min_arrays > len(site.arrays):
         yield (
             ("fusion", "min_arrays"),

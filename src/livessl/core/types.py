@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 

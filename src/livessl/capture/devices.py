@@ -1,0 +1,213 @@
+"""Where sound comes from: the Device protocol, recordings that stand in for one, and their playing at real speed."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+import soundfile
+
+from livessl.clock import Clock
+from livessl.core.types import Block, Float32Array
+
+BLOCK_S: Final = 0.02
+"""Length of the blocks that recordings are read in: as an audio interface would deliver them."""
+
+_SCAN_SAMPLES: Final = 1 << 18
+
+
+class DeviceError(Exception):
+    """A device or recording that cannot be used: what, expected, got, cure."""
+
+
+class Device(Protocol):
+    """A running source of sound: a context manager, and an iterator of blocks while it is entered."""
+
+    name: str
+    sample_rate_hz: float
+    channels: int
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with it now, in words."""
+        ...
+
+    def __enter__(self) -> Device: ...
+    def __exit__(self, *exc: object) -> None: ...
+    def __iter__(self) -> Iterator[Block]: ...
+
+
+class Recording(Protocol):
+    """Sound with a beginning and an end, read as fast as wanted."""
+
+    name: str
+    sample_rate_hz: float
+    channels: int
+    duration_s: float
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """The recording from its beginning, as if that had been at site time `start_ns`: ideal stamps."""
+        ...
+
+
+class WavRecording:
+    """A WAV or FLAC file, in any sample format that libsndfile reads.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    DeviceError
+        Where it cannot be read, is empty, silent throughout, or holds NaN.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._path = path
+        with self._open() as file:
+            self.sample_rate_hz = float(file.samplerate)
+            self.channels = int(file.channels)
+            self.duration_s = file.frames / file.samplerate
+            self._check(file)
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """Blocks of `BLOCK_S`; (channels, n) each."""
+        with self._open() as file:
+            yield from _blocks(
+                file.blocks(round(BLOCK_S * self.sample_rate_hz), dtype="float32", always_2d=True),
+                self.sample_rate_hz,
+                start_ns,
+            )
+
+    def _open(self) -> soundfile.SoundFile:
+        try:
+            return soundfile.SoundFile(self._path)
+        except (soundfile.LibsndfileError, OSError, TypeError) as error:
+            reason = getattr(error, "error_string", None) or getattr(error, "strerror", None) or str(error)
+            raise DeviceError(f"{self._path}: expected a WAV or FLAC file, cannot read it: {reason}") from error
+
+    def _check(self, file: soundfile.SoundFile) -> None:
+        if file.frames == 0:
+            raise DeviceError(f"{self.name}: expected sound, got a file of zero length; record it again")
+        may_hold_nan = file.subtype in ("FLOAT", "DOUBLE")
+        silent, position = True, 0
+        for samples in file.blocks(_SCAN_SAMPLES, dtype="float32", always_2d=True):
+            if not np.isfinite(samples).all():
+                bad, channel = np.argwhere(~np.isfinite(samples))[0]
+                raise DeviceError(
+                    f"{self.name}: expected finite samples, got NaN or infinity at sample {position + bad} of "
+                    f"channel {channel + 1}; export it again"
+                )
+            silent = silent and not samples.any()
+            position += len(samples)
+            if not silent and not may_hold_nan:
+                return
+        if silent:
+            raise DeviceError(f"{self.name}: expected sound, got all-zero samples; was the right input recorded?")
+
+
+@dataclass(frozen=True)
+class ArrayRecording:
+    """Sound in memory, such as a simulated scene's."""
+
+    name: str
+    sample_rate_hz: float
+    samples: Float32Array
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.samples)
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return float(self.samples.shape[1] / self.sample_rate_hz)
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """Blocks of `BLOCK_S`; (channels, n) each."""
+        n = round(BLOCK_S * self.sample_rate_hz)
+        pieces = (self.samples[:, first : first + n].T for first in range(0, self.samples.shape[1], n))
+        yield from _blocks(pieces, self.sample_rate_hz, start_ns)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A recording and when it begins, in site time."""
+
+    recording: Recording
+    start_ns: int
+
+
+def merged(placed: Sequence[Placed]) -> Iterator[tuple[int, int, Block]]:
+    """Blocks of several recordings in the order in which devices would deliver them.
+
+    Yields
+    ------
+    end_ns : int
+        Site time at which the block is complete.
+    line : int
+        Index into `placed`.
+    block : Block
+    """
+
+    def with_end(line: int, item: Placed) -> Iterator[tuple[int, int, Block]]:
+        for block in item.recording.blocks(item.start_ns):
+            length_ns = round(int(block.samples.shape[1]) / item.recording.sample_rate_hz * 1e9)
+            yield block.stamp_ns + length_ns, line, block
+
+    return heapq.merge(*(with_end(k, item) for k, item in enumerate(placed)), key=lambda entry: entry[:2])
+
+
+def played(placed: Sequence[Placed], clock: Clock) -> Iterator[tuple[int, int, Block]]:
+    """`merged`, each block not before it would be complete: an ideal schedule, so that lateness never adds up."""
+    for end_ns, line, block in merged(placed):
+        clock.sleep_until_ns(end_ns)
+        yield end_ns, line, block
+
+
+def looped(recording: Recording) -> Recording:
+    """The recording again and again, without a gap."""
+    return _Looped(recording)
+
+
+@dataclass(frozen=True)
+class _Looped:
+    once: Recording
+    duration_s: float = float("inf")
+
+    @property
+    def name(self) -> str:
+        return self.once.name
+
+    @property
+    def sample_rate_hz(self) -> float:
+        return self.once.sample_rate_hz
+
+    @property
+    def channels(self) -> int:
+        return self.once.channels
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        index = 0
+        while True:
+            for block in self.once.blocks(start_ns):
+                stamp_ns = start_ns + round(index / self.sample_rate_hz * 1e9)
+                yield Block(index, block.samples, stamp_ns)
+                index += int(block.samples.shape[1])
+
+
+def _blocks(pieces: Iterable[Float32Array], rate_hz: float, start_ns: int) -> Iterator[Block]:
+    """Blocks with ideal stamps from (n, channels) pieces."""
+    index = 0
+    for piece in pieces:
+        stamp_ns = start_ns + round(index / rate_hz * 1e9)
+        yield Block(index, np.ascontiguousarray(piece.T, dtype=np.float32), stamp_ns)
+        index += len(piece)

@@ -1,0 +1,94 @@
+"""One line of sound: a device's blocks in, the messages of the arrays on its channels out. It waits for nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from livessl.capture.devices import DeviceError, Recording
+from livessl.config import Site
+from livessl.core.segmenter import Segmenter
+from livessl.core.timeline import Framer
+from livessl.core.types import Block, Message
+
+
+class Line:
+    """The arrays that share one device's clock.
+
+    Parameters
+    ----------
+    site : Site
+    channels : mapping of array name to channels
+        Device channels counted from 1, in the order of the array's microphones.
+    sample_rate_hz : float
+        Nominal rate of the device.
+    """
+
+    def __init__(self, site: Site, channels: Mapping[str, Sequence[int]], sample_rate_hz: float) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.framer = Framer(sample_rate_hz)
+        self._segmenters = [
+            Segmenter(site.array(name), np.array(numbers) - 1, sample_rate_hz, site.activity_parameters())
+            for name, numbers in channels.items()
+        ]
+
+    @property
+    def arrays(self) -> list[str]:
+        """Names of the arrays on it."""
+        return [segmenter.array for segmenter in self._segmenters]
+
+    def push(self, block: Block) -> list[Message]:
+        """Messages that a block completes."""
+        return [
+            message
+            for cut in self.framer.push(block)
+            for segmenter in self._segmenters
+            for message in segmenter.push(cut, self.framer)
+        ]
+
+    def flush(self) -> list[Message]:
+        """Messages held back, at the end of the sound."""
+        return [message for segmenter in self._segmenters for message in segmenter.flush(self.framer)]
+
+
+def recording_channels(site: Site, array: str, recording: Recording, wanted: Sequence[int] | None = None) -> list[int]:
+    """Which channels (from 1) of a recording are an array's microphones.
+
+    As wanted; else as many channels as microphones, in order; else the channels that the site file gives the array on
+    its node's device; else the first ones.
+
+    Raises
+    ------
+    DeviceError
+        Where channels or sampling rate do not fit the site.
+    """
+    expected = len(site.array(array).microphones_m)
+    node = site.node_of(array)
+    rate = site.nodes[node].device.sample_rate_hz if node else None
+    if rate is not None and rate != recording.sample_rate_hz:
+        raise DeviceError(
+            f"{recording.name}: expected {rate:g} Hz for array {array!r}, got {recording.sample_rate_hz:g} Hz; "
+            f"resample the file or correct nodes.{node}.device.sample_rate_hz"
+        )
+    high = site.array(array).band_hz[1]
+    if high >= recording.sample_rate_hz / 2:
+        raise DeviceError(
+            f"{recording.name}: array {array!r} uses up to {high:g} Hz and needs more than {2 * high:g} Hz, got "
+            f"{recording.sample_rate_hz:g} Hz; lower band_hz or use a recording with a higher rate"
+        )
+    if wanted is not None:
+        if len(wanted) != expected or min(wanted) < 1 or max(wanted) > recording.channels:
+            raise DeviceError(
+                f"{recording.name}: expected {expected} channel numbers from 1 to {recording.channels} for array "
+                f"{array!r}, got {list(wanted)}"
+            )
+        return list(wanted)
+    if recording.channels < expected:
+        raise DeviceError(
+            f"{recording.name}: expected {expected} channels, one for each microphone of array {array!r}, "
+            f"got {recording.channels}"
+        )
+    if recording.channels > expected and node and max(site.nodes[node].arrays[array]) <= recording.channels:
+        return list(site.nodes[node].arrays[array])
+    return list(range(1, expected + 1))

@@ -1,0 +1,495 @@
+"""Joins the frames of all arrays on the time raster and turns them into updates, events and tracks.
+
+`Fusion.step(messages, now_ns)` is the only door, live and replayed. A raster interval closes when every array that is
+being waited for has reached it, or at its deadline; who is late or missing contributes nothing. It reads no clock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from livessl.core.activity import THRESHOLD, exact_mask, runs
+from livessl.core.estimators import Estimator, Localization, Sound
+from livessl.core.geometry import direction_deg
+from livessl.core.tracker import Tracker
+from livessl.core.types import (
+    FRAME_NS,
+    FRAME_S,
+    ArraySpec,
+    ClockState,
+    Contribution,
+    Estimate,
+    Event,
+    FloatArray,
+    Frame,
+    MapSnapshot,
+    Mark,
+    Message,
+    Output,
+    Status,
+    Track,
+    Update,
+)
+
+LOST_NS: Final = 2_000_000_000
+"""An array not heard from for so long is lost; marks come every 50 ms."""
+
+TROUBLE_NS: Final = 10_000_000_000
+"""How long a fault keeps an array degraded after it was last seen."""
+
+SILENT_NS: Final = 1_000_000_000
+"""All-zero samples for so long are a dead microphone: any real one has noise."""
+
+EARLIEST_NS: Final = -30_000_000_000
+LATEST_NS: Final = 2_000_000_000
+"""Frames this far from the server's time come from a clock that is wrong; older ones a node's buffer cannot hold."""
+
+JUMP_FRAMES: Final = 1200
+"""A gap of a minute is skipped, not walked through."""
+
+RANGE_UNKNOWN: Final = 0.25
+"""Where the position's spread exceeds this share of the distance to the nearest array, only the direction is told."""
+
+
+class ArrayState(StrEnum):
+    """How an array is doing, as the server sees it."""
+
+    STARTING = "starting"
+    HEALTHY = "healthy"
+    DEGRADED = "degraded"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class FusionParameters:
+    """How arrays are joined.
+
+    Parameters
+    ----------
+    deadline_s : float
+        How long an interval waits for a late array.
+    window_s, update_s : float
+        Length of the windows that updates are made from, and the time between updates.
+    max_event_s : float
+        A sound longer than this is cut into several events.
+    min_arrays : int
+        With fewer an event is refused.
+    threshold : float
+        The activity rule's.
+    pre_roll_s, hang_over_s : float
+        As the nodes use them: an event ends after a quiet hang-over.
+    """
+
+    deadline_s: float = 0.5
+    window_s: float = 0.2
+    update_s: float = 0.1
+    max_event_s: float = 10.0
+    min_arrays: int = 1
+    threshold: float = THRESHOLD
+    pre_roll_s: float = 0.4
+    hang_over_s: float = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayStatus:
+    """One array, for people: powers in full scale squared, age since anything was heard from it."""
+
+    name: str
+    state: ArrayState
+    reason: str | None
+    active: bool
+    age_s: float | None
+    power: float | None
+    noise_power: float | None
+    channel_power: tuple[float, ...]
+    sample_rate_hz: float | None
+    drift_ppm: float | None
+    clock: ClockState | None
+    counters: Mapping[str, int]
+
+
+@dataclass(slots=True)
+class _Stream:
+    """What is known of one array."""
+
+    spec: ArraySpec
+    frames: dict[int, Frame] = field(default_factory=dict)
+    watermark: int | None = None
+    heard_ns: int | None = None
+    waited_for: bool = True
+    mark: Mark | None = None
+    power: float | None = None
+    active: bool = False
+    rate_hz: float | None = None
+    silent_since_ns: int | None = None
+    trouble_ns: int | None = None
+    trouble: str = ""
+    left: bool = False
+    counters: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
+    )
+
+    def worry(self, now_ns: int, what: str) -> None:
+        self.trouble_ns, self.trouble = now_ns, what
+
+    def has_active(self, raster: int) -> bool:
+        frame = self.frames.get(raster)
+        return frame is not None and frame.active
+
+    def segments(self, rasters: Sequence[int]) -> tuple[list[list[Frame]], list[int]]:
+        """The frames at `rasters` (ascending), cut wherever one is missing; and the rasters that are there."""
+        pieces: list[list[Frame]] = []
+        there: list[int] = []
+        for raster in rasters:
+            frame = self.frames.get(raster)
+            if frame is None:
+                continue
+            if not there or raster != there[-1] + 1:
+                pieces.append([])
+            pieces[-1].append(frame)
+            there.append(raster)
+        return pieces, there
+
+
+@dataclass(slots=True)
+class _OpenEvent:
+    start: int
+    last_active: int
+    late_frames: int = 0
+
+
+class Fusion:
+    """The server's heart.
+
+    Parameters
+    ----------
+    site : str
+        Name that event ids begin with.
+    arrays : sequence of ArraySpec
+    estimator : Estimator
+    parameters : FusionParameters
+    updates : bool
+        Whether to localize windows while a sound lasts; offline nobody looks at them.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        arrays: Sequence[ArraySpec],
+        estimator: Estimator,
+        parameters: FusionParameters | None = None,
+        *,
+        updates: bool = True,
+    ) -> None:
+        self._site = site
+        self._estimator = estimator
+        self._parameters = parameters or FusionParameters()
+        self._updates = updates
+        self._streams = {spec.name: _Stream(spec) for spec in arrays}
+        self._tracker = Tracker()
+        self._next: int | None = None
+        self._reached: deque[tuple[int, int]] = deque()
+        self._event: _OpenEvent | None = None
+        self._heard_until = -(2**63)
+        self._now_ns = 0
+        self.unknown_arrays = 0
+
+    @property
+    def event_id(self) -> str | None:
+        """Id of the event that is going on, if one is."""
+        return None if self._event is None else self._id(self._event.start)
+
+    def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
+        """Take in messages, in any order between arrays; return what there is to tell."""
+        self._now_ns = now_ns
+        for message in messages:
+            self._accept(message)
+        outputs = self._close_ready()
+        if self._event is not None and self._everyone_silent():
+            outputs += self._finish()
+        outputs += self._tracker.step(now_ns)
+        return outputs
+
+    def flush(self, now_ns: int) -> list[Output]:
+        """End of the recording: close what is open without waiting for anyone."""
+        self._now_ns = now_ns
+        for stream in self._streams.values():
+            stream.waited_for = False
+        outputs = self._close_ready()
+        return outputs + self._finish() if self._event is not None else outputs
+
+    def leave(self, array: str) -> None:
+        """The array's node said good-bye: nobody waits for it."""
+        if array in self._streams:
+            self._streams[array].left = True
+
+    def status(self, now_ns: int) -> list[ArrayStatus]:
+        """How every array is doing."""
+        return [_status(stream, now_ns) for stream in self._streams.values()]
+
+    def _accept(self, message: Message) -> None:
+        stream = self._streams.get(message.array)
+        if stream is None:
+            self.unknown_arrays += 1
+            return
+        ahead_ns = message.raster * FRAME_NS - self._now_ns
+        if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
+            stream.counters["rejected"] += 1
+            side = "ahead of" if ahead_ns > 0 else "behind"
+            stream.worry(self._now_ns, f"its clock is {abs(ahead_ns) / 1e9:.1f} s {side} the server's; set both by NTP")
+            return
+        if isinstance(message, Frame):
+            if not self._accept_frame(stream, message):
+                return
+        else:
+            _take_mark(stream, message, self._now_ns)
+        stream.heard_ns, stream.left = self._now_ns, False
+        stream.watermark = message.raster if stream.watermark is None else max(stream.watermark, message.raster)
+        if not self._reached or message.raster > self._reached[-1][0]:
+            self._reached.append((message.raster, self._now_ns))
+        if self._next is None:
+            self._next = message.raster
+
+    def _accept_frame(self, stream: _Stream, frame: Frame) -> bool:
+        if len(frame.samples) != len(stream.spec.microphones_m):
+            stream.counters["rejected"] += 1
+            expected, got = len(stream.spec.microphones_m), len(frame.samples)
+            stream.worry(self._now_ns, f"its frames have {got} channels, the server's site file says {expected}")
+            return False
+        if frame.active and self._next is not None and frame.raster < self._next:
+            stream.counters["late"] += 1
+            stream.worry(self._now_ns, "its frames come after their deadline")
+            if self._event is not None:
+                self._event.late_frames += 1
+        stream.frames[frame.raster] = frame
+        stream.counters["frames"] += 1
+        stream.rate_hz = frame.sample_rate_hz
+        if stream.watermark is None or frame.raster >= stream.watermark:
+            stream.power, stream.active = frame.power, frame.active
+        return True
+
+    def _close_ready(self) -> list[Output]:
+        outputs: list[Output] = []
+        if self._next is None:
+            return outputs
+        newest = max(stream.watermark for stream in self._streams.values() if stream.watermark is not None)
+        if newest - self._next > JUMP_FRAMES:
+            outputs += self._finish() if self._event is not None else []
+            self._next = newest
+        while self._next <= newest and self._may_close(self._next):
+            outputs += self._close(self._next)
+            self._next += 1
+            self._prune()
+        return outputs
+
+    def _may_close(self, raster: int) -> bool:
+        late = [stream for stream in self._streams.values() if self._is_waited_for(stream, raster)]
+        if not late:
+            return True
+        while self._reached and self._reached[0][0] < raster:
+            self._reached.popleft()
+        first_ns = self._reached[0][1] if self._reached else self._now_ns
+        if self._now_ns - first_ns < self._parameters.deadline_s * 1e9:
+            return False
+        for stream in late:
+            stream.waited_for = False
+            stream.worry(self._now_ns, "its frames come after their deadline")
+        return True
+
+    def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
+        if stream.watermark is None or stream.heard_ns is None or stream.left:
+            return False
+        if stream.watermark >= raster:
+            stream.waited_for = True
+            return False
+        return stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
+
+    def _everyone_silent(self) -> bool:
+        quiet_ns = self._parameters.deadline_s * 1e9 + self._parameters.hang_over_s * 1e9
+        return all(s.heard_ns is None or self._now_ns - s.heard_ns > quiet_ns for s in self._streams.values())
+
+    def _close(self, raster: int) -> list[Output]:
+        active = any(stream.has_active(raster) for stream in self._streams.values())
+        if active and self._event is None:
+            self._event = _OpenEvent(raster, raster)
+        event = self._event
+        if event is None:
+            return []
+        if active:
+            event.last_active = raster
+        if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
+            return self._finish()
+        outputs: list[Output] = []
+        period = round(self._parameters.update_s / FRAME_S)
+        if self._updates and active and (raster - event.start + 1) % period == 0:
+            outputs += self._update(event, raster)
+        if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
+            outputs += self._finish()
+        return outputs
+
+    def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
+        window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
+        sounds: dict[str, Sound] = {}
+        power = 0.0
+        for name, stream in self._streams.items():
+            heard = [r for r in window if stream.has_active(r)]
+            pieces, _ = stream.segments(heard)
+            if pieces:
+                sounds[name] = _sound(pieces)
+                power = max(power, *(frame.power for piece in pieces for frame in piece))
+        if len(sounds) < self._parameters.min_arrays:
+            return []
+        found = self._estimator.locate(sounds)
+        middle_ns = (window.start + window.stop) * FRAME_NS // 2
+        estimate = _estimate(found, middle_ns, sounds)
+        update = Update(self._id(event.start), estimate, power)
+        snapshot = MapSnapshot(middle_ns, found.fused, found.maps)
+        tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
+        return [update, snapshot, *tracks]
+
+    def _finish(self) -> list[Output]:
+        event, self._event = self._event, None
+        assert event is not None
+        parameters = self._parameters
+        span = range(
+            max(event.start - round(parameters.pre_roll_s / FRAME_S), self._heard_until),
+            event.last_active + round(parameters.hang_over_s / FRAME_S) + 1,
+        )
+        sounds: dict[str, Sound] = {}
+        powers: dict[str, FloatArray] = {}
+        self._heard_until = event.last_active + 1
+        first, last = event.last_active, event.start
+        for name, stream in self._streams.items():
+            if not any(stream.has_active(raster) for raster in span):
+                continue
+            _, there = stream.segments(span)
+            power = np.array([stream.frames[raster].power for raster in there])
+            mask = exact_mask(power, parameters.threshold)
+            rasters = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
+            pieces, _ = stream.segments(rasters)
+            if not pieces:
+                continue
+            sounds[name], powers[name] = _sound(pieces), power[mask]
+            first, last = min(first, rasters[0]), max(last, rasters[-1])
+        if not sounds:
+            return []
+        start_ns, end_ns = first * FRAME_NS, (last + 1) * FRAME_NS
+        status, reason, estimate = self._judge(sounds, (start_ns + end_ns) // 2)
+        return [
+            Event(
+                id=self._id(event.start),
+                start_ns=start_ns,
+                end_ns=end_ns,
+                status=status,
+                reason=reason,
+                estimate=estimate,
+                power=max(float(power.max()) for power in powers.values()),
+                method=self._estimator.name,
+                contributions=tuple(_contribution(self._streams[name].spec, powers[name], estimate) for name in sounds)
+                if estimate is not None
+                else (),
+                heard_by=tuple(sounds),
+                late_frames=event.late_frames,
+                latency_s=(self._now_ns - end_ns) / 1e9,
+            )
+        ]
+
+    def _judge(self, sounds: Mapping[str, Sound], time_ns: int) -> tuple[Status, str | None, Estimate | None]:
+        wanted = self._parameters.min_arrays
+        if len(sounds) < wanted:
+            return Status.REFUSED, f"heard by {len(sounds)} of at least {wanted} arrays", None
+        found = self._estimator.locate(sounds)
+        estimate = _estimate(found, time_ns, sounds)
+        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
+        distances = [direction_deg(self._streams[name].spec.centre_m, found.position_m)[2] for name in sounds]
+        if spread_m > RANGE_UNKNOWN * min(distances):
+            who = "one array cannot" if len(sounds) == 1 else "these arrays cannot"
+            reason = f"{who} tell how far away it is: +-{spread_m:.2f} m at {min(distances):.2f} m"
+            return Status.DIRECTION_ONLY, reason, estimate
+        return Status.LOCATED, None, estimate
+
+    def _id(self, raster: int) -> str:
+        return f"{self._site}-{raster * FRAME_NS // 1_000_000}"
+
+    def _prune(self) -> None:
+        assert self._next is not None
+        keep = max(self._parameters.pre_roll_s, self._parameters.window_s) + self._parameters.hang_over_s
+        oldest = (self._next if self._event is None else self._event.start) - round(keep / FRAME_S) - 1
+        for stream in self._streams.values():
+            while stream.frames and (first := next(iter(stream.frames))) < oldest:
+                del stream.frames[first]
+
+
+def _sound(pieces: Sequence[Sequence[Frame]]) -> Sound:
+    segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
+    return Sound(segments, pieces[0][0].sample_rate_hz)
+
+
+def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
+    return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, tuple(sounds))
+
+
+def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate) -> Contribution:
+    azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
+    return Contribution(spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance)
+
+
+def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
+    stream.counters["marks"] += 1
+    if stream.mark is not None:
+        if mark.overflows > stream.mark.overflows:
+            stream.worry(now_ns, "its device loses samples; use larger blocks or a less busy machine")
+        elif mark.lost_frames > stream.mark.lost_frames:
+            stream.worry(now_ns, "frames were torn by a gap in the sound")
+    if mark.clock is ClockState.STEPPED:
+        stream.worry(now_ns, "its clock has stepped")
+    stream.counters["overflows"], stream.counters["lost_frames"] = mark.overflows, mark.lost_frames
+    if stream.watermark is None or mark.raster >= stream.watermark:
+        stream.mark, stream.power, stream.active = mark, mark.power, False
+        if min(mark.channel_power, default=1.0) > 0.0:
+            stream.silent_since_ns = None
+        elif stream.silent_since_ns is None:
+            stream.silent_since_ns = now_ns
+
+
+def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
+    mark = stream.mark
+    age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
+    state, reason = _state(stream, age_ns, now_ns)
+    return ArrayStatus(
+        name=stream.spec.name,
+        state=state,
+        reason=reason,
+        active=stream.active and state is not ArrayState.LOST,
+        age_s=None if age_ns is None else age_ns / 1e9,
+        power=stream.power,
+        noise_power=mark.noise_power if mark else None,
+        channel_power=mark.channel_power if mark else (),
+        sample_rate_hz=stream.rate_hz,
+        drift_ppm=mark.drift_ppm if mark else None,
+        clock=mark.clock if mark else None,
+        counters=dict(stream.counters),
+    )
+
+
+def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState, str | None]:
+    troubled = stream.trouble_ns is not None and now_ns - stream.trouble_ns < TROUBLE_NS
+    if age_ns is None:
+        return (ArrayState.DEGRADED, stream.trouble) if troubled else (ArrayState.STARTING, "not heard from yet")
+    if stream.left:
+        return ArrayState.LOST, "its node has ended"
+    if age_ns >= LOST_NS:
+        return ArrayState.LOST, stream.trouble if troubled else f"nothing heard from it for {age_ns / 1e9:.0f} s"
+    if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
+        dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]
+        which = "all channels are" if len(dead) == len(stream.mark.channel_power) else f"microphone {dead} is"
+        return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
+    if troubled:
+        return ArrayState.DEGRADED, stream.trouble
+    return ArrayState.HEALTHY, None

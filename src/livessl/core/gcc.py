@@ -1,0 +1,125 @@
+"""Generalized cross-correlation with phase transform (GCC-PHAT), band-limited, on a fine lag axis.
+
+The sign of a lag is defined here and nowhere else: *positive lag of pair (i, k): channel k hears it later*. The paper's
+SRP equation has the opposite one, which would mirror the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import scipy.fft
+from scipy.signal import upfirdn
+from scipy.special import i0
+
+from livessl.core.activity import band_bins
+from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, IntArray
+
+OVERSAMPLING: Final = 8
+"""Fine lags a sample. Nearest-lag look-up then errs by 1/16 sample: 8 degrees of phase at 6 kHz and 16 kHz sampling."""
+
+_HALF_WIDTH: Final = 24
+"""Samples of the interpolation kernel on each side: 80 dB for bands up to 0.45 of the sampling rate."""
+
+_KAISER_BETA: Final = 7.86
+"""Kaiser window for 80 dB: 0.1102 (80 - 8.7)."""
+
+ENVELOPE_ABOVE: Final = 0.25
+"""Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
+
+_SILENT: Final = 1e-12
+"""Cross-power below this share of the largest carries no phase worth whitening."""
+
+
+def microphone_pairs(count: int) -> IntArray:
+    """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""
+    return np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
+
+
+class GCCPhat:
+    """GCC-PHAT of one array at one sampling rate, with its constants worked out once.
+
+    R_ik(tau) = 1/B sum_{f in band} Re[ conj(X_i) X_k / |X_i X_k| e^{j 2 pi f tau} ], so that a pure delay gives 1 at
+    its lag (Knapp and Carter 1976, PHAT weighting, averaged over the B bins of the band). The lags around zero are
+    taken from one inverse FFT at the sampling rate and interpolated to `OVERSAMPLING` lags a sample by a
+    Kaiser-windowed sinc: exact in the band to 80 dB, and far cheaper than a zero-padded FFT.
+
+    Where the band begins above `ENVELOPE_ABOVE` times its own width, R is the magnitude of the same sum instead of its
+    real part: a carrier's periods would be side lobes nearly as high as the peak, and a centimetre of error in a
+    microphone's place would turn their signs against each other.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+        The array.
+    sample_rate_hz : float
+        Must exceed twice the band's upper edge.
+    c_m_s : float
+        Speed of sound.
+    """
+
+    def __init__(self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float) -> None:
+        low, high = spec.band_hz
+        if high >= sample_rate_hz / 2:
+            raise ValueError(
+                f"array {spec.name!r}: band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, "
+                f"got {sample_rate_hz:g} Hz; lower the array's band_hz"
+            )
+        self.pairs = microphone_pairs(len(spec.microphones_m))
+        self._band_hz = spec.band_hz
+        self._rate_hz = sample_rate_hz
+        self._envelope = low > ENVELOPE_ABOVE * (high - low)
+        largest = spec.aperture_m / c_m_s * sample_rate_hz
+        fine = int(np.ceil(largest * OVERSAMPLING)) + 2 * OVERSAMPLING
+        self.lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
+        self._coarse = fine // OVERSAMPLING + _HALF_WIDTH
+        offset = np.arange(-_HALF_WIDTH * OVERSAMPLING, _HALF_WIDTH * OVERSAMPLING + 1) / OVERSAMPLING
+        window = i0(_KAISER_BETA * np.sqrt(1.0 - (offset / _HALF_WIDTH) ** 2)) / i0(_KAISER_BETA)
+        self._kernel: Float32Array = (np.sinc(offset) * window).astype(np.float32)
+
+    def __call__(self, segments: Sequence[Float32Array]) -> GCC:
+        """GCC of a sound's segments, each (K, n) and without gaps: their mean, weighted by length.
+
+        Silence and dead channels give zeros, never NaN.
+        """
+        total = np.zeros((len(self.pairs), 2 * self._coarse + 1), dtype=np.complex64)
+        for segment in segments:
+            total += segment.shape[1] * self._around_zero(segment)
+        total /= max(1, sum(segment.shape[1] for segment in segments))
+        correlation = total if self._envelope else total.real
+        fine = upfirdn(self._kernel, correlation, up=OVERSAMPLING, axis=1)
+        centre = (self._coarse + _HALF_WIDTH) * OVERSAMPLING
+        reach = len(self.lags_s) // 2
+        fine = fine[:, centre - reach : centre + reach + 1]
+        values = np.abs(fine) if self._envelope else fine
+        return GCC(self.pairs.copy(), self.lags_s.copy(), values.astype(np.float64))
+
+    def _around_zero(self, samples: Float32Array) -> ComplexArray:
+        """Correlation at whole-sample lags around zero, (P, 2 coarse + 1); analytic where the envelope is wanted."""
+        n_fft = scipy.fft.next_fast_len(samples.shape[1] + self._coarse, real=True)
+        spectrum = scipy.fft.rfft(samples, n_fft, axis=1)
+        low, high = band_bins(n_fft, self._rate_hz, self._band_hz)
+        inside = spectrum[:, low:high]
+        first, second = self.pairs.T
+        whitened = np.zeros((len(self.pairs), n_fft if self._envelope else n_fft // 2 + 1), dtype=np.complex64)
+        whitened[:, low:high] = _phase_only(np.conj(inside[first]) * inside[second])
+        if self._envelope:
+            correlation = scipy.fft.ifft(whitened, axis=1) * n_fft
+        else:
+            correlation = (scipy.fft.irfft(whitened, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
+        around = np.concatenate([correlation[:, -self._coarse :], correlation[:, : self._coarse + 1]], axis=1)
+        return np.asarray(around / max(1, high - low), dtype=np.complex64)
+
+
+def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:
+    """Curvature of an ideal band-limited GCC at its peak: (2 pi)^2 (f2^3 - f1^3) / (3 (f2 - f1)), 1/s^2."""
+    low, high = band_hz
+    return float(4.0 * np.pi**2 * (high**3 - low**3) / (3.0 * (high - low)))
+
+
+def _phase_only(cross: ComplexArray) -> ComplexArray:
+    magnitude = np.abs(cross)
+    audible = magnitude > _SILENT * magnitude.max(initial=0.0)
+    return np.divide(cross, magnitude, out=np.zeros_like(cross), where=audible)

@@ -1,0 +1,143 @@
+"""What subscribers read: estimates, events, tracks and array states as JSON-ready dictionaries."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from livessl.clock import utc_text
+from livessl.config import Site
+from livessl.core.fusion import ArrayStatus
+from livessl.core.types import Contribution, Estimate, Event, Track, Update
+
+API_VERSION: Final = 1
+
+JsonObject = dict[str, Any]
+
+
+class Messages:
+    """Turns the core's values into the API's objects.
+
+    Parameters
+    ----------
+    site : Site
+        For the zones.
+    origin_ns : int
+        Site time that `start_s` counts from: the beginning of the recording, or of the live run.
+    utc : bool
+        Whether site time is UTC; where a recording does not say when it was made, `time_utc` is null.
+    """
+
+    def __init__(self, site: Site, origin_ns: int, *, utc: bool) -> None:
+        self._site = site
+        self._origin_ns = origin_ns
+        self._utc = utc
+
+    def event(self, event: Event) -> JsonObject:
+        """An event: the contract's fields first."""
+        position, covariance, confidence, arrays = self._where(event.estimate)
+        return {
+            "kind": "event",
+            "id": event.id,
+            **self._when(event.start_ns),
+            "duration_s": round(event.duration_s, 6),
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "arrays": arrays,
+            "method": event.method,
+            "status": str(event.status),
+            "reason": event.reason,
+            "heard_by": list(event.heard_by),
+            "level_dbfs": dbfs(event.power),
+            "contributions": [_contribution(c) for c in event.contributions],
+            "zones": self._site.zones_of(position),
+            "late_frames": event.late_frames,
+            "latency_s": round(event.latency_s, 4),
+        }
+
+    def update(self, update: Update) -> JsonObject:
+        """Where a sound that still lasts seems to be."""
+        position, covariance, confidence, arrays = self._where(update.estimate)
+        return {
+            "kind": "update",
+            "event_id": update.event_id,
+            **self._when(update.estimate.time_ns),
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "arrays": arrays,
+            "zones": self._site.zones_of(position),
+            "level_dbfs": dbfs(update.power),
+        }
+
+    def track(self, track: Track) -> JsonObject:
+        """A followed source."""
+        position = _metres(track.position_m)
+        return {
+            "kind": "track",
+            "id": track.id,
+            "state": str(track.state),
+            **self._when(track.time_ns),
+            "position_m": position,
+            "velocity_m_s": _metres(track.velocity_m_s),
+            "covariance_m2": [_square_metres(row) for row in track.covariance_m2],
+            "zones": self._site.zones_of(position),
+        }
+
+    def _when(self, time_ns: int) -> JsonObject:
+        return {
+            "time_utc": utc_text(time_ns) if self._utc else None,
+            "start_s": round((time_ns - self._origin_ns) / 1e9, 6),
+        }
+
+    def _where(
+        self, estimate: Estimate | None
+    ) -> tuple[list[float] | None, list[list[float]] | None, float, list[str]]:
+        if estimate is None:
+            return None, None, 0.0, []
+        covariance = [_square_metres(row) for row in estimate.covariance_m2]
+        return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
+
+
+def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
+    """An array's state."""
+    return {
+        "name": status.name,
+        "state": str(status.state),
+        "reason": status.reason,
+        "node": node,
+        "active": status.active,
+        "age_s": None if status.age_s is None else round(status.age_s, 3),
+        "level_dbfs": dbfs(status.power),
+        "noise_floor_dbfs": dbfs(status.noise_power),
+        "channel_levels_dbfs": [dbfs(power) for power in status.channel_power],
+        "sample_rate_hz": status.sample_rate_hz,
+        "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),
+        "clock": None if status.clock is None else str(status.clock),
+        "counters": dict(status.counters),
+    }
+
+
+def dbfs(power: float | None) -> float | None:
+    """Level of a power in full scale squared; null for none, and for digital silence, which has no level."""
+    return round(10.0 * math.log10(power), 1) if power else None
+
+
+def _contribution(contribution: Contribution) -> JsonObject:
+    return {
+        "array": contribution.array,
+        "active_s": round(contribution.active_s, 3),
+        "level_dbfs": dbfs(contribution.power),
+        "azimuth_deg": round(contribution.azimuth_deg, 2),
+        "elevation_deg": round(contribution.elevation_deg, 2),
+        "distance_m": round(contribution.distance_m, 3),
+    }
+
+
+def _metres(values: Any) -> list[float]:
+    return [round(float(value), 4) for value in values]
+
+
+def _square_metres(values: Any) -> list[float]:
+    return [float(f"{float(value):.6g}") for value in values]

@@ -1,0 +1,391 @@
+// The wiring: what the server says goes into one state, and the panels and plans are drawn from it.
+
+import { ArraysPanel, effectiveState } from "./arrays.js";
+import { Readout } from "./estimate.js";
+import { EventList, verdict } from "./events.js";
+import { ago, clock, duration, number, position, utc, when, write } from "./format.js";
+import { HeatFeed, paint, ramp, visibility } from "./heat.js";
+import { Live, ServerClock } from "./live.js";
+import { OLD_MS, Plan } from "./plan.js";
+
+const API = new URL("api/v1/", document.baseURI);
+const FIRST_EVENTS = 50;
+const TRAIL = 20;
+const TRACK_POINTS = 60;
+/** Updates of several sounds at once are all shown, each until it has not been heard of for this long. */
+const UPDATE_LIVES_MS = 1500;
+/** What arrives later than this after it happened is as old as it says; below, it has just been heard. */
+const LATE_MS = 3000;
+const ANNOUNCE_MS = 2500;
+const GAP_SHOWN_MS = 20000;
+
+const find = (id) => document.getElementById(id);
+
+const state = {
+  site: null,
+  mode: null,
+  link: "down",
+  arrays: [],       // { array, askedMs }: what was said, and when, by the browser's clock
+  events: new Set(), // ids that came by socket since the stored ones were last asked for
+  trail: [],        // { kind, id, position, bornMs }, oldest first
+  current: new Map(), // event id → the last update of a sound that goes on
+  last: null,       // the newest update or event as a marker
+  mark: null,       // the event that is pointed at or pinned, as a marker
+  tracks: new Map(),
+  latencies: [],
+  maps: null,       // { floor, side, bornMs, time }
+  images: null,     // { floor, side, bornMs } coloured
+  missed: 0,
+};
+
+const serverClock = new ServerClock();
+const plans = [new Plan(find("floor"), "floor"), new Plan(find("side"), "side")];
+const readout = new Readout();
+const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"));
+const eventList = new EventList(find("events"), {
+  empty: find("events-empty"),
+  count: find("events-count"),
+  onMark: (event) => {
+    state.mark = event === null ? null : { ...marker(event, 0), label: when(event, serverNow()) };
+    redraw();
+  },
+});
+const heat = new HeatFeed(API, (maps) => {
+  state.maps = maps;
+  colourMaps();
+  redraw();
+});
+const light = matchMedia("(prefers-color-scheme: light)");
+let table;
+let colours;
+let announcedAt = -Infinity;
+let gapTimer;
+let drawing = false;
+
+// --- what the server says -------------------------------------------------------------------------------------
+
+const HEARD = {
+  hello(message) {
+    serverClock.reset();
+    setSite(message.site, message.mode);
+    HEARD.arrays(message);
+    state.tracks.clear();
+    loadSite();
+    loadEvents();
+    heat.want();
+  },
+  arrays(message) {
+    const sentMs = utc(message.now_utc);
+    const now = Date.now();
+    if (sentMs !== null) serverClock.learn(sentMs, now);
+    // A message that was long under way is as old as its stamp says.
+    const askedMs = sentMs === null ? now : now - Math.max(0, serverClock.at(now) - sentMs);
+    state.arrays = message.arrays.map((array) => ({ array, askedMs }));
+    arraysPanel.show(state.arrays, now, "live");
+    fillMapChoice();
+    if (message.arrays.some(({ active }) => active)) heat.want();
+  },
+  update(message) {
+    const bornMs = born(message, 0, true);
+    const shown = marker(message, bornMs);
+    state.current.set(message.event_id, shown);
+    if (shown.position) leaveTrail(shown);
+    newest(message, shown);
+    heat.want();
+  },
+  event({ v, seq, ...message }) { // what is left is the event as it is stored
+    const bornMs = born(message, message.duration_s, true);
+    const shown = marker(message, bornMs);
+    state.current.delete(message.id);
+    state.events.add(message.id);
+    eventList.add(message, serverNow());
+    if (shown.position && shown.status === "located") leaveTrail(shown);
+    learnLatency(message);
+    newest(message, shown);
+    announce(message);
+    heat.want();
+  },
+  track(message) {
+    const track = (message.state !== "new" && state.tracks.get(message.id)) || { points: [] };
+    if (message.position_m) track.points = [...track.points, message.position_m].slice(-TRACK_POINTS);
+    state.tracks.set(message.id, { ...track, velocity: message.velocity_m_s, ended: message.state === "end", heardMs: Date.now() });
+  },
+  gap(message) {
+    state.missed += message.missed;
+    write(find("gap-text"), `this page missed ${state.missed} message${state.missed === 1 ? "" : "s"}${message.reason ? ` (${message.reason})` : ""}; events are loaded again`);
+    find("gap").hidden = false;
+    clearTimeout(gapTimer);
+    gapTimer = setTimeout(closeGap, GAP_SHOWN_MS);
+    loadEvents();
+  },
+};
+
+const live = new Live(socketUrl(), {
+  onMessage(message) {
+    HEARD[message.kind]?.(message);
+    redraw();
+  },
+  onState: showLink,
+});
+
+function socketUrl() {
+  const url = new URL("live?kinds=update,event,track,arrays", API);
+  url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
+  return url;
+}
+
+async function getJson(path) {
+  const response = await fetch(new URL(path, API), { cache: "no-store", signal: AbortSignal.timeout(8000) });
+  if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
+  return response.json();
+}
+
+async function loadSite(tries = 0) {
+  try {
+    state.site = await getJson("site");
+    setSite(state.site.site, state.site.mode);
+    const [x, y, z] = state.site.room.size_m;
+    find("floor-frame").style.setProperty("--aspect", String(x / y));
+    find("side-frame").style.setProperty("--aspect", String(y / z));
+    find("floor-empty").hidden = true;
+    redraw();
+  } catch (error) {
+    console.warn("livessl: site:", error.message);
+    if (tries < 5) setTimeout(() => loadSite(tries + 1), 1500);
+  }
+}
+
+async function loadEvents(tries = 0) {
+  state.events.clear();
+  try {
+    const { events } = await getJson(`events?limit=${FIRST_EVENTS}`);
+    eventList.load(events, state.events, serverNow());
+    const known = new Set(state.trail.filter(({ kind }) => kind === "event").map(({ id }) => id));
+    const stored = events.filter(({ id }) => !known.has(id)).map((event) => marker(event, born(event, event.duration_s, false)));
+    state.trail = [...stored.reverse().filter((one) => one.position && one.status === "located"), ...state.trail]
+      .sort(byAge).slice(-TRAIL);
+    if (events.length > 0 && (state.last === null || born(events[0], events[0].duration_s, false) > state.last.bornMs + LATE_MS)) {
+      newest(events[0], marker(events[0], born(events[0], events[0].duration_s, false)));
+    }
+    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.length < TRAIL) learnLatency(event);
+    redraw();
+  } catch (error) {
+    console.warn("livessl: events:", error.message);
+    if (tries < 5) setTimeout(() => loadEvents(tries + 1), 1500);
+  }
+}
+
+// --- from messages to what is shown ---------------------------------------------------------------------------
+
+function serverNow() {
+  return serverClock.at(Date.now());
+}
+
+/** When a sound was last heard, by the browser's clock: as its stamp says, or just now where the stamp is no help. */
+function born(message, lastedS, bySocket) {
+  const now = Date.now();
+  const ms = utc(message.time_utc);
+  if (ms === null || state.mode === "replay") return bySocket ? now : -Infinity;
+  const age = Math.max(0, serverNow() - (ms + 1000 * (lastedS ?? 0)));
+  return bySocket && age < LATE_MS ? now : now - age;
+}
+
+function marker(message, bornMs) {
+  return {
+    kind: message.kind ?? "event",
+    id: message.kind === "update" ? message.event_id : message.id,
+    status: message.status ?? "located",
+    position: message.position_m,
+    covariance: message.covariance_m2,
+    rays: (message.contributions ?? []).map((c) => ({ array: c.array, azimuth: c.azimuth_deg, elevation: c.elevation_deg })),
+    bornMs,
+  };
+}
+
+/** Oldest first; what is infinitely old has no order among itself. */
+function byAge(a, b) {
+  return a.bornMs === b.bornMs ? 0 : a.bornMs < b.bornMs ? -1 : 1;
+}
+
+function leaveTrail(shown) {
+  state.trail = [...state.trail, shown].slice(-TRAIL);
+}
+
+function newest(message, shown) {
+  state.last = shown;
+  readout.show({ kind: "event", ...message }, shown.bornMs, Date.now(), state.link);
+}
+
+function learnLatency({ latency_s: latency }) {
+  if (!Number.isFinite(latency)) return;
+  state.latencies = [...state.latencies, latency].slice(-TRAIL);
+  const sorted = [...state.latencies].sort((a, b) => a - b);
+  write(find("vital-latency"), `${number(sorted[sorted.length >> 1])} s`);
+}
+
+function announce(event) {
+  if (performance.now() - announcedAt < ANNOUNCE_MS) return;
+  announcedAt = performance.now();
+  const told = verdict(event);
+  const placed = event.status === "located" && event.position_m;
+  write(find("announce"), `Event at ${when(event, serverNow())}: ${placed ? position(event.position_m) : told}`);
+}
+
+function setSite(name, mode) {
+  state.mode = mode ?? state.mode;
+  write(find("site-name"), name ?? "");
+  document.title = name ? `${name} · livessl` : "livessl";
+  find("mode").hidden = !state.mode;
+  find("mode").dataset.mode = state.mode ?? "";
+  write(find("mode"), state.mode ?? "");
+}
+
+function fillMapChoice() {
+  const select = find("map-choice");
+  const names = ["fused", ...state.arrays.map(({ array }) => array.name)];
+  if (names.join("\n") === [...select.options].map(({ value }) => value).join("\n")) return;
+  const chosen = names.includes(select.value) ? select.value : "fused";
+  select.replaceChildren(...names.map((name) => new Option(name === "fused" ? "fused" : `${name} alone`, name)));
+  select.value = chosen;
+  if (heat.choice !== chosen) heat.choose(chosen);
+}
+
+function closeGap() {
+  state.missed = 0;
+  find("gap").hidden = true;
+}
+
+// --- time passes ----------------------------------------------------------------------------------------------
+
+function showLink(link, silentMs) {
+  const changed = link !== state.link;
+  state.link = link;
+  document.body.dataset.link = link;
+  find("connection").dataset.state = link;
+  write(find("connection-word"), { live: "live", stale: "stale", down: silentMs === null ? "connecting" : "no contact" }[link]);
+  const banner = find("banner");
+  banner.hidden = link === "live" || (silentMs === null && performance.now() < 1000);
+  write(find("banner-for"), silentMs === null ? " yet" : ` for ${duration(silentMs / 1000)}`);
+  if (changed) arraysPanel.tick(state.arrays, Date.now(), link);
+  if (changed) redraw();
+}
+
+/** Ten times a second: everything that ages, ages, whether or not anything is heard. */
+function tick() {
+  const now = Date.now();
+  for (const [id, { bornMs }] of state.current) if (now - bornMs > UPDATE_LIVES_MS) state.current.delete(id);
+  for (const [id, { heardMs }] of state.tracks) if (now - heardMs > OLD_MS) state.tracks.delete(id);
+  arraysPanel.tick(state.arrays, now, state.link);
+  readout.tick(now, state.link);
+  showMapAge(now);
+  const states = state.arrays.map((held) => effectiveState(held, now, state.link));
+  const healthy = states.filter((each) => each === "healthy").length;
+  write(find("vital-arrays"), states.length && state.link === "live" ? `${healthy} of ${states.length} healthy` : "–");
+  find("vital-arrays").dataset.tone = state.link === "live" && healthy < states.length ? "warn" : "fine";
+  write(find("vital-clock"), state.link === "live" ? clock(serverNow(), false) : "–");
+  const moving = state.last !== null && now - state.last.bornMs < OLD_MS + 500;
+  const fading = state.images !== null && visibility(now - state.images.bornMs) > 0;
+  if (moving || fading || state.tracks.size > 0) redraw();
+}
+
+function showMapAge(now) {
+  const label = find("map-age");
+  const age = state.maps ? now - state.maps.bornMs : null;
+  label.dataset.tone = age !== null && age > LATE_MS ? "old" : "fine";
+  write(label, age === null ? "map: none yet" : age < 1500 ? "map: now" : `map: ${ago(age)}`);
+  for (const plan of plans) {
+    plan.canvas.dataset.mapTime = state.maps?.time ?? "";
+    plan.canvas.dataset.mapAge = age === null ? "" : (age / 1000).toFixed(2);
+    plan.canvas.dataset.map = heat.choice;
+  }
+}
+
+// --- drawing --------------------------------------------------------------------------------------------------
+
+function readTheme() {
+  const style = getComputedStyle(document.documentElement);
+  const read = (name) => style.getPropertyValue(`--${name}`).trim();
+  const names = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
+  colours = Object.fromEntries(names.map((name) => [name, read(name)]));
+  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
+  table = ramp(light.matches ? "light" : "dark");
+  const g = find("ramp").getContext("2d");
+  const image = g.createImageData(256, 8);
+  for (let i = 0; i < 256 * 8; i += 1) image.data.set([...table.subarray((i % 256) * 3, (i % 256) * 3 + 3), 255], i * 4);
+  g.putImageData(image, 0, 0);
+  colourMaps();
+  redraw();
+}
+
+function colourMaps() {
+  state.images = state.maps && { floor: paint(state.maps.floor, table), side: paint(state.maps.side, table), bornMs: state.maps.bornMs };
+}
+
+function redraw() {
+  if (drawing) return;
+  drawing = true;
+  requestAnimationFrame(() => {
+    drawing = false;
+    draw();
+  });
+}
+
+function scene(now) {
+  const { site } = state;
+  const held = new Map(state.arrays.map((each) => [each.array.name, each]));
+  const estimates = [...state.current.values()].filter(({ id }) => id !== state.last?.id);
+  if (state.last !== null && state.last.status !== "refused") estimates.push({ ...state.last, newest: true });
+  return {
+    now,
+    map: state.images,
+    grid: site.grid,
+    zones: Object.entries(site.zones ?? {}).map(([name, { bounds_m: bounds }]) => [name, bounds.map(([a]) => a), bounds.map(([, b]) => b)]),
+    arrays: Object.entries(site.arrays).map(([name, array]) => ({
+      name,
+      position: array.position_m,
+      microphones: array.microphones_m,
+      state: held.has(name) ? effectiveState(held.get(name), now, state.link) : "unknown",
+      active: state.link === "live" && Boolean(held.get(name)?.array.active),
+    })),
+    trail: state.trail,
+    tracks: [...state.tracks.values()],
+    estimates,
+    highlight: state.mark,
+  };
+}
+
+function draw() {
+  if (!state.site) return;
+  const size = state.site.room.size_m;
+  const fits = plans.map((plan) => plan.fit(size));
+  // One scale for both views, so that they read as one drawing, unless that would waste a view's space.
+  const common = Math.min(...fits);
+  const shared = common > 0.85 * Math.max(...fits);
+  const now = Date.now();
+  const shown = scene(now);
+  plans.forEach((plan, index) => {
+    plan.layout(size, shared ? common : fits[index]);
+    plan.draw(shown, colours);
+  });
+}
+
+function followPointer(plan, output) {
+  plan.canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
+    const metres = plan.under(offsetX, offsetY);
+    write(output, metres ? metres.map((value, index) => `${plan.view.names[index]} ${number(value)}`).join("  ") : "");
+  });
+  plan.canvas.addEventListener("pointerleave", () => write(output, ""));
+}
+
+// --- begin ----------------------------------------------------------------------------------------------------
+
+readTheme();
+light.addEventListener("change", readTheme);
+const sizes = new ResizeObserver(redraw);
+for (const plan of plans) sizes.observe(plan.canvas);
+followPointer(plans[0], find("floor-pointer"));
+followPointer(plans[1], find("side-pointer"));
+find("map-choice").addEventListener("change", ({ target }) => heat.choose(target.value));
+find("gap-close").addEventListener("click", closeGap);
+setInterval(tick, 100);
+live.start();

@@ -1,0 +1,275 @@
+"""Messages to bytes and back: version, limits, validation. It knows no socket.
+
+One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind), then the body of its kind. Sound
+travels as float32, so that a replayed or live frame is the very frame that was cut.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ClockState, Frame, Mark
+
+VERSION: Final = 1
+
+MAX_NAME_BYTES: Final = 64
+"""Longest array or node name: the site file allows no longer site, and a header must stay a header."""
+
+MAX_FRAME_SAMPLES: Final = 19_200
+"""A 50 ms frame at 192 kHz is 9 600 samples; twice that is no frame of ours."""
+
+MAX_JSON_BYTES: Final = 64 * 1024
+"""Greetings and acknowledgements are a few hundred bytes."""
+
+MAX_MESSAGE_BYTES: Final = 256 + 4 * MAX_MICROPHONES * MAX_FRAME_SAMPLES
+"""The largest message there can be: a frame of 16 channels."""
+
+_MAGIC: Final = b"LSSL"
+_HEAD: Final = struct.Struct("<4sBB")
+_FRAME: Final = struct.Struct("<BQqqdd?BI")  # name length, sequence, raster, time, rate, power, active, channels, n
+_MARK: Final = struct.Struct("<BQqddQQdBB")  # name length, sequence, raster, powers, overflows, lost, drift, clock, K
+_CLOCK_STATES: Final = tuple(ClockState)
+
+
+class WireError(ValueError):
+    """Bytes that are no message; says what was expected and what was got."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """A node introduces itself.
+
+    Parameters
+    ----------
+    node : str
+        Its name in the site file.
+    run_id : str
+        New at every start: sequence numbers begin again.
+    arrays : dict of str to float
+        The arrays it captures and their sampling rates in Hz.
+    replay : bool
+        The frames carry past times; the server shall follow them instead of its clock.
+    problem : str or None
+        What is wrong with its device now, in words.
+    """
+
+    node: str
+    run_id: str
+    arrays: dict[str, float]
+    replay: bool = False
+    problem: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """The server's answer and heartbeat: the last sequence number it holds of each array of this node's run."""
+
+    run_id: str
+    sequences: dict[str, int]
+    who_are_you: bool = False
+    refused: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Bye:
+    """A node ends on purpose."""
+
+    node: str
+    run_id: str
+
+
+WireMessage = Frame | Mark | Hello | Ack | Bye
+_JSON_KINDS: Final[dict[int, type[Hello | Ack | Bye]]] = {3: Hello, 4: Ack, 5: Bye}
+_FRAME_KIND: Final = 1
+_MARK_KIND: Final = 2
+
+
+def encode(message: WireMessage) -> bytes:
+    """Bytes of a message."""
+    if isinstance(message, Frame):
+        return _encode_frame(message)
+    if isinstance(message, Mark):
+        return _encode_mark(message)
+    kind = next(number for number, type_ in _JSON_KINDS.items() if isinstance(message, type_))
+    return _head(kind) + json.dumps(asdict(message), separators=(",", ":")).encode()
+
+
+def decode(data: bytes) -> WireMessage:
+    """Message of some bytes.
+
+    Raises
+    ------
+    WireError
+        Where they are not a whole, valid message of this version; never anything else.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise WireError(f"message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
+    if len(data) < _HEAD.size:
+        raise WireError(f"message of {len(data)} bytes: expected at least a header of {_HEAD.size}")
+    magic, version, kind = _HEAD.unpack_from(data)
+    if magic != _MAGIC:
+        raise WireError(f"expected a message of livessl beginning with {_MAGIC!r}, got {magic!r}")
+    if version != VERSION:
+        raise WireError(f"expected wire version {VERSION}, got {version}; run the same livessl on nodes and server")
+    body = data[_HEAD.size :]
+    if kind == _FRAME_KIND:
+        return _decode_frame(body)
+    if kind == _MARK_KIND:
+        return _decode_mark(body)
+    if kind in _JSON_KINDS:
+        return _decode_json(_JSON_KINDS[kind], body)
+    raise WireError(f"expected a known kind of message, got {kind}")
+
+
+def _head(kind: int) -> bytes:
+    return _HEAD.pack(_MAGIC, VERSION, kind)
+
+
+def _encode_frame(frame: Frame) -> bytes:
+    name = _name_bytes(frame.array)
+    channels, n = frame.samples.shape
+    fixed = _FRAME.pack(
+        len(name),
+        frame.sequence,
+        frame.raster,
+        frame.time_ns,
+        frame.sample_rate_hz,
+        frame.power,
+        frame.active,
+        channels,
+        n,
+    )
+    return b"".join([_head(_FRAME_KIND), fixed, name, frame.samples.astype("<f4", copy=False).tobytes()])
+
+
+def _decode_frame(body: bytes) -> Frame:
+    fixed = _unpack(_FRAME, body, "frame")
+    name_length, sequence, raster, time_ns, rate, power, active, channels, n = fixed
+    if not MIN_MICROPHONES <= channels <= MAX_MICROPHONES:
+        raise WireError(f"frame: expected 2 to 16 channels, got {channels}")
+    if not 0 < n <= MAX_FRAME_SAMPLES:
+        raise WireError(f"frame: expected 1 to {MAX_FRAME_SAMPLES} samples, got {n}")
+    if not (math.isfinite(rate) and rate > 0 and math.isfinite(power) and power >= 0):
+        raise WireError(f"frame: expected a finite rate > 0 and power >= 0, got {rate} and {power}")
+    name, start = _name(body, _FRAME.size, name_length)
+    if len(body) - start != 4 * channels * n:
+        raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
+    samples = np.frombuffer(body, dtype="<f4", offset=start).reshape(channels, n).astype(np.float32, copy=False)
+    if not np.isfinite(samples).all():
+        raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
+    return Frame(name, sequence, raster, time_ns, rate, samples, power, active)
+
+
+def _encode_mark(mark: Mark) -> bytes:
+    name = _name_bytes(mark.array)
+    fixed = _MARK.pack(
+        len(name),
+        mark.sequence,
+        mark.raster,
+        mark.power,
+        mark.noise_power,
+        mark.overflows,
+        mark.lost_frames,
+        mark.drift_ppm,
+        _CLOCK_STATES.index(mark.clock),
+        len(mark.channel_power),
+    )
+    return b"".join([_head(_MARK_KIND), fixed, name, np.asarray(mark.channel_power, dtype="<f8").tobytes()])
+
+
+def _decode_mark(body: bytes) -> Mark:
+    fixed = _unpack(_MARK, body, "mark")
+    name_length, sequence, raster, power, noise, overflows, lost, drift, clock, channels = fixed
+    if clock >= len(_CLOCK_STATES) or channels > MAX_MICROPHONES:
+        raise WireError(f"mark: expected a known clock state and at most 16 channels, got {clock} and {channels}")
+    name, start = _name(body, _MARK.size, name_length)
+    if len(body) - start != 8 * channels:
+        raise WireError(f"mark: expected {8 * channels} bytes of channel powers, got {len(body) - start}")
+    channel_power = tuple(np.frombuffer(body, dtype="<f8", offset=start).tolist())
+    if not all(math.isfinite(value) and value >= 0 for value in (power, noise, *channel_power)):
+        raise WireError(f"mark of array {name!r}: expected finite powers >= 0")
+    if not math.isfinite(drift):
+        raise WireError(f"mark of array {name!r}: expected a finite drift, got {drift}")
+    return Mark(name, sequence, raster, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])
+
+
+def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
+    what = type_.__name__.lower()
+    if len(body) > MAX_JSON_BYTES:
+        raise WireError(f"{what} of {len(body)} bytes: expected at most {MAX_JSON_BYTES}")
+    try:
+        fields = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"{what}: not valid JSON") from error
+    checks = _FIELDS[type_]
+    if not isinstance(fields, dict) or set(fields) != set(checks):
+        raise WireError(f"{what}: expected the fields {', '.join(checks)}")
+    for name, valid in checks.items():
+        if not valid(fields[name]):
+            raise WireError(f"{what}: field {name!r} has a wrong type or value")
+    return type_(**fields)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value.encode("utf-8", "replace")) <= MAX_NAME_BYTES
+
+
+def _is_text(value: Any) -> bool:
+    return value is None or (isinstance(value, str) and len(value) <= 1000)
+
+
+def _is_rate(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+def _is_flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_map_of(valid: Any) -> Any:
+    return lambda value: isinstance(value, dict) and all(_is_name(k) and valid(v) for k, v in value.items())
+
+
+_FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
+    Hello: {
+        "node": _is_name,
+        "run_id": _is_name,
+        "arrays": _is_map_of(_is_rate),
+        "replay": _is_flag,
+        "problem": _is_text,
+    },
+    Ack: {"run_id": _is_name, "sequences": _is_map_of(_is_sequence), "who_are_you": _is_flag, "refused": _is_text},
+    Bye: {"node": _is_name, "run_id": _is_name},
+}
+
+
+def _unpack(form: struct.Struct, body: bytes, what: str) -> tuple[Any, ...]:
+    if len(body) < form.size:
+        raise WireError(f"{what} of {len(body)} bytes: expected at least {form.size}")
+    return form.unpack_from(body)
+
+
+def _name_bytes(name: str) -> bytes:
+    data = name.encode()
+    if not 0 < len(data) <= MAX_NAME_BYTES:
+        raise ValueError(f"name {name!r}: expected 1 to {MAX_NAME_BYTES} bytes")
+    return data
+
+
+def _name(body: bytes, start: int, length: int) -> tuple[str, int]:
+    if not 0 < length <= MAX_NAME_BYTES or len(body) < start + length:
+        raise WireError(f"expected a name of 1 to {MAX_NAME_BYTES} bytes, got {length}")
+    try:
+        return body[start : start + length].decode(), start + length
+    except UnicodeDecodeError as error:
+        raise WireError("expected a name in UTF-8") from error
