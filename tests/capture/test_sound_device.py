@@ -26,6 +26,7 @@ from livessl.capture import sound_device
 from livessl.capture.sound_device import DeviceError, SoundDevice, input_devices
 from livessl.clock import UnpacedClock
 from livessl.config import SoundDeviceConfig
+from livessl.core.types import FRAME_NS
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -234,7 +235,7 @@ class TestBlocks:
         ("age_s", "origin_s", "believed_s"),
         [
             (0.020, 5.0, 0.020),
-            (0.470, 5.0, 0.470),  # a sound server's buffer
+            (0.060, 5.0, 0.060),  # two more blocks wait behind it
             (0.0, 0.0, 0.020),  # no times at all
             (-3.0, 5.0, 0.020),  # converted in the future
             (0.010, 5.0, 0.020),  # before its last sample was there
@@ -248,6 +249,12 @@ class TestBlocks:
             FakeStream.opened[0].play(noise(), age_s, origin_s)
             block = next(opened)
         assert abs(block.stamp_ns - (NOW_NS - believed_s * 1e9)) < 1000  # float64 seconds keep a microsecond
+
+    def test_stamp_does_not_believe_a_sound_server(self, portaudio: FakePortAudio) -> None:
+        portaudio.plug(("pulse", 32))
+        with device("pulse") as opened:
+            FakeStream.opened[0].play(noise(), age_s=0.2)
+            assert next(opened).stamp_ns == NOW_NS - 20_000_000
 
     def test_overflow_marks_the_block_after_the_loss(self, portaudio: FakePortAudio) -> None:
         with device() as opened:
@@ -537,14 +544,12 @@ def test_records_each_channel_of_a_card_in_its_place(card: VirtualCard, tmp_path
     assert recorded["samples"].shape == (4, count * BLOCK)
     assert not recorded["overflow"].any()
     assert_array_equal(recorded["first_index"], BLOCK * np.arange(count))
-    # The stamps run with the samples: over 4 s, a mean rate within 2 % and no stamp off by more than a quarter second.
-    line = np.polyfit(recorded["first_index"], recorded["stamp_ns"] - recorded["stamp_ns"][0], 1)
-    assert line[0] == pytest.approx(1e9 / RATE_HZ, rel=0.02)
-    jitter_ns = recorded["stamp_ns"] - recorded["stamp_ns"][0] - np.polyval(line, recorded["first_index"])
-    assert np.abs(jitter_ns).max() < 0.25e9
+    # Stamps serve to put frames on a raster of 50 ms, so most must lie nearer than that to an even run.
+    even_ns = recorded["stamp_ns"][0] + recorded["first_index"] / RATE_HZ * 1e9
+    assert np.median(np.abs(recorded["stamp_ns"] - even_ns)) < FRAME_NS
 
-    # The card keeps 16 bits: rounding leaves 2^-15 / sqrt(12) = 9e-6 RMS in each of player, mixer and monitor. One sample
-    # lost shifts a 440 Hz tone by d = 0.058 rad from there on; a loss after a fraction f of the second leaves
+    # The card keeps 16 bits: rounding leaves 2^-15 / sqrt(12) = 9e-6 RMS in each of player, mixer and monitor. One
+    # sample lost shifts a 440 Hz tone by d = 0.058 rad from there on; a loss after a fraction f of the second leaves
     # 0.5 d sqrt(f (1 - f) / 2) RMS: 1e-2 in the middle, and above 1e-4 unless it is among the last two samples.
     last_second = recorded["samples"][:, -RATE_HZ:].astype(np.float64)
     for channel, frequency_hz in enumerate(TONES_HZ):

@@ -6,7 +6,8 @@ import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from types import TracebackType
+from typing import Final, Protocol, Self
 
 import numpy as np
 import soundfile
@@ -36,18 +37,35 @@ class Device(Protocol):
         """What is wrong with it now, in words."""
         ...
 
-    def __enter__(self) -> Device: ...
-    def __exit__(self, *exc: object) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None: ...
     def __iter__(self) -> Iterator[Block]: ...
 
 
 class Recording(Protocol):
     """Sound with a beginning and an end, read as fast as wanted."""
 
-    name: str
-    sample_rate_hz: float
-    channels: int
-    duration_s: float
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+        ...
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples a second."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        ...
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        ...
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
         """The recording from its beginning, as if that had been at site time `start_ns`: ideal stamps."""
@@ -173,35 +191,71 @@ def played(placed: Sequence[Placed], clock: Clock) -> Iterator[tuple[int, int, B
         yield end_ns, line, block
 
 
-def looped(recording: Recording) -> Recording:
-    """The recording again and again, without a gap."""
-    return _Looped(recording)
-
-
 @dataclass(frozen=True)
-class _Looped:
+class Looped:
+    """A recording again and again, without a gap."""
+
     once: Recording
     duration_s: float = float("inf")
 
     @property
     def name(self) -> str:
+        """The recording's."""
         return self.once.name
 
     @property
     def sample_rate_hz(self) -> float:
+        """The recording's."""
         return self.once.sample_rate_hz
 
     @property
     def channels(self) -> int:
+        """The recording's."""
         return self.once.channels
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
+        """Blocks without end."""
         index = 0
         while True:
             for block in self.once.blocks(start_ns):
-                stamp_ns = start_ns + round(index / self.sample_rate_hz * 1e9)
-                yield Block(index, block.samples, stamp_ns)
+                yield Block(index, block.samples, start_ns + round(index / self.sample_rate_hz * 1e9))
                 index += int(block.samples.shape[1])
+
+
+@dataclass(frozen=True)
+class Spliced:
+    """Stretches of one array's sound with gaps between them, as one recording: its sample index jumps at a gap."""
+
+    stretches: tuple[Placed, ...]
+
+    @property
+    def name(self) -> str:
+        """The first stretch's."""
+        return self.stretches[0].recording.name
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """The first stretch's."""
+        return self.stretches[0].recording.sample_rate_hz
+
+    @property
+    def channels(self) -> int:
+        """The first stretch's."""
+        return self.stretches[0].recording.channels
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        last = self.stretches[-1]
+        return (last.start_ns - self.stretches[0].start_ns) / 1e9 + last.recording.duration_s
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """Blocks of every stretch at its own time, the first one's being `start_ns`."""
+        for stretch in self.stretches:
+            offset_ns = stretch.start_ns - self.stretches[0].start_ns
+            skipped = round(offset_ns * self.sample_rate_hz / 1e9)
+            for block in stretch.recording.blocks(start_ns + offset_ns):
+                yield Block(block.first_index + skipped, block.samples, block.stamp_ns)
 
 
 def _blocks(pieces: Iterable[Float32Array], rate_hz: float, start_ns: int) -> Iterator[Block]:

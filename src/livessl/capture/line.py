@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from livessl.capture.devices import DeviceError, Recording
+from livessl.capture.devices import DeviceError, Placed, Recording, played
+from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.segmenter import Segmenter
 from livessl.core.timeline import Framer
@@ -50,6 +51,16 @@ class Line:
     def flush(self) -> list[Message]:
         """Messages held back, at the end of the sound."""
         return [message for segmenter in self._segmenters for message in segmenter.flush(self.framer)]
+
+
+def played_messages(
+    lines: Sequence[Line], placed: Sequence[Placed], clock: Clock
+) -> Iterator[tuple[int, list[Message]]]:
+    """What lines make of their recordings, block by block: the site time at which it is known, and the messages."""
+    end_ns = 0
+    for end_ns, index, block in played(placed, clock):
+        yield end_ns, lines[index].push(block)
+    yield end_ns, [message for line in lines for message in line.flush()]
 
 
 def recording_channels(site: Site, array: str, recording: Recording, wanted: Sequence[int] | None = None) -> list[int]:

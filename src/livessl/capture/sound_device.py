@@ -78,6 +78,11 @@ class InputDevice:
         """The name that tells it from its namesakes under other drivers: `HOSTAPI: name`."""
         return f"{self.host_api}: {self.name}"
 
+    @property
+    def is_hardware(self) -> bool:
+        """Whether samples come from the device itself (ALSA's `hw:`), not from a sound server or through a plug-in."""
+        return "(hw:" in self.name
+
     def answers_to(self, wanted: str) -> bool:
         """Whether `wanted` is part of the name, case apart, or `HOSTAPI: part of the name`."""
         folded, name = wanted.casefold(), self.name.casefold()
@@ -127,6 +132,7 @@ class SoundDevice:
         self._queue: SimpleQueue[tuple[int, Float32Array, int, bool]] = SimpleQueue()
         self._entered = False
         self._stream: Any = None
+        self._is_hardware = False
         self._idle_s = 0.0
         self._next_index = 0
         self._lost = False
@@ -177,8 +183,11 @@ class SoundDevice:
     def _receive(self, samples: Float32Array, count: int, time: Any, status: Any) -> None:
         """PortAudio's callback: see the contract at the head of the module.
 
-        The driver's own time of conversion, where it gives a sane one, knows what the time of this call cannot: how
-        long the samples waited for the callback thread. Otherwise the last sample is taken to have come just now.
+        The time of conversion that the driver of a hardware device gives rests on a count of the samples in its buffer,
+        and so knows how long they waited for this call, and that two blocks of one period came at once. A sound
+        server's is a guess: PulseAudio's drifts by 0.2 s in the first second, while its blocks arrive evenly. There,
+        and where the time is not sane, the last sample is taken to have come just now.
+
         A copy is asked for by name, because one channel transposed is already contiguous, and the memory is
         PortAudio's.
         """
@@ -190,7 +199,7 @@ class SoundDevice:
             self._lost = True
             return
         length_s = count / self.sample_rate_hz
-        age_s = time.currentTime - time.inputBufferAdcTime
+        age_s = time.currentTime - time.inputBufferAdcTime if self._is_hardware else length_s
         if not length_s <= age_s <= length_s + MAX_BACKLOG_S:
             age_s = length_s
         stamp_ns = self._clock.now_ns() - round(age_s * 1e9)
@@ -232,9 +241,11 @@ class SoundDevice:
         """
         stream: Any = None
         try:
-            index = _find(_inputs(sd), self.name, self.channels)
-            if index is None:
+            found = _find(_inputs(sd), self.name, self.channels)
+            if found is None:
                 return f"device {self.name!r} is not connected, or another program holds it; waiting for it"
+            index, device = found
+            self._is_hardware = device.is_hardware
             stream = sd.InputStream(
                 device=index,
                 channels=self.channels,
@@ -310,8 +321,8 @@ def _inputs(sd: Any) -> list[tuple[int, InputDevice]]:
     ]
 
 
-def _find(devices: Sequence[tuple[int, InputDevice]], wanted: str, channels: int) -> int | None:
-    """PortAudio's index of the one device that answers to a name; None if there is none.
+def _find(devices: Sequence[tuple[int, InputDevice]], wanted: str, channels: int) -> tuple[int, InputDevice] | None:
+    """PortAudio's index and description of the one device that answers to a name; None if there is none.
 
     A name given in full wins over names that merely hold it, so that every device can be named.
 
@@ -342,7 +353,7 @@ def _find(devices: Sequence[tuple[int, InputDevice]], wanted: str, channels: int
             f"device {wanted!r} has {device.channels} input channels, arrays use channel {channels}; "
             "correct the channels under arrays of this node, or use an interface with more inputs"
         )
-    return index
+    return index, device
 
 
 def _rescan(sd: Any) -> None:

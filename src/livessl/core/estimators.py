@@ -39,6 +39,10 @@ class Estimator(Protocol):
 
     name: str
 
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Work out what an array at a sampling rate needs; `locate` does it otherwise."""
+        ...
+
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Localize one sound heard by the arrays named in `sounds`; at least one."""
         ...
@@ -62,22 +66,16 @@ class SrpPhat:
         self._c_m_s = c_m_s
         self._tools: dict[tuple[str, float], tuple[GCCPhat, SRPMapper]] = {}
 
-    def prepare(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper]:
-        """Work out an array's tables for a sampling rate; done at most once for each."""
-        key = (array, sample_rate_hz)
-        if key not in self._tools:
-            spec = self._arrays[array]
-            correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s)
-            mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s)
-            self._tools[key] = (correlate, mapper)
-        return self._tools[key]
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Work out an array's tables for a sampling rate."""
+        self._tools_for(array, sample_rate_hz)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Sum the arrays' maps, take the peak, refine it below the grid."""
         evidence: list[HeardBy] = []
         maps: dict[str, Float32Array] = {}
         for name in sorted(sounds):  # float sums depend on the order: the answer must not
-            correlate, to_map = self.prepare(name, sounds[name].sample_rate_hz)
+            correlate, to_map = self._tools_for(name, sounds[name].sample_rate_hz)
             gcc = correlate(sounds[name].segments)
             evidence.append(HeardBy(self._arrays[name], gcc))
             maps[name] = to_map(gcc)
@@ -95,6 +93,15 @@ class SrpPhat:
             fused,
             maps,
         )
+
+    def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper]:
+        key = (array, sample_rate_hz)
+        if key not in self._tools:
+            spec = self._arrays[array]
+            correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s)
+            mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s)
+            self._tools[key] = (correlate, mapper)
+        return self._tools[key]
 
 
 ESTIMATORS: Final[dict[str, Callable[[Sequence[ArraySpec], Grid, float], Estimator]]] = {SrpPhat.name: SrpPhat}

@@ -224,6 +224,10 @@ class Fusion:
         outputs = self._close_ready()
         return outputs + self._finish() if self._event is not None else outputs
 
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Work out what an array's sound will need, so that its first event does not wait for it."""
+        self._estimator.prepare(array, sample_rate_hz)
+
     def leave(self, array: str) -> None:
         """The array's node said good-bye: nobody waits for it."""
         if array in self._streams:

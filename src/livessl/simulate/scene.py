@@ -320,7 +320,7 @@ def _gain(scene: Scene) -> np.float32:
     """Factor from samples to sound that gives the largest peak of all sources `level_dbfs` at 1 m.
 
     A direct path has the amplitude 1/(4 pi) there, and the diffuse field 16 pi (1 - alpha) / (alpha S) times its power
-    (Kuttruff, Room Acoustics, 5th ed., eq. 5.44).
+    (critical distance: Kuttruff, Room Acoustics, ch. 5).
     """
     peak = max((float(np.abs(source.sound).max()) for source in scene.sources), default=0.0)
     if peak == 0.0:

@@ -18,6 +18,7 @@ const UPDATE_LIVES_MS = 1500;
 const LATE_MS = 3000;
 const ANNOUNCE_MS = 2500;
 const GAP_SHOWN_MS = 20000;
+const TICK_MS = 100;
 
 const find = (id) => document.getElementById(id);
 
@@ -30,6 +31,7 @@ const state = {
   trail: [],        // { kind, id, position, bornMs }, oldest first
   current: new Map(), // event id → the last update of a sound that goes on
   last: null,       // the newest update or event as a marker
+  unread: null,     // its message, until it is read out
   mark: null,       // the event that is pointed at or pinned, as a marker
   tracks: new Map(),
   latencies: [],
@@ -60,7 +62,8 @@ let table;
 let colours;
 let announcedAt = -Infinity;
 let gapTimer;
-let drawing = false;
+let dirty = true;
+let ticking = false;
 
 // --- what the server says -------------------------------------------------------------------------------------
 
@@ -213,7 +216,7 @@ function leaveTrail(shown) {
 
 function newest(message, shown) {
   state.last = shown;
-  readout.show({ kind: "event", ...message }, shown.bornMs, Date.now(), state.link);
+  state.unread = { kind: "event", ...message }; // read out with the next tick, so that numbers and plans agree
 }
 
 function learnLatency({ latency_s: latency }) {
@@ -270,13 +273,26 @@ function showLink(link, silentMs) {
   if (changed) redraw();
 }
 
-/** Ten times a second: everything that ages, ages, whether or not anything is heard. */
+/** Ten times a second while the page can be seen: one frame is asked for, never a second one before it came. */
+function nextTick() {
+  if (ticking) return;
+  ticking = true;
+  requestAnimationFrame(() => {
+    ticking = false;
+    tick();
+  });
+}
+
+/** Everything that ages, ages, whether or not anything is heard. */
 function tick() {
   const now = Date.now();
   for (const [id, { bornMs }] of state.current) if (now - bornMs > UPDATE_LIVES_MS) state.current.delete(id);
   for (const [id, { heardMs }] of state.tracks) if (now - heardMs > OLD_MS) state.tracks.delete(id);
   arraysPanel.tick(state.arrays, now, state.link);
-  readout.tick(now, state.link);
+  if (state.unread) readout.show(state.unread, state.last.bornMs, now, state.link);
+  else readout.tick(now, state.link);
+  if (state.unread) redraw();
+  state.unread = null;
   showMapAge(now);
   const states = state.arrays.map((held) => effectiveState(held, now, state.link));
   const healthy = states.filter((each) => each === "healthy").length;
@@ -285,7 +301,7 @@ function tick() {
   write(find("vital-clock"), state.link === "live" ? clock(serverNow(), false) : "–");
   const moving = state.last !== null && now - state.last.bornMs < OLD_MS + 500;
   const fading = state.images !== null && visibility(now - state.images.bornMs) > 0;
-  if (moving || fading || state.tracks.size > 0) redraw();
+  if (dirty || moving || fading || state.tracks.size > 0) draw(now);
 }
 
 function showMapAge(now) {
@@ -321,13 +337,9 @@ function colourMaps() {
   state.images = state.maps && { floor: paint(state.maps.floor, table), side: paint(state.maps.side, table), bornMs: state.maps.bornMs };
 }
 
+/** Something to draw has changed: it is drawn with the next tick, however many messages come until then. */
 function redraw() {
-  if (drawing) return;
-  drawing = true;
-  requestAnimationFrame(() => {
-    drawing = false;
-    draw();
-  });
+  dirty = true;
 }
 
 function scene(now) {
@@ -354,14 +366,14 @@ function scene(now) {
   };
 }
 
-function draw() {
+function draw(now) {
   if (!state.site) return;
+  dirty = false;
   const size = state.site.room.size_m;
   const fits = plans.map((plan) => plan.fit(size));
   // One scale for both views, so that they read as one drawing, unless that would waste a view's space.
   const common = Math.min(...fits);
   const shared = common > 0.85 * Math.max(...fits);
-  const now = Date.now();
   const shown = scene(now);
   plans.forEach((plan, index) => {
     plan.layout(size, shared ? common : fits[index]);
@@ -387,5 +399,5 @@ followPointer(plans[0], find("floor-pointer"));
 followPointer(plans[1], find("side-pointer"));
 find("map-choice").addEventListener("change", ({ target }) => heat.choose(target.value));
 find("gap-close").addEventListener("click", closeGap);
-setInterval(tick, 100);
+setInterval(nextTick, TICK_MS);
 live.start();

@@ -136,7 +136,7 @@ export class Plan {
     }
     this.g.globalAlpha = alpha;
     this.g.imageSmoothingEnabled = true;
-    this.g.imageSmoothingQuality = "high";
+    this.g.imageSmoothingQuality = "low";
     this.g.drawImage(image, ...this.#box(low, high));
     this.g.globalAlpha = 1;
   }
@@ -194,7 +194,7 @@ export class Plan {
     const { g } = this;
     const [i, k] = this.view.axes;
     const [x0, y0] = [this.left, this.bottom];
-    const step = niceStep(this.scale, 40);
+    const step = niceStep(this.scale, 46);
     g.font = SMALL;
     g.fillStyle = this.c.muted;
     g.strokeStyle = this.c.wall;
@@ -263,7 +263,7 @@ export class Plan {
       const rank = (index + 1) / trail.length;
       const [x, y] = this.at(item.position);
       const old = age > OLD_MS;
-      g.globalAlpha = old ? 0.16 + 0.3 * rank : (0.25 + 0.6 * rank) * Math.max(0.3, 1 - age / OLD_MS);
+      g.globalAlpha = old ? 0.25 + 0.4 * rank : (0.25 + 0.6 * rank) * Math.max(0.3, 1 - age / OLD_MS);
       g.beginPath();
       g.arc(x, y, item.kind === "event" ? 4 : 2.5, 0, 2 * Math.PI);
       if (old) {

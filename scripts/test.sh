@@ -1,0 +1,38 @@
+#!/bin/sh
+# Sets livessl up with all that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
+set -eu
+cd "$(dirname "$0")/.."
+packages="chromium libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd"
+
+missing=
+for package in $packages; do
+    [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2>/dev/null || true)" = installed ] || missing="$missing $package"
+done
+# Runs apt-get as root if that needs no password; fails otherwise.
+apt_get() {
+    command -v apt-get >/dev/null || return 1
+    if [ "$(id -u)" -eq 0 ]; then
+        DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 "$@" >/dev/null
+    else
+        sudo -n env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=120 "$@" >/dev/null 2>&1
+    fi
+}
+
+if [ -n "$missing" ]; then
+    echo "test: installing$missing" >&2
+    # shellcheck disable=SC2086  # a list of words
+    if ! { apt_get update && apt_get install -y --no-install-recommends $missing; }; then
+        echo "test: could not. Skipped are the tests of the dashboard in a browser without chromium, of the units in deploy/" >&2
+        echo "test: without systemd, of a sound card without the others. To have them: sudo apt-get install$missing" >&2
+    fi
+fi
+
+sh scripts/setup.sh dev
+PATH="$PWD/.venv/bin:$PATH"
+export PATH
+set -x
+ruff check
+ruff format --check
+mypy
+lint-imports
+pytest "$@"

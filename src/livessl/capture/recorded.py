@@ -1,0 +1,153 @@
+"""Recordings that stand in for devices: whose they are, on which channels, and when they began."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from livessl.capture.devices import ArrayRecording, DeviceError, Looped, Placed, Spliced, WavRecording
+from livessl.capture.line import Line, recording_channels
+from livessl.config import SceneDeviceConfig, Site, WavDeviceConfig
+from livessl.session import Session
+from livessl.simulate.scene import make_scene, render, synthesised_sounds
+
+
+@dataclass(frozen=True)
+class Part:
+    """One array's recording: what is heard on which channels, and when it began."""
+
+    array: str
+    placed: Placed
+    channels: tuple[int, ...]
+
+    def line(self, site: Site) -> Line:
+        """The line that cuts it into messages."""
+        return Line(site, {self.array: self.channels}, self.placed.recording.sample_rate_hz)
+
+
+def parts_from_wavs(
+    site: Site, wavs: Mapping[str, Path], channels: Mapping[str, Sequence[int]] | None = None, start_ns: int = 0
+) -> list[Part]:
+    """Recordings that begin together at `start_ns`, but for each array's `wav_offset_s` in the site file.
+
+    Raises
+    ------
+    DeviceError
+        With every file that does not fit, one a line.
+    """
+    wanted = channels or {}
+    return _parts(
+        site,
+        [
+            (name, path, start_ns + (round(site.arrays[name].wav_offset_s * 1e9) if name in site.arrays else 0))
+            for name, path in wavs.items()
+        ],
+        wanted,
+    )
+
+
+def parts_from_session(site: Site, session: Session) -> list[Part]:
+    """A session's recordings at their original times.
+
+    Raises
+    ------
+    DeviceError
+        With every file that does not fit, one a line.
+    """
+    return _parts(site, [(piece.array, session.path(piece), piece.start_ns) for piece in session.pieces], {})
+
+
+def end_ns(parts: Iterable[Part]) -> int:
+    """Site time at which the last recording ends."""
+    return max(part.placed.start_ns + round(part.placed.recording.duration_s * 1e9) for part in parts)
+
+
+def repeated(parts: Iterable[Part]) -> list[Part]:
+    """The same recordings, again and again."""
+    return [
+        Part(part.array, Placed(Looped(part.placed.recording), part.placed.start_ns), part.channels) for part in parts
+    ]
+
+
+def parts_from_scene(
+    site: Site,
+    arrays: Iterable[str],
+    config: SceneDeviceConfig,
+    start_ns: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Part]:
+    """A simulated scene as the arrays of one node would record it; every node with the same numbers hears the same."""
+    scene = make_scene(
+        site.room.size_m,
+        rt60_s=config.rt60_s,
+        sounds=synthesised_sounds(config.sample_rate_hz, config.seed),
+        count=config.events,
+        sample_rate_hz=config.sample_rate_hz,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=config.seed,
+    )
+    order = list(site.arrays)
+    parts = []
+    for array in arrays:
+        microphones = site.array(array).microphones_m
+        samples = render(scene, microphones, seed=config.seed + 1 + order.index(array), progress=progress)
+        recording = ArrayRecording(f"scene {config.seed}", config.sample_rate_hz, samples)
+        parts.append(Part(array, Placed(recording, start_ns), tuple(range(1, len(microphones) + 1))))
+    return parts
+
+
+def parts_from_node(
+    site: Site,
+    node: str,
+    start_ns: int,
+    base: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Part]:
+    """What a node whose device is no audio interface plays: its WAV files (relative to `base`), or its scene.
+
+    Raises
+    ------
+    DeviceError
+        With every file that does not fit, one a line.
+    """
+    config = site.nodes[node].device
+    arrays = site.nodes[node].arrays
+    if isinstance(config, SceneDeviceConfig):
+        parts = parts_from_scene(site, arrays, config, start_ns, progress)
+    else:
+        assert isinstance(config, WavDeviceConfig)
+        missing = [array for array in arrays if array not in config.files]
+        if missing:
+            raise DeviceError(f"nodes.{node}.device.files: expected a file for array {missing[0]!r}; add it")
+        wavs = {array: base / config.files[array] for array in arrays}
+        parts = parts_from_wavs(site, wavs, start_ns=start_ns)
+    return repeated(parts) if config.loop else parts
+
+
+def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping[str, Sequence[int]]) -> list[Part]:
+    stretches: dict[str, list[Placed]] = {}
+    chosen: dict[str, tuple[int, ...]] = {}
+    faults: list[str] = []
+    for array, path, start_ns in files:
+        if array not in site.arrays:
+            faults.append(f"{array}={path}: no such array; arrays are {', '.join(site.arrays)}")
+            continue
+        try:
+            recording = WavRecording(path)
+            chosen[array] = tuple(recording_channels(site, array, recording, channels.get(array)))
+        except DeviceError as error:
+            faults.append(str(error))
+            continue
+        stretches.setdefault(array, []).append(Placed(recording, start_ns))
+    if faults:
+        raise DeviceError("\n".join(faults))
+    return [Part(array, _spliced(placed), chosen[array]) for array, placed in stretches.items()]
+
+
+def _spliced(stretches: Sequence[Placed]) -> Placed:
+    if len(stretches) == 1:
+        return stretches[0]
+    ordered = sorted(stretches, key=lambda stretch: stretch.start_ns)
+    return Placed(Spliced(tuple(ordered)), ordered[0].start_ns)

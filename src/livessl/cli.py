@@ -1,0 +1,587 @@
+"""The command line: arguments, progress bars, exit codes. No logic."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from tqdm import tqdm
+
+from livessl import __version__, demo, replay
+from livessl.capture.devices import DeviceError
+from livessl.capture.line import Line
+from livessl.capture.node import Node, UndeliveredError
+from livessl.capture.record import Recorder, record_parts
+from livessl.capture.recorded import Part, end_ns, parts_from_node, parts_from_session, parts_from_wavs, repeated
+from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns
+from livessl.config import ConfigError, Fault, Site, SoundDeviceConfig, load_site
+from livessl.core.estimators import ESTIMATORS
+from livessl.core.types import Event
+from livessl.messages import JsonObject, Messages
+from livessl.server.app import Server
+from livessl.server.receiver import BindError
+from livessl.server.store import StoreError
+from livessl.session import read_session
+from livessl.simulate.export import write_scene
+from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
+
+OK: Final = 0
+FAILED: Final = 1
+WRONG_USE: Final = 2
+INTERRUPTED: Final = 130
+
+WITHIN_M: Final = 0.5
+"""The demo calls an event located if it is this near to the truth."""
+
+_stop = threading.Event()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns its exit code: 0 success, 1 failure at run time, 2 wrong use or configuration."""
+    parsed = _parser().parse_args(arguments)
+    logging.basicConfig(
+        level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
+    )
+    _stop.clear()
+    previous = [signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        return int(parsed.run(parsed))
+    except ConfigError as error:
+        for fault in error.faults:
+            _complain(str(fault))
+        return WRONG_USE
+    except DeviceError as error:
+        for line in str(error).splitlines():
+            _complain(line)
+        return WRONG_USE
+    except (BindError, StoreError, UndeliveredError, demo.DemoError, OSError) as error:
+        _complain(str(error))
+        return FAILED
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        for number, handler in zip((signal.SIGINT, signal.SIGTERM), previous, strict=True):
+            signal.signal(number, handler)
+
+
+class _Once:
+    """Ctrl-C and SIGTERM mean the same: loops look at `_stop`, everything else is interrupted."""
+
+    polite = False
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
+    _stop.set()
+    if not _Once.polite:
+        raise KeyboardInterrupt
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="livessl", description="Tells, live, where in a room a sound happened.", epilog="example: livessl demo"
+    )
+    parser.add_argument("--version", action="version", version=f"livessl {__version__}")
+    parser.add_argument("--verbose", action="store_true", help="say more on stderr")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
+        sub = commands.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + ".", epilog=f"example: {example}"
+        )
+        sub.set_defaults(run=run)
+        return sub
+
+    sub = command("demo", _demo, "show everything with no hardware", "livessl demo --once")
+    sub.add_argument("--once", action="store_true", help="run the scene once, print each event and its error")
+    sub.add_argument("--json", action="store_true", help="print one JSON object per event")
+    sub.add_argument("--port", type=int, default=8000, help="of the dashboard (default 8000)")
+    sub.add_argument("--events", type=_positive, default=8, help="sounds in the scene (default 8)")
+    sub.add_argument("--no-browser", action="store_true", help="do not open the dashboard")
+
+    sub = command("serve", _serve, "run the fusion server with API and dashboard", "livessl serve --site site.yaml")
+    _add_site(sub)
+    _add_method(sub)
+
+    sub = command("capture", _capture, "run a capture node", "livessl capture --site site.yaml --node lab-pc")
+    _add_site(sub)
+    sub.add_argument("--node", required=True, help="name of the node in the site file")
+    _add_wav(sub, "play FILE at real speed instead of the device; give it for each array of the node")
+    sub.add_argument("--loop", action="store_true", help="play the files again and again")
+    sub.add_argument("--start-at", type=_time, metavar="TIME", help="when the files begin, RFC 3339 (default now)")
+
+    sub = command(
+        "locate",
+        _locate,
+        "localize what was recorded",
+        "livessl locate --site site.yaml --wav north=north.wav --wav south=south.wav",
+    )
+    _add_site(sub)
+    _add_wav(sub, "recording of an array; all begin together", required=True)
+    _add_method(sub)
+    sub.add_argument("--json", action="store_true", help="print one JSON object per event")
+
+    sub = command("replay", _replay, "play a recorded session through a server", "livessl replay session/ --speed 2")
+    sub.add_argument("directory", type=Path, metavar="DIR", help="made by record or simulate")
+    sub.add_argument("--site", type=Path, help="site file (default: the session's own)")
+    sub.add_argument("--speed", type=_speed, default=1.0, help="times real time, or 'max' (default 1)")
+    sub.add_argument("--server", metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570")
+    sub.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
+    sub.add_argument("--json", action="store_true", help="print one JSON object per event")
+    _add_method(sub)
+
+    sub = command(
+        "record", _record, "record a session for replay", "livessl record --site site.yaml --node lab-pc --out session/"
+    )
+    _add_site(sub)
+    sub.add_argument("--node", required=True, help="name of the node in the site file")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must not hold a session")
+    sub.add_argument("--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV")
+    sub.add_argument("--duration", type=_seconds, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
+    _add_wav(sub, "record FILE at real speed instead of the device: a rehearsal")
+
+    sub = command(
+        "simulate",
+        _simulate,
+        "simulate recordings in the site's room",
+        "livessl simulate --site site.yaml --rt60 0.7 --out session/",
+    )
+    _add_site(sub)
+    sub.add_argument("--events", type=Path, metavar="DIR", help="WAV or FLAC files to play (default: our own sounds)")
+    sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to")
+    sub.add_argument("--count", type=_positive, default=8, help="sounds in the scene (default 8)")
+    sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
+    sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
+
+    sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
+    sub.add_argument("site", type=Path)
+    sub.add_argument("--json", action="store_true", help="print the result as JSON")
+
+    sub = command("devices", _devices, "list audio devices", "livessl devices")
+    sub.add_argument("--json", action="store_true", help="print the list as JSON")
+    return parser
+
+
+def _add_site(parser: Any) -> None:
+    parser.add_argument("--site", type=Path, required=True, help="site file")
+
+
+def _add_method(parser: Any) -> None:
+    parser.add_argument("--method", choices=sorted(ESTIMATORS), help="estimator (default: the site's)")
+
+
+def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
+    parser.add_argument(
+        "--wav", action="append", type=_assignment, default=[], metavar="ARRAY=FILE", help=text, required=required
+    )
+    parser.add_argument(
+        "--channels",
+        action="append",
+        type=_channels,
+        default=[],
+        metavar="ARRAY=1,2,3,4",
+        help="channels of the file, from 1, in microphone order",
+    )
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    clock = SystemClock()
+    with tempfile.TemporaryDirectory(prefix="livessl-demo-") as name, _bar("simulating the room", "source") as bar:
+        directory = Path(name)
+        site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
+        truth = demo.read_truth(directory)
+        start_ns = clock.now_ns() + demo.LEAD_NS
+        with demo.running(directory, site, start_ns, loop=not arguments.once, clock=clock) as url:
+            print(f"dashboard: {url}", file=sys.stderr)
+            if not arguments.once and not arguments.no_browser:
+                threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+            until_ns = start_ns + round((scene.duration_s + 1.5) * 1e9) if arguments.once else None
+            events = []
+            if not arguments.json:
+                print(_DEMO_HEAD)
+            for event in demo.events_of(url, until_ns, clock):
+                events.append(event)
+                outcome = demo.nearest_source(truth, event, start_ns, scene.duration_s)
+                print(_demo_json(outcome) if arguments.json else _demo_row(outcome), flush=True)
+                if not arguments.once:
+                    events.clear()
+    outcomes = demo.match(truth, events, start_ns, scene.duration_s)
+    good = [o for o in outcomes if o.located and o.error_m is not None and o.error_m <= WITHIN_M]
+    surplus = len(events) - len({o.event["id"] for o in outcomes if o.event is not None})
+    summary = f"{len(good)} of {len(outcomes)} sounds located within {WITHIN_M:g} m; {surplus} events without a sound"
+    print(summary, file=sys.stderr)
+    return OK if len(good) == len(outcomes) else FAILED
+
+
+_DEMO_HEAD: Final = f"{'time':>7}  {'sound':<14} {'true position':<22} {'found':<22} {'error':>7}  status"
+
+
+def _demo_row(outcome: demo.Outcome) -> str:
+    event = outcome.event
+    assert event is not None
+    error = "-" if outcome.error_m is None else f"{outcome.error_m:.2f} m"
+    return (
+        f"{outcome.start_s:6.2f}s  {outcome.name:<14} {_xyz(outcome.true_position_m):<22} "
+        f"{_xyz(event['position_m']):<22} {error:>7}  {event['status']}"
+    )
+
+
+def _demo_json(outcome: demo.Outcome) -> str:
+    truth = {"name": outcome.name, "start_s": outcome.start_s, "position_m": list(outcome.true_position_m)}
+    return json.dumps({**(outcome.event or {}), "truth": truth, "error_m": outcome.error_m})
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    server = Server(site, SystemClock(), method=arguments.method)
+    logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
+    _run_server(server)
+    return OK
+
+
+def _run_server(server: Server) -> None:
+    try:
+        server.run()
+    except KeyboardInterrupt:
+        logging.info("stopped")
+
+
+def _capture(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    config = _node(site, arguments.node, arguments.site)
+    clock = SystemClock()
+    run_id = f"{arguments.node}-{os.getpid()}-{clock.now_ns()}"[-64:]
+    if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
+        from livessl.capture.sound_device import SoundDevice
+
+        device = SoundDevice(config.device, max(map(max, config.arrays.values())), clock)
+        line = Line(site, config.arrays, device.sample_rate_hz)
+        node = Node(arguments.node, config.server, [line], clock, run_id)
+        _Once.polite = True
+        node.run_device(device, _stop.is_set)
+        return OK
+    with _bar("simulating the room", "source") as bar:
+        parts = _played_parts(arguments, site, clock.now_ns(), bar)
+    lines = [part.line(site) for part in parts]
+    node = Node(arguments.node, config.server, lines, clock, run_id)
+    _Once.polite = True
+    with _seconds_bar(parts) as progress:
+        node.run_recordings([part.placed for part in parts], _stop.is_set, clock=clock, progress=progress)
+    return OK
+
+
+def _played_parts(
+    arguments: argparse.Namespace, site: Site, now_ns: int, bar: Callable[[int, int], None]
+) -> list[Part]:
+    """What a node plays instead of a device."""
+    start_ns = getattr(arguments, "start_at", None) or now_ns
+    if not arguments.wav:
+        parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
+    else:
+        wavs = dict(arguments.wav)
+        strangers = sorted(set(wavs) - set(site.nodes[arguments.node].arrays))
+        if strangers:
+            known = ", ".join(site.nodes[arguments.node].arrays)
+            raise DeviceError(f"--wav {strangers[0]}=…: node {arguments.node!r} has the arrays {known}")
+        parts = parts_from_wavs(site, wavs, dict(arguments.channels), start_ns)
+    return repeated(parts) if getattr(arguments, "loop", False) else parts
+
+
+def _locate(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    parts = parts_from_wavs(site, dict(arguments.wav), dict(arguments.channels))
+    messages = Messages(site, 0, utc=False)
+    found = 0
+    with _seconds_bar(parts) as progress:
+        for output in replay.run(site, parts, UnpacedClock(), method=arguments.method, progress=progress):
+            if isinstance(output, Event):
+                found += 1
+                _print_event(messages.event(output), as_json=arguments.json)
+    if not found:
+        factor = site.activity.floor_factor
+        _complain(
+            f"no sound found: nothing rose {factor:g} times in power above the background; "
+            "see activity.floor_factor and band_hz in the site file",
+            kind="note",
+        )
+    return OK
+
+
+def _print_event(event: JsonObject, *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(event), flush=True)
+        return
+    spread = max(event["covariance_m2"][k][k] for k in range(3)) ** 0.5 if event["covariance_m2"] else float("nan")
+    print(
+        f"{event['start_s']:9.2f} s  {event['duration_s']:5.2f} s  {_xyz(event['position_m']):<22} ± {spread:.2f} m  "
+        f"confidence {event['confidence']:.2f}  {event['status']:<14} {', '.join(event['arrays'])}"
+        + (f"  ({event['reason']})" if event["reason"] else ""),
+        flush=True,
+    )
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    session = read_session(arguments.directory)
+    site = load_site(arguments.site) if arguments.site else session.site()
+    parts = parts_from_session(site, session)
+    start_ns = min(part.placed.start_ns for part in parts)
+    if arguments.server is not None:
+        _Once.polite = True
+        _send_session(site, parts, arguments.server, start_ns, arguments.speed)
+        return OK
+    here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "events_db": None})
+    site = site.model_copy(update={"server": here})
+    show: Callable[[JsonObject], None] = lambda event: _print_event(event, as_json=arguments.json)  # noqa: E731
+    server = Server(site, SystemClock(), method=arguments.method, on_event=show)
+    logging.info("dashboard on %s", server.url)
+    failures: list[Exception] = []
+
+    def send() -> None:
+        try:
+            _send_session(site, parts, server.engine.endpoint, start_ns, arguments.speed)
+        except Exception as error:  # noqa: BLE001 - raised again by the main thread
+            failures.append(error)
+        if arguments.once or failures:
+            server.engine.wait_idle()
+            server.stop()
+        else:
+            logging.info("the session has ended; the dashboard stays until Ctrl-C")
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    _run_server(server)
+    _stop.set()
+    sender.join(timeout=4.0)
+    if failures:
+        raise failures[0]
+    return OK
+
+
+def _send_session(site: Site, parts: Sequence[Part], endpoint: str, start_ns: int, speed: float) -> None:
+    clock = SystemClock()
+    pace = UnpacedClock(start_ns) if speed == float("inf") else PacedClock(start_ns, speed)
+    lines = [part.line(site) for part in parts]
+    node = Node("replay", endpoint, lines, clock, f"replay-{os.getpid()}-{clock.now_ns()}", replay=True)
+    node.link.wait_connected(_stop.is_set)
+    with _seconds_bar(parts) as progress:
+        node.run_recordings([part.placed for part in parts], _stop.is_set, clock=pace, progress=progress)
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    config = _node(site, arguments.node, arguments.site)
+    clock = SystemClock()
+    if (arguments.out / "session.yaml").exists():
+        raise ConfigError([Fault(f"--out {arguments.out}", "already holds a session; choose another folder")])
+    _Once.polite = True
+    begun_ns = clock.now_ns()
+
+    def over() -> bool:
+        spent_s = (clock.now_ns() - begun_ns) / 1e9
+        return _stop.is_set() or (arguments.duration is not None and spent_s >= arguments.duration)
+
+    if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
+        from livessl.capture.sound_device import SoundDevice
+
+        device = SoundDevice(config.device, max(map(max, config.arrays.values())), clock)
+        with device, Recorder(arguments.out, site, config.arrays, device.sample_rate_hz, arguments.format) as recorder:
+            for block in device:
+                recorder.push(block)
+                if over():
+                    break
+        recorded = recorder.recorded
+    else:
+        with _bar("simulating the room", "source") as bar:
+            parts = _played_parts(arguments, site, clock.now_ns(), bar)
+        recorded = record_parts(arguments.out, site, parts, clock, over, arguments.format)
+    if not recorded:
+        _complain("nothing was recorded: the device delivered no sound")
+        return FAILED
+    logging.info("recorded to %s", arguments.out)
+    return OK
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    rate = float(arguments.sample_rate)
+    try:
+        sounds = read_sounds(arguments.events, rate) if arguments.events else synthesised_sounds(rate, arguments.seed)
+        scene = make_scene(
+            site.room.size_m,
+            rt60_s=arguments.rt60,
+            sounds=sounds,
+            count=arguments.count,
+            sample_rate_hz=rate,
+            c_m_s=site.c_m_s,
+            keep_away_m=[spec.centre_m for spec in site.specs],
+            seed=arguments.seed,
+        )
+        with _bar("simulating the room", "source") as bar:
+            write_scene(arguments.out, site, scene, seed=arguments.seed, progress=bar)
+    except ValueError as error:
+        _complain(str(error))
+        return WRONG_USE
+    logging.info("%d sounds in %.1f s written to %s", len(scene.sources), scene.duration_s, arguments.out)
+    return OK
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    try:
+        site = load_site(arguments.site)
+    except ConfigError as error:
+        if arguments.json:
+            faults = [{"where": fault.where, "what": fault.what} for fault in error.faults]
+            print(json.dumps({"valid": False, "faults": faults}))
+            return WRONG_USE
+        raise
+    grid = site.search_grid()
+    if arguments.json:
+        print(
+            json.dumps(
+                {"valid": True, "faults": [], "site": site.site, "arrays": list(site.arrays), "nodes": grid.size}
+            )
+        )
+    else:
+        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.specs)
+        print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid nodes")
+    return OK
+
+
+def _devices(arguments: argparse.Namespace) -> int:
+    from livessl.capture.sound_device import input_devices
+
+    devices = input_devices()
+    if arguments.json:
+        print(json.dumps([_device_json(device) for device in devices]))
+    elif not devices:
+        print("no audio input found")
+    else:
+        print(f"{'channels':>8}  {'rate':>8}  name")
+        for device in devices:
+            print(f"{device.channels:8d}  {device.default_sample_rate_hz:6.0f}Hz  {device.host_api}: {device.name}")
+    return OK
+
+
+def _device_json(device: Any) -> JsonObject:
+    return {
+        "name": device.name,
+        "host_api": device.host_api,
+        "channels": device.channels,
+        "default_sample_rate_hz": device.default_sample_rate_hz,
+    }
+
+
+def _node(site: Site, name: str, path: Path) -> Any:
+    if name not in site.nodes:
+        known = ", ".join(site.nodes) or "none"
+        raise ConfigError([Fault(f"{path}: nodes", f"expected one of {known}, got --node {name}")])
+    return site.nodes[name]
+
+
+def _bar(what: str, unit: str) -> Any:
+    return _Progress(what, unit)
+
+
+class _Progress:
+    """A progress bar on stderr, only on a terminal and only for what takes longer than 2 s."""
+
+    def __init__(self, what: str, unit: str) -> None:
+        self._bar: Any = tqdm(desc=what, unit=unit, delay=2.0, leave=False, disable=None, total=1)
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._bar.close()
+
+    def __call__(self, done: int, total: int) -> None:
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)
+
+
+class _seconds_bar:  # noqa: N801 - used as a function
+    """A progress bar over the site time of recordings."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._start_ns = min(part.placed.start_ns for part in parts)
+        endless = any(part.placed.recording.duration_s == float("inf") for part in parts)
+        self._total = 0 if endless else round((end_ns(parts) - self._start_ns) / 1e9)
+        self._progress = _Progress("listening", "s")
+
+    def __enter__(self) -> Callable[[int], None]:
+        return lambda now_ns: self._progress(round((now_ns - self._start_ns) / 1e9), self._total)
+
+    def __exit__(self, *exc: object) -> None:
+        self._progress.__exit__()
+
+
+def _complain(text: str, kind: str = "error") -> None:
+    print(f"livessl: {kind}: {text}", file=sys.stderr)
+
+
+def _xyz(position: Sequence[float] | None) -> str:
+    return "-" if position is None else "(" + ", ".join(f"{x:5.2f}" for x in position) + ")"
+
+
+def _assignment(text: str) -> tuple[str, Path]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
+    return name, Path(path)
+
+
+def _channels(text: str) -> tuple[str, list[int]]:
+    name, equals, numbers = text.partition("=")
+    try:
+        channels = [int(number) for number in numbers.split(",")]
+    except ValueError:
+        channels = []
+    if not (name and equals and channels):
+        raise argparse.ArgumentTypeError(f"expected ARRAY=1,2,3,4, got {text!r}")
+    return name, channels
+
+
+def _time(text: str) -> int:
+    try:
+        return utc_ns(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
+    return int(text)
+
+
+def _not_negative(text: str) -> float:
+    return _number(text, lambda value: value >= 0, "a number >= 0")
+
+
+def _seconds(text: str) -> float:
+    return _number(text, lambda value: value > 0, "a number > 0")
+
+
+def _speed(text: str) -> float:
+    return float("inf") if text == "max" else _number(text, lambda value: value > 0, "a number > 0 or 'max'")
+
+
+def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not (valid(value) and value < float("inf")):
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+    return value

@@ -1,0 +1,135 @@
+"""The fusion server as one process: engine thread, event loop, HTTP. `serve` runs until it is told to end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import uvicorn
+
+from livessl.clock import Clock
+from livessl.config import Site
+from livessl.messages import JsonObject
+from livessl.server.engine import Engine
+from livessl.server.hub import Hub
+from livessl.server.receiver import BindError
+from livessl.server.store import Store
+from livessl.server.web import create_app
+
+SHUTDOWN_S: Final = 2
+"""Open connections get this long to end."""
+
+_log = logging.getLogger(__name__)
+
+
+class Server:
+    """A fusion server bound to its two addresses, not yet running.
+
+    Parameters
+    ----------
+    site : Site
+    clock : Clock
+    method : str or None
+        Estimator, instead of the site's.
+    on_event : callable or None
+        Gets every event besides the subscribers; called on the engine's thread.
+
+    Raises
+    ------
+    BindError
+        Where an address is taken.
+    StoreError
+        Where the event database cannot be used.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        clock: Clock,
+        *,
+        method: str | None = None,
+        on_event: Callable[[JsonObject], None] | None = None,
+    ) -> None:
+        self._on_event = on_event
+        self._hub = Hub()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._http = _listen(site.server.http.host, site.server.http.port)
+        try:
+            self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
+            self.engine = Engine(site, clock, self._store, self._publish, method)
+        except BaseException:
+            self._http.close()
+            raise
+        app = create_app(site, self.engine, self._hub, self._store)
+        self._uvicorn = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                ws_per_message_deflate=False,  # costs thirty times what it saves on small messages
+                timeout_graceful_shutdown=SHUTDOWN_S,
+            )
+        )
+        host, port = self._http.getsockname()[:2]
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+    def run(self) -> None:
+        """Serve until SIGINT, SIGTERM or `stop`; raises what made the engine fail, if it did."""
+        try:
+            asyncio.run(self._serve())
+        finally:
+            self.engine.stop()
+            self._store.close()
+            self._http.close()
+        if self.engine.failure is not None:
+            raise self.engine.failure
+
+    def stop(self) -> None:
+        """End `run`; from any thread."""
+        self._uvicorn.should_exit = True
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self.engine.start()
+        watch = asyncio.create_task(self._watch())
+        try:
+            await self._uvicorn.serve(sockets=[self._http])
+        finally:
+            watch.cancel()
+            self._loop = None
+
+    async def _watch(self) -> None:
+        """Without its engine the server is of no use: better to end and be restarted than to look alive."""
+        while self.engine.failure is None:
+            await asyncio.sleep(0.2)
+        self.stop()
+
+    def _publish(self, message: JsonObject) -> None:
+        if self._on_event is not None and message["kind"] == "event":
+            self._on_event(message)
+        loop = self._loop
+        if loop is None:
+            return
+        try:
+            loop.call_soon_threadsafe(self._hub.publish, message)
+        except RuntimeError:  # the loop has just closed: nobody is left to tell
+            _log.debug("a message came after the end")
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        raise BindError(
+            f"server.http: cannot listen on {host}:{port}: {error.strerror}; is another server running? "
+            "Stop it or choose another port"
+        ) from error
+    return listener

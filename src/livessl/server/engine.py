@@ -1,0 +1,246 @@
+"""The server's working thread: steps the fusion with what the nodes sent, and hands on what there is to tell."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from livessl import wire
+from livessl.clock import Clock, utc_text
+from livessl.config import Site
+from livessl.core.fusion import ArrayStatus
+from livessl.core.types import FRAME_NS, Event, MapSnapshot, Message, Output, Track, TrackState, Update
+from livessl.messages import JsonObject, Messages, array_status
+from livessl.server.receiver import Joined, Left, Receiver
+from livessl.server.store import Store
+
+WAIT_S: Final = 0.02
+"""How long the thread waits for sound before it looks at the clock again."""
+
+BATCH: Final = 200
+"""Messages taken in before the fusion is stepped: a second of ten arrays."""
+
+STATUS_NS: Final = 500_000_000
+"""Between two reports on the arrays."""
+
+REPLAY_SILENT_NS: Final = 5_000_000_000
+"""A replay that sends nothing for so long is over."""
+
+_log = logging.getLogger(__name__)
+
+
+class Engine:
+    """Everything between the nodes and the hub.
+
+    Parameters
+    ----------
+    site : Site
+    clock : Clock
+    store : Store
+    publish : callable
+        Gets every message for subscribers; called on the engine's thread.
+    method : str or None
+        Estimator, instead of the site's.
+
+    Raises
+    ------
+    BindError
+        Where the address for the nodes is taken.
+    """
+
+    def __init__(
+        self, site: Site, clock: Clock, store: Store, publish: Callable[[JsonObject], None], method: str | None = None
+    ) -> None:
+        self._site = site
+        self._clock = clock
+        self._store = store
+        self._publish = publish
+        self._method = method
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
+        self._lock = threading.Lock()
+        self._map: MapSnapshot | None = None
+        self._tracks: dict[int, JsonObject] = {}
+        self._replay_now_ns: int | None = None
+        self._replay_heard_ns = 0
+        self._status_ns = 0
+        self._failure: BaseException | None = None
+        self._started_ns = clock.now_ns()
+        self.events = 0
+        self._begin()
+        self._receiver = Receiver(site, clock)
+
+    @property
+    def endpoint(self) -> str:
+        """Where nodes connect to."""
+        return self._receiver.endpoint
+
+    @property
+    def failure(self) -> BaseException | None:
+        """What ended one of the threads, if anything did."""
+        return self._failure or self._receiver.failure
+
+    @property
+    def mode(self) -> str:
+        """Live, or replay while a recorded session is being played."""
+        return "live" if self._replay_now_ns is None else "replay"
+
+    @property
+    def malformed(self) -> int:
+        """Messages refused since the start."""
+        return self._receiver.ingest.malformed
+
+    def start(self) -> None:
+        """Begin to work."""
+        self._receiver.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and give the address back."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=3.0)
+        self._receiver.stop()
+
+    def wait_idle(self) -> None:
+        """Return when the replay that is going on has ended and its last event is told."""
+        while self._replay_now_ns is not None and self.failure is None and self._thread.is_alive():
+            self._stop.wait(WAIT_S)
+
+    def now_ns(self) -> int:
+        """Site time: the clock's, or in a replay the recording's."""
+        replayed = self._replay_now_ns
+        return self._clock.now_ns() if replayed is None else replayed
+
+    def uptime_s(self) -> float:
+        """Seconds since the start."""
+        return (self._clock.now_ns() - self._started_ns) / 1e9
+
+    def arrays(self) -> list[JsonObject]:
+        """How every array is doing; from any thread."""
+        with self._lock:
+            statuses = self._fusion.status(self.now_ns())
+        return [self._array(status) for status in statuses]
+
+    def tracks(self) -> list[JsonObject]:
+        """The tracks that live now."""
+        with self._lock:
+            return list(self._tracks.values())
+
+    def latest_map(self) -> MapSnapshot | None:
+        """Power maps of the newest window."""
+        return self._map
+
+    def _array(self, status: ArrayStatus) -> JsonObject:
+        ingest = self._receiver.ingest
+        described = array_status(status, self._site.node_of(status.name))
+        described["counters"]["duplicates"] = ingest.duplicates[status.name]
+        described["counters"]["sequence_gaps"] = ingest.sequence_gaps[status.name]
+        problem = ingest.problem_of(status.name)
+        if problem is not None:
+            described["reason"] = problem
+            if described["state"] == "healthy":
+                described["state"] = "degraded"
+        return described
+
+    def _begin(self) -> None:
+        """A clean slate: nothing of another time may leak into this one."""
+        self._fusion = self._site.make_fusion(self._method)
+        self._messages: Messages | None = None
+        self._map = None
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._turn()
+        except BaseException as error:
+            self._failure = error
+            _log.exception("the fusion thread has failed; the server ends")
+            raise
+
+    def _turn(self) -> None:
+        batch: list[Message] = []
+        for item in self._receiver.take(BATCH, WAIT_S):
+            if isinstance(item, Joined | Left):
+                self._step(batch)
+                batch = []
+                self._join(item.hello) if isinstance(item, Joined) else self._leave(item.hello)
+            else:
+                batch.append(item)
+        self._step(batch)
+        now_ns = self._clock.now_ns()
+        if batch:
+            self._replay_heard_ns = now_ns
+        elif self._replay_now_ns is not None and now_ns - self._replay_heard_ns > REPLAY_SILENT_NS:
+            self._end_replay()
+        if now_ns - self._status_ns >= STATUS_NS:
+            self._status_ns = now_ns
+            self._publish({"kind": "arrays", "now_utc": utc_text(self.now_ns()), "arrays": self.arrays()})
+
+    def _join(self, hello: wire.Hello) -> None:
+        if hello.replay:
+            with self._lock:
+                self._begin()
+                self._replay_now_ns = 0
+                self._replay_heard_ns = self._clock.now_ns()
+        for array, rate_hz in hello.arrays.items():
+            self._fusion.prepare(array, rate_hz)
+
+    def _leave(self, hello: wire.Hello) -> None:
+        _log.info("node %r has ended", hello.node)
+        if hello.replay:
+            self._end_replay()
+            return
+        with self._lock:
+            for array in hello.arrays:
+                self._fusion.leave(array)
+
+    def _end_replay(self) -> None:
+        with self._lock:
+            outputs = self._fusion.flush(self.now_ns())
+        self._tell(outputs)
+        with self._lock:
+            self._begin()
+            self._replay_now_ns = None
+            ended, self._tracks = list(self._tracks.values()), {}
+        for track in ended:
+            self._publish({**track, "state": str(TrackState.END)})
+
+    def _step(self, batch: Sequence[Message]) -> None:
+        if self._messages is None:
+            if not batch:
+                return
+            origin_ns = min(message.raster for message in batch) * FRAME_NS
+            self._messages = Messages(self._site, origin_ns, utc=True)
+        if self._replay_now_ns is not None and batch:
+            newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
+            self._replay_now_ns = max(self._replay_now_ns, newest_ns)
+        with self._lock:
+            outputs = self._fusion.step(batch, self.now_ns())
+        self._tell(outputs)
+
+    def _tell(self, outputs: Sequence[Output]) -> None:
+        if self._messages is None:
+            return
+        for output in outputs:
+            if isinstance(output, Event):
+                event = self._messages.event(output)
+                self._store.add(event, output.start_ns)
+                self.events += 1
+                self._publish(event)
+            elif isinstance(output, Update):
+                self._publish(self._messages.update(output))
+            elif isinstance(output, Track):
+                self._keep_track(self._messages.track(output), output)
+            else:
+                self._map = output
+
+    def _keep_track(self, message: JsonObject, track: Track) -> None:
+        with self._lock:
+            if track.state is TrackState.END:
+                self._tracks.pop(track.id, None)
+            else:
+                self._tracks[track.id] = message
+        self._publish(message)

@@ -1,0 +1,157 @@
+"""Who is connected and what they have sent: greetings, sequence numbers, acknowledgements. It owns no socket."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from typing import Final
+
+from livessl import wire
+from livessl.config import Site
+from livessl.core.types import Message
+
+ACK_NS: Final = 500_000_000
+"""Every node hears from us at least this often."""
+
+GONE_NS: Final = 2_000_000_000
+"""A node silent for so long no longer holds its name and its arrays."""
+
+NOTICE_NS: Final = 60_000_000_000
+"""One notice a minute about senders of rubbish, not one a message."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Peer:
+    """One node's run."""
+
+    routing_id: bytes
+    hello: wire.Hello
+    heard_ns: int
+    sequences: dict[str, int] = field(default_factory=dict)
+    ended: bool = False
+
+
+@dataclass(slots=True)
+class Arrival:
+    """What one piece of data brought."""
+
+    message: Message | None = None
+    joined: wire.Hello | None = None
+    left: wire.Hello | None = None
+    reply: wire.Ack | None = None
+
+
+class Ingest:
+    """The server's side of the link, sans I/O: data in, messages and replies out.
+
+    Parameters
+    ----------
+    site : Site
+        Which arrays there are.
+    """
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._peers: dict[bytes, Peer] = {}
+        self._acked_ns = 0
+        self._notice_ns = -NOTICE_NS
+        self.malformed = 0
+        self.duplicates = dict.fromkeys(site.arrays, 0)
+        self.sequence_gaps = dict.fromkeys(site.arrays, 0)
+
+    def problem_of(self, array: str) -> str | None:
+        """What the node says is wrong with the device that an array is on."""
+        return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
+
+    def receive(self, routing_id: bytes, data: bytes, now_ns: int) -> Arrival:
+        """Take in one message from one peer."""
+        try:
+            message = wire.decode(data)
+        except wire.WireError as error:
+            return self._reject(error, now_ns)
+        if isinstance(message, wire.Hello):
+            return self._greet(routing_id, message, now_ns)
+        peer = self._peers.get(routing_id)
+        if peer is None or peer.ended:
+            return Arrival(reply=wire.Ack(run_id="?", sequences={}, who_are_you=True))
+        peer.heard_ns = now_ns
+        if isinstance(message, wire.Bye):
+            peer.ended = True
+            return Arrival(left=peer.hello)
+        if isinstance(message, wire.Ack):
+            return self._reject(wire.WireError("a node sent an acknowledgement; only servers do"), now_ns)
+        if message.array not in peer.hello.arrays:
+            return self._reject(
+                wire.WireError(f"node {peer.hello.node!r} sent array {message.array!r}, which it did not announce"),
+                now_ns,
+            )
+        last = peer.sequences.get(message.array, 0)
+        if message.sequence <= last:
+            self.duplicates[message.array] += 1
+            return Arrival()
+        self.sequence_gaps[message.array] += message.sequence - last - 1 if last else 0
+        peer.sequences[message.array] = message.sequence
+        return Arrival(message=message)
+
+    def acknowledgements(self, now_ns: int) -> list[tuple[bytes, wire.Ack]]:
+        """Replies due by now; also forgets nodes that have been silent for long."""
+        if now_ns - self._acked_ns < ACK_NS:
+            return []
+        self._acked_ns = now_ns
+        self._peers = {
+            key: peer for key, peer in self._peers.items() if now_ns - peer.heard_ns < 30 * GONE_NS and not peer.ended
+        }
+        return [(peer.routing_id, _ack(peer)) for peer in self._peers.values()]
+
+    def live_nodes(self, now_ns: int) -> list[wire.Hello]:
+        """Nodes heard from lately."""
+        return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.heard_ns < GONE_NS]
+
+    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> Arrival:
+        refusal = self._refusal(routing_id, hello, now_ns)
+        if refusal is not None:
+            return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
+        same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
+        peer = Peer(routing_id, hello, now_ns, same_run.sequences if same_run else {})
+        self._peers = {
+            key: other for key, other in self._peers.items() if other.hello.node != hello.node and key != routing_id
+        }
+        self._peers[routing_id] = peer
+        if same_run is None:
+            _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
+        return Arrival(joined=None if same_run else hello, reply=_ack(peer))
+
+    def _refusal(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
+        unknown = [name for name in hello.arrays if name not in self._site.arrays]
+        if unknown:
+            return f"no array {unknown[0]!r} in the server's site file; it has {', '.join(self._site.arrays)}"
+        others = [
+            peer
+            for key, peer in self._peers.items()
+            if key != routing_id
+            and not peer.ended
+            and peer.hello.run_id != hello.run_id
+            and now_ns - peer.heard_ns < GONE_NS
+        ]
+        for other in others:
+            if other.hello.node == hello.node:
+                return f"a node named {hello.node!r} is connected already; names must differ"
+            taken = sorted(set(other.hello.arrays) & set(hello.arrays))
+            if taken:
+                return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
+            if other.hello.replay != hello.replay:
+                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
+        return None
+
+    def _reject(self, error: wire.WireError, now_ns: int) -> Arrival:
+        self.malformed += 1
+        if now_ns - self._notice_ns >= NOTICE_NS:
+            self._notice_ns = now_ns
+            _log.warning("message refused (%d so far): %s", self.malformed, error)
+        return Arrival()
+
+
+def _ack(peer: Peer) -> wire.Ack:
+    return wire.Ack(peer.hello.run_id, dict(peer.sequences))

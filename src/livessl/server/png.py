@@ -1,0 +1,41 @@
+"""Power maps as PNG pictures, by the standard library alone."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livessl.core.types import Float32Array
+
+_ANCHORS: Final = np.array(
+    [[10, 8, 30], [66, 20, 108], [140, 42, 115], [214, 72, 82], [248, 142, 60], [252, 246, 176]], dtype=np.float64
+)
+"""Dark to light through purple, red and orange; evenly spaced."""
+
+
+def map_png(image: Float32Array) -> bytes:
+    """A map (rows, columns) as a PNG, first row at the bottom; its median is dark, its maximum light."""
+    low, high = float(np.median(image)), float(image.max())
+    level = np.clip((image - low) / max(high - low, 1e-12), 0.0, 1.0)[::-1]
+    place = level * (len(_ANCHORS) - 1)
+    left = np.minimum(place.astype(np.int64), len(_ANCHORS) - 2)
+    fraction = (place - left)[..., None]
+    colours = _ANCHORS[left] * (1.0 - fraction) + _ANCHORS[left + 1] * fraction
+    return encode_png(colours.astype(np.uint8))
+
+
+def encode_png(pixels: NDArray[np.uint8]) -> bytes:
+    """An RGB picture (rows, columns, 3) as PNG (RFC 2083): signature, header, one compressed block, end."""
+    rows, columns, _ = pixels.shape
+    lines = np.concatenate([np.zeros((rows, 1), dtype=np.uint8), pixels.reshape(rows, -1)], axis=1)
+    header = struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)
+    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes())), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,0 +1,150 @@
+"""The nodes' socket and the thread that drains it: what they send, in order, into one bounded queue."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from queue import Empty, Full, Queue
+from typing import Final
+
+import zmq
+
+from livessl import wire
+from livessl.clock import Clock
+from livessl.config import Site
+from livessl.core.types import Message
+from livessl.server.ingest import Ingest
+
+POLL_MS: Final = 20
+"""How long the thread waits for sound before it looks whether acknowledgements are due."""
+
+QUEUE_MESSAGES: Final = 1000
+"""Ten seconds of five arrays. When it is full the socket is left alone, and nodes keep their sound themselves."""
+
+_log = logging.getLogger(__name__)
+
+
+class BindError(Exception):
+    """The server's address cannot be taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """A node has begun a run."""
+
+    hello: wire.Hello
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A node has ended on purpose."""
+
+    hello: wire.Hello
+
+
+Item = Message | Joined | Left
+
+
+class Receiver:
+    """ROUTER socket, greetings, acknowledgements.
+
+    Parameters
+    ----------
+    site : Site
+    clock : Clock
+
+    Raises
+    ------
+    BindError
+        Where the address is taken.
+    """
+
+    def __init__(self, site: Site, clock: Clock) -> None:
+        self.ingest = Ingest(site)
+        self._clock = clock
+        self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
+        self.failure: BaseException | None = None
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        try:
+            self._socket.bind(site.server.bind)
+        except zmq.ZMQError as error:
+            self._socket.close()
+            self._context.term()
+            raise BindError(
+                f"server.bind: cannot listen on {site.server.bind}: {error.strerror}; is another server running? "
+                "Stop it or choose another port"
+            ) from error
+        self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def start(self) -> None:
+        """Begin to receive."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and give the address back."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+        self._socket.close()
+        self._context.term()
+
+    def take(self, most: int, wait_s: float) -> list[Item]:
+        """What has arrived, in order: waits for the first item, then takes what is there."""
+        items: list[Item] = []
+        try:
+            items.append(self._queue.get(timeout=wait_s))
+            while len(items) < most:
+                items.append(self._queue.get_nowait())
+        except Empty:
+            pass
+        return items
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                if self._socket.poll(POLL_MS):
+                    self._drain()
+                for routing_id, ack in self.ingest.acknowledgements(self._clock.now_ns()):
+                    self._reply(routing_id, ack)
+        except BaseException as error:
+            self.failure = error
+            _log.exception("the receiving thread has failed")
+            raise
+
+    def _drain(self) -> None:
+        for _ in range(QUEUE_MESSAGES):
+            try:
+                routing_id, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            arrival = self.ingest.receive(routing_id, b"".join(parts), self._clock.now_ns())
+            if arrival.joined is not None:
+                self._put(Joined(arrival.joined))
+            if arrival.left is not None:
+                self._put(Left(arrival.left))
+            if arrival.message is not None:
+                self._put(arrival.message)
+            if arrival.reply is not None:
+                self._reply(routing_id, arrival.reply)
+
+    def _put(self, item: Item) -> None:
+        while not self._stop.is_set():
+            try:
+                self._queue.put(item, timeout=0.1)
+            except Full:
+                for routing_id, ack in self.ingest.acknowledgements(self._clock.now_ns()):
+                    self._reply(routing_id, ack)
+            else:
+                return
+
+    def _reply(self, routing_id: bytes, ack: wire.Ack) -> None:
+        try:
+            self._socket.send_multipart([routing_id, wire.encode(ack)], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # it is gone or reads nothing; it will say hello again
+            _log.debug("no acknowledgement to %r: %s", routing_id, error)

@@ -1,0 +1,306 @@
+"""The HTTP face: REST under /api/v1, the live WebSocket, /metrics, and the dashboard. It computes nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+from fastapi import FastAPI, HTTPException, Query, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from livessl import __version__
+from livessl.clock import utc_ns, utc_text
+from livessl.config import Site
+from livessl.core.types import FRAME_S, Float32Array, MapSnapshot
+from livessl.messages import API_VERSION, JsonObject
+from livessl.server.engine import Engine
+from livessl.server.hub import Filter, Hub, Subscription
+from livessl.server.png import map_png
+from livessl.server.store import Query as EventQuery
+from livessl.server.store import Store
+
+STATIC: Final = Path(__file__).parent / "static"
+
+SEND_TIMEOUT_S: Final = 30.0
+"""A client that takes no byte for so long is gone."""
+
+KINDS: Final = frozenset({"update", "event", "track", "arrays"})
+VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
+"""A view and the axis that its projection takes the maximum over."""
+
+_CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
+
+
+def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
+    """The application around a running engine."""
+    app = FastAPI(
+        title="livessl",
+        version=__version__,
+        description="Where in the room a sound happened: events, live estimates, tracks, arrays and power maps.",
+        docs_url="/api/docs",
+        redoc_url=None,
+        openapi_url="/api/v1/openapi.json",
+    )
+
+    @app.middleware("http")
+    async def _headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
+        response: Response = await proceed(request)
+        if not request.url.path.startswith("/api/docs"):
+            response.headers["Content-Security-Policy"] = _CSP
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers.setdefault("Cache-Control", "no-cache")
+        return response
+
+    _add_state_routes(app, site, engine, hub, store)
+    _add_event_routes(app, site, store)
+    _add_map_route(app, site, engine)
+    _add_live_route(app, site, engine, hub)
+
+    @app.get("/", include_in_schema=False)
+    async def dashboard() -> FileResponse:
+        return FileResponse(STATIC / "index.html")
+
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    return app
+
+
+def describe_site(site: Site, mode: str) -> JsonObject:
+    """Geometry and settings, for clients that draw."""
+    grid = site.search_grid()
+    return {
+        "v": API_VERSION,
+        "site": site.site,
+        "version": __version__,
+        "mode": mode,
+        "room": {"size_m": list(site.room.size_m)},
+        "grid": {"bounds_m": [list(b) for b in grid.bounds_m], "spacing_m": grid.spacing_m, "shape": list(grid.shape)},
+        "speed_of_sound_m_s": site.c_m_s,
+        "band_hz": list(site.band_hz),
+        "method": site.fusion.method,
+        "frame_s": FRAME_S,
+        "activity": {"threshold": site.activity.threshold, "floor_factor": site.activity.floor_factor},
+        "arrays": {
+            spec.name: {
+                "position_m": spec.centre_m.round(4).tolist(),
+                "microphones_m": spec.microphones_m.round(4).tolist(),
+                "band_hz": list(spec.band_hz),
+            }
+            for spec in site.specs
+        },
+        "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
+    }
+
+
+def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store) -> None:
+    @app.get("/api/v1/site", tags=["state"])
+    def get_site() -> JsonObject:
+        """Room, grid, arrays and settings."""
+        return describe_site(site, engine.mode)
+
+    @app.get("/api/v1/arrays", tags=["state"])
+    def get_arrays() -> JsonObject:
+        """State, age of the last message, levels, drift and counters of every array."""
+        return {"v": API_VERSION, "now_utc": utc_text(engine.now_ns()), "arrays": engine.arrays()}
+
+    @app.get("/api/v1/tracks", tags=["estimates"])
+    def get_tracks() -> JsonObject:
+        """The tracks that live now."""
+        return {"v": API_VERSION, "tracks": engine.tracks()}
+
+    @app.get("/api/v1/health", tags=["state"])
+    def get_health(response: Response) -> JsonObject:
+        """Whether the server works (503 where it does not) and how the arrays are."""
+        arrays = engine.arrays()
+        reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
+        states = {a["state"] for a in arrays}
+        status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
+        if engine.failure is not None:
+            status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
+            response.status_code = 503
+        return {
+            "v": API_VERSION,
+            "status": status,
+            "version": __version__,
+            "mode": engine.mode,
+            "uptime_s": round(engine.uptime_s(), 3),
+            "arrays": {a["name"]: a["state"] for a in arrays},
+            "reasons": reasons,
+        }
+
+    registry = CollectorRegistry()
+    registry.register(_Metrics(engine, hub, store))
+
+    @app.get("/metrics", tags=["state"], response_class=PlainTextResponse)
+    def get_metrics() -> PlainTextResponse:
+        """Metrics in the text format of Prometheus."""
+        return PlainTextResponse(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
+    @app.get("/api/v1/events", tags=["estimates"])
+    def get_events(
+        since: Annotated[str | None, Query(description="RFC 3339; events that began then or later")] = None,
+        until: Annotated[str | None, Query(description="RFC 3339; events that began then or earlier")] = None,
+        zone: Annotated[str | None, Query(description="only events inside this zone")] = None,
+        min_confidence: Annotated[float | None, Query(ge=0, le=1)] = None,
+        limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+        cursor: Annotated[int | None, Query(ge=1, le=2**62, description="next_cursor of the page before")] = None,
+    ) -> JsonObject:
+        """Finished events, newest first."""
+        if zone is not None and zone not in site.zones:
+            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+        query = EventQuery(_instant("since", since), _instant("until", until), zone, min_confidence, limit, cursor)
+        events, following = store.find(query)
+        return {"v": API_VERSION, "events": events, "next_cursor": following}
+
+    @app.get("/api/v1/events/{event_id}", tags=["estimates"])
+    def get_event(event_id: str) -> JsonObject:
+        """One event."""
+        event = store.get(event_id)
+        if event is None:
+            raise HTTPException(404, f"no event {event_id!r}")
+        return {"v": API_VERSION, **event}
+
+
+def _instant(name: str, text: str | None) -> int | None:
+    if text is None:
+        return None
+    try:
+        time_ns = utc_ns(text.replace(" ", "+"))  # an unescaped + in a query arrives as a blank
+    except (ValueError, OverflowError) as error:
+        raise HTTPException(422, f"{name}: {error}") from error
+    return max(-(2**63), min(2**63 - 1, time_ns))
+
+
+def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
+    @app.get(
+        "/api/v1/map",
+        tags=["estimates"],
+        responses={
+            200: {"content": {"image/png": {}, "application/octet-stream": {}}},
+            204: {"description": "no window has been localized yet"},
+        },
+    )
+    def get_map(
+        array: Annotated[str, Query(description="'fused' or an array's name")] = "fused",
+        view: Annotated[Literal["floor", "side", "front", "volume"], Query()] = "floor",
+        format: Annotated[Literal["png", "float32"], Query()] = "png",  # noqa: A002 - the API's word
+    ) -> Response:
+        """The newest power map: a projection (largest value along the axis left out) or the whole volume."""
+        if array != "fused" and array not in site.arrays:
+            raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
+        if view == "volume" and format == "png":
+            raise HTTPException(422, "view=volume has no picture; use format=float32")
+        snapshot = engine.latest_map()
+        if snapshot is None:
+            return Response(status_code=204)
+        power = _power(snapshot, array)
+        if power is None:
+            raise HTTPException(404, f"array {array!r} has no part in the newest map")
+        image = power.reshape(site.search_grid().shape)
+        if view != "volume":
+            image = image.max(axis=VIEWS[view]).T  # rows: y or z, upwards
+        headers = {
+            "X-Map-Shape": ",".join(str(n) for n in image.shape),
+            "X-Map-Time-Utc": utc_text(snapshot.time_ns),
+            "X-Map-Age-S": f"{(engine.now_ns() - snapshot.time_ns) / 1e9:.3f}",
+            "X-Map-Min": f"{image.min():.6g}",
+            "X-Map-Max": f"{image.max():.6g}",
+        }
+        if format == "png":
+            return Response(map_png(image), media_type="image/png", headers=headers)
+        body = np.ascontiguousarray(image, dtype="<f4").tobytes()
+        return Response(body, media_type="application/octet-stream", headers=headers)
+
+
+def _power(snapshot: MapSnapshot, array: str) -> Float32Array | None:
+    return snapshot.fused if array == "fused" else snapshot.arrays.get(array)
+
+
+def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
+    @app.websocket("/api/v1/live")
+    async def live(
+        socket: WebSocket, kinds: str | None = None, min_confidence: float = 0.0, zone: str | None = None
+    ) -> None:
+        chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
+        await socket.accept()
+        if chosen is not None and not chosen <= KINDS:
+            await socket.close(1008, f"kinds: expected some of {', '.join(sorted(KINDS))}")
+            return
+        if zone is not None and zone not in site.zones:
+            await socket.close(1008, f"no such zone; zones are {', '.join(site.zones) or 'none'}"[:120])
+            return
+        subscription = hub.subscribe(Filter(chosen, min_confidence, zone))
+        hello = {
+            "v": API_VERSION,
+            "seq": hub.last_seq,
+            "kind": "hello",
+            "now_utc": utc_text(engine.now_ns()),
+            "site": site.site,
+            "mode": engine.mode,
+            "last_seq": hub.last_seq,
+            "arrays": await asyncio.to_thread(engine.arrays),
+        }
+        sending = asyncio.create_task(_send_all(socket, subscription, hello))
+        listening = asyncio.create_task(_until_gone(socket))
+        try:
+            await asyncio.wait({sending, listening}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            hub.unsubscribe(subscription)
+            for task in (sending, listening):
+                task.cancel()
+            await asyncio.gather(sending, listening, return_exceptions=True)
+
+
+async def _send_all(socket: WebSocket, subscription: Subscription, first: JsonObject) -> None:
+    message = first
+    while True:
+        text = json.dumps(message, separators=(",", ":"))
+        try:
+            await asyncio.wait_for(socket.send_text(text), SEND_TIMEOUT_S)
+        except (TimeoutError, WebSocketDisconnect, RuntimeError):
+            return
+        message = await subscription.next()
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Read and ignore what a client says, so that its leaving is noticed."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+class _Metrics(Collector):
+    """Everything countable, read when it is asked for."""
+
+    def __init__(self, engine: Engine, hub: Hub, store: Store) -> None:
+        self._engine = engine
+        self._hub = hub
+        self._store = store
+
+    def collect(self) -> Iterator[Metric]:
+        yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", self._engine.uptime_s())
+        yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
+        yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
+        yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
+        yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
+        up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
+        age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
+        level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])
+        counts = CounterMetricFamily("livessl_array", "Counts of an array.", labels=["array", "what"])
+        for array in self._engine.arrays():
+            up.add_metric([array["name"]], float(array["state"] == "healthy"))
+            if array["age_s"] is not None:
+                age.add_metric([array["name"]], array["age_s"])
+            if array["level_dbfs"] is not None:
+                level.add_metric([array["name"]], array["level_dbfs"])
+            for what, count in array["counters"].items():
+                counts.add_metric([array["name"], what], count)
+        yield from (up, age, level, counts)

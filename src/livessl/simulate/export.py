@@ -1,0 +1,52 @@
+"""A simulated scene as a session on disk: a WAV for each array, the truth, and what replay needs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import soundfile
+
+from livessl.config import Site
+from livessl.session import piece, write_session
+from livessl.simulate.scene import Scene, render, truth
+
+TRUTH_FILE: Final = "truth.jsonl"
+
+NOMINAL_START_NS: Final = 1_767_225_600_000_000_000
+"""2026-01-01T00:00:00Z: a simulated session happened at no time, and two of the same seed shall be the same."""
+
+
+def write_scene(
+    directory: Path,
+    site: Site,
+    scene: Scene,
+    *,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
+
+    Raises
+    ------
+    OSError
+        Where the folder cannot be written.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    pieces = []
+    total = len(site.specs) * len(scene.sources)
+    for number, spec in enumerate(site.specs):
+        done_before = number * len(scene.sources)
+
+        def report(done: int, _: int, before: int = done_before) -> None:
+            if progress is not None:
+                progress(before + done, total)
+
+        samples = render(scene, spec.microphones_m, seed=seed + 1 + number, progress=report)
+        soundfile.write(directory / f"{spec.name}.wav", samples.T, round(scene.sample_rate_hz), subtype="PCM_16")
+        pieces.append(piece(spec.name, f"{spec.name}.wav", NOMINAL_START_NS))
+    lines = "".join(json.dumps(entry) + "\n" for entry in truth(scene))
+    (directory / TRUTH_FILE).write_text(lines, encoding="utf-8")
+    write_session(directory, site, pieces)
