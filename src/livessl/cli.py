@@ -27,7 +27,7 @@ from livessl.capture.recorded import Part, end_ns, parts_from_node, parts_from_s
 from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import ConfigError, Fault, Site, SoundDeviceConfig, load_site
 from livessl.core.estimators import ESTIMATORS
-from livessl.core.types import Event
+from livessl.core.types import FRAME_NS, Event
 from livessl.messages import JsonObject, Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
@@ -201,7 +201,7 @@ def _demo(arguments: argparse.Namespace) -> int:
         directory = Path(name)
         site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
         truth = demo.read_truth(directory)
-        start_ns = clock.now_ns() + demo.LEAD_NS
+        start_ns = (clock.now_ns() + demo.LEAD_NS) // FRAME_NS * FRAME_NS
         with demo.running(directory, site, start_ns, loop=not arguments.once, clock=clock) as url:
             print(f"dashboard: {url}", file=sys.stderr)
             if not arguments.once and not arguments.no_browser:
@@ -284,8 +284,8 @@ def _capture(arguments: argparse.Namespace) -> int:
 def _played_parts(
     arguments: argparse.Namespace, site: Site, now_ns: int, bar: Callable[[int, int], None]
 ) -> list[Part]:
-    """What a node plays instead of a device."""
-    start_ns = getattr(arguments, "start_at", None) or now_ns
+    """What a node plays instead of a device; from the next raster boundary on, so that frames are cut as offline."""
+    start_ns = getattr(arguments, "start_at", None) or -(-now_ns // FRAME_NS) * FRAME_NS
     if not arguments.wav:
         parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:

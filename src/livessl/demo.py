@@ -37,7 +37,7 @@ MATCH_S: Final = 1.0
 """An event that begins this near to a source's start is its event."""
 
 RATE_HZ: Final = 44100.0
-SEED: Final = 7
+SEED: Final = 1
 
 
 class DemoError(Exception):

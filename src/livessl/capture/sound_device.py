@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from livessl.capture.devices import DeviceError
 from livessl.clock import Clock
 from livessl.config import SoundDeviceConfig
 from livessl.core.types import Block, Float32Array
@@ -46,10 +47,6 @@ MAX_BACKLOG_S: Final = 1.0
 
 _INVALID_CHANNEL_COUNT: Final = -9998
 _INVALID_SAMPLE_RATE: Final = -9997
-
-
-class DeviceError(Exception):
-    """What the configuration asks of the sound devices cannot be had, however long one waits."""
 
 
 @dataclass(frozen=True, slots=True)
