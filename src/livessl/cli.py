@@ -23,7 +23,15 @@ from livessl.capture.devices import DeviceError
 from livessl.capture.line import Line
 from livessl.capture.node import Node, UndeliveredError
 from livessl.capture.record import Recorder, record_parts
-from livessl.capture.recorded import Part, end_ns, parts_from_node, parts_from_session, parts_from_wavs, repeated
+from livessl.capture.recorded import (
+    Part,
+    common_start_ns,
+    end_ns,
+    parts_from_node,
+    parts_from_session,
+    parts_from_wavs,
+    repeated,
+)
 from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import ConfigError, Fault, Site, SoundDeviceConfig, load_site
 from livessl.core.estimators import ESTIMATORS
@@ -118,7 +126,12 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--node", required=True, help="name of the node in the site file")
     _add_wav(sub, "play FILE at real speed instead of the device; give it for each array of the node")
     sub.add_argument("--loop", action="store_true", help="play the files again and again")
-    sub.add_argument("--start-at", type=_time, metavar="TIME", help="when the files begin, RFC 3339 (default now)")
+    sub.add_argument(
+        "--start-at",
+        type=_time,
+        metavar="TIME",
+        help="when the files begin, RFC 3339 (default: now, or with several nodes the next full 5 s of the clock)",
+    )
 
     sub = command(
         "locate",
@@ -284,8 +297,8 @@ def _capture(arguments: argparse.Namespace) -> int:
 def _played_parts(
     arguments: argparse.Namespace, site: Site, now_ns: int, bar: Callable[[int, int], None]
 ) -> list[Part]:
-    """What a node plays instead of a device; from the next raster boundary on, so that frames are cut as offline."""
-    start_ns = getattr(arguments, "start_at", None) or -(-now_ns // FRAME_NS) * FRAME_NS
+    """What a node plays instead of a device."""
+    start_ns = getattr(arguments, "start_at", None) or common_start_ns(now_ns, len(site.nodes))
     if not arguments.wav:
         parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:

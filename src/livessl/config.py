@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,8 +29,8 @@ MAP_BYTES_PER_PAIR_AND_NODE: Final = 8
 MAP_BYTES_PER_NODE: Final = 64
 """Coordinates, delays while they are worked out, and the maps themselves."""
 
-Coordinate = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 Position = tuple[Coordinate, Coordinate, Coordinate]
 Interval = tuple[Coordinate, Coordinate]
 Bounds = tuple[Interval, Interval, Interval]
@@ -68,7 +69,7 @@ class Room(_Model):
 class GridConfig(_Model):
     """The search grid."""
 
-    spacing_m: Positive = 0.1
+    spacing_m: Annotated[Positive, Field(ge=1e-4)] = 0.1
     bounds_m: Bounds | None = None
     max_memory_mb: Positive = 1024.0
 
@@ -156,7 +157,11 @@ class ArrayConfig(_Model):
     @field_validator("geometry", mode="before")
     @classmethod
     def _shape_or_file(cls, geometry: Any) -> Any:
-        return Shape.model_validate(geometry) if isinstance(geometry, dict) else geometry
+        if isinstance(geometry, dict):
+            return Shape.model_validate(geometry)
+        if geometry is None or isinstance(geometry, str):
+            return geometry
+        raise ValueError("expected a shape such as {tetrahedron: {edge_m: 0.5}} or the path of a geometry file")
 
     @model_validator(mode="after")
     def _one_form(self) -> ArrayConfig:
@@ -194,7 +199,7 @@ class SceneDeviceConfig(_Model):
     """A simulated scene at real speed."""
 
     type: Literal["scene"]
-    rt60_s: Annotated[float, Field(ge=0)] = 0.7
+    rt60_s: Annotated[float, Field(ge=0, le=100)] = 0.7
     events: Annotated[int, Field(ge=1)] = 8
     seed: int = 0
     sample_rate_hz: Positive = 44100.0
@@ -223,13 +228,13 @@ class NodeConfig(_Model):
     @classmethod
     def _of_its_type(cls, device: Any) -> Any:
         if not isinstance(device, dict):
-            return device
+            raise ValueError("expected a mapping such as {name: UMC1820, sample_rate_hz: 44100}")
         kinds: dict[str, type[_Model]] = {
             "sound": SoundDeviceConfig,
             "wav": WavDeviceConfig,
             "scene": SceneDeviceConfig,
         }
-        kind = kinds.get(device.get("type", ""))
+        kind = kinds.get(str(device.get("type")))
         if kind is None:
             raise ValueError(f"type: expected one of {', '.join(kinds)}, got {device.get('type')!r}")
         return kind.model_validate(device)
@@ -266,8 +271,8 @@ class ActivityConfig(_Model):
     threshold: Annotated[float, Field(gt=0, le=1)] = 0.1
     release_s: Positive = 1.0
     floor_window_s: Positive = 3.0
-    floor_factor: Annotated[float, Field(ge=1)] = 4.0
-    min_level_dbfs: Coordinate = -90.0
+    floor_factor: Annotated[float, Field(ge=1, le=1e6)] = 4.0
+    min_level_dbfs: Annotated[float, Field(ge=-300, le=0)] = -90.0
     pre_roll_s: Annotated[float, Field(ge=0, le=5)] = 0.4
     hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = 0.3
 
@@ -408,30 +413,46 @@ def parse_site(text: str, source: str = "site file", directory: Path | None = No
         With every fault found, each with its line.
     """
     try:
+        data = read_yaml(text)
         root = yaml.compose(text, Loader=yaml.SafeLoader)
-        data = yaml.safe_load(text)
+        at = _Places(source, dict(_lines(root)))
+    except RecursionError as error:
+        raise ConfigError([Fault(source, "not a site: it holds itself, or is nested too deeply")]) from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{source}:{mark.line + 1}" if mark else source
         raise ConfigError([Fault(where, f"not valid YAML: {getattr(error, 'problem', error)}")]) from error
-    lines = dict(_lines(root))
-    at = _Places(source, lines)
     if not isinstance(data, dict):
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
+    findings = [*_duplicate_keys(root)]
     if "specs" in data:
-        raise ConfigError([at.fault(("specs",), "unknown key; take it away")])
-    faults = [at.fault(path, what) for path, what in _duplicate_keys(root)]
-    try:
-        site = Site.model_validate(data)
-    except ValidationError as error:
-        faults += [at.fault(_path(item["loc"]), _sentence(item)) for item in error.errors()]
-        raise ConfigError(faults) from error
-    specs, wrong = _array_specs(site, directory or Path())
-    site = site.model_copy(update={"specs": specs})
-    faults += [at.fault(path, what) for path, what in [*wrong, *_cross_faults(site)]]
-    if faults:
-        raise ConfigError(faults)
+        findings.append((("specs",), "unknown key; take it away"))
+        del data["specs"]
+    site, wrong = _valid_part(data)
+    findings += wrong
+    if site is not None:
+        specs, wrong = _array_specs(site, directory or Path())
+        site = site.model_copy(update={"specs": specs})
+        lost = set(data["arrays"]) - set(site.arrays)
+        findings += wrong
+        findings += [finding for finding in _cross_faults(site) if not _follows(finding[0], lost)]
+    if findings or site is None:
+        raise ConfigError([at.fault(path, what) for path, what in findings])
     return site
+
+
+def read_yaml(text: str) -> Any:
+    """Value of a YAML text.
+
+    Raises
+    ------
+    yaml.YAMLError
+        Where it is no YAML, or holds a value such as the 45th of a month.
+    """
+    try:
+        return yaml.safe_load(text)
+    except (ValueError, KeyError, AttributeError, RecursionError) as error:  # let through by the library's constructors
+        raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
 
 
 _Place = tuple[str | int, ...]
@@ -443,16 +464,52 @@ class _Places:
 
     def __init__(self, source: str, lines: Mapping[_Place, int]) -> None:
         self._source = source
-        self._lines = lines
+        self._lines = {tuple(map(str, path)): line for path, line in lines.items()}
 
     def fault(self, path: _Place, what: str) -> Fault:
-        known = path
+        known = tuple(map(str, path))
         while known and known not in self._lines:
             known = known[:-1]
         line = self._lines.get(known)
         where = self._source if line is None else f"{self._source}:{line}"
-        dotted = ".".join(str(part) for part in path)
+        dotted = ".".join(map(str, path))
         return Fault(f"{where}: {dotted}" if dotted else where, what)
+
+
+def _valid_part(data: Mapping[str, Any]) -> tuple[Site | None, list[_Finding]]:
+    """What is left without the parts that are wrong, so that faults elsewhere show too; and what is wrong."""
+    left = copy.deepcopy(dict(data))
+    found: list[_Finding] = []
+    while True:
+        try:
+            return Site.model_validate(left), found
+        except ValidationError as error:
+            items = error.errors()
+        if not found:  # what is missing in later rounds has been taken away here
+            found = [(_path(item["loc"]), _sentence(item)) for item in items]
+        for part in {_part(_path(item["loc"]), item["type"] == "extra_forbidden") for item in items}:
+            if not _take_away(left, part):
+                return None, found
+
+
+def _part(path: _Place, unknown_key: bool) -> _Place:
+    """The smallest part of the file that can be left out for a fault at `path`."""
+    return path if unknown_key else path[: 2 if path[0] in ("arrays", "nodes", "zones") else 1]
+
+
+def _take_away(data: dict[str, Any], path: _Place) -> bool:
+    holder: Any = data
+    for part in path[:-1]:
+        holder = holder[part] if isinstance(holder, dict) and part in holder else None
+    if not isinstance(holder, dict) or path[-1] not in holder:
+        return False
+    del holder[path[-1]]
+    return True
+
+
+def _follows(path: _Place, lost: set[str]) -> bool:
+    """Whether a finding may come only of arrays that were left out."""
+    return bool(lost) and (path[-1] in lost or path == ("fusion", "min_arrays"))
 
 
 def _lines(node: yaml.Node | None, path: _Place = ()) -> Iterator[tuple[_Place, int]]:
@@ -482,7 +539,7 @@ def _duplicate_keys(node: yaml.Node | None, path: _Place = ()) -> Iterator[_Find
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
-_UNION_PARTS: Final = frozenset({"Shape", "str", "SoundDeviceConfig", "WavDeviceConfig", "SceneDeviceConfig"})
+_UNION_PARTS: Final = frozenset({"Shape", "[key]", "str", "SoundDeviceConfig", "WavDeviceConfig", "SceneDeviceConfig"})
 
 
 def _path(location: tuple[str | int, ...]) -> _Place:
@@ -538,7 +595,7 @@ def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
 
 def _geometry_file(path: Path) -> GeometryFile:
     try:
-        return GeometryFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return GeometryFile.model_validate(read_yaml(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError([Fault(str(path), f"geometry file cannot be read: {_reason(error)}")]) from error
     except ValidationError as error:

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from livessl.clock import utc_ns, utc_text
-from livessl.config import ConfigError, Fault, Site, load_site
+from livessl.config import ConfigError, Fault, Site, load_site, read_yaml
 
 SESSION_FILE: Final = "session.yaml"
 SITE_FILE: Final = "site.yaml"
@@ -83,7 +83,7 @@ def read_session(directory: Path) -> Session:
     """
     path = directory / SESSION_FILE
     try:
-        described = _SessionFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        described = _SessionFile.model_validate(read_yaml(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise ConfigError(
             [

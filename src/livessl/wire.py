@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ClockState, Frame, Mark
+from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MIN_MICROPHONES, ClockState, Frame, Mark
 
 VERSION: Final = 1
 
@@ -23,6 +23,12 @@ MAX_NAME_BYTES: Final = 64
 
 MAX_FRAME_SAMPLES: Final = 19_200
 """A 50 ms frame at 192 kHz is 9 600 samples; twice that is no frame of ours."""
+
+MAX_RATE_HZ: Final = 384_000.0
+"""No sound card samples faster."""
+
+MAX_RASTER: Final = (2**63 - 1) // FRAME_NS - 1
+"""Site times are 64-bit nanoseconds: until the year 2262."""
 
 MAX_JSON_BYTES: Final = 64 * 1024
 """Greetings and acknowledgements are a few hundred bytes."""
@@ -155,8 +161,9 @@ def _decode_frame(body: bytes) -> Frame:
         raise WireError(f"frame: expected 2 to 16 channels, got {channels}")
     if not 0 < n <= MAX_FRAME_SAMPLES:
         raise WireError(f"frame: expected 1 to {MAX_FRAME_SAMPLES} samples, got {n}")
-    if not (math.isfinite(rate) and rate > 0 and math.isfinite(power) and power >= 0):
-        raise WireError(f"frame: expected a finite rate > 0 and power >= 0, got {rate} and {power}")
+    if not (0 < rate <= MAX_RATE_HZ and math.isfinite(power) and power >= 0):
+        raise WireError(f"frame: expected 0 < rate <= {MAX_RATE_HZ:g} Hz and power >= 0, got {rate} and {power}")
+    _check_raster(raster, "frame")
     name, start = _name(body, _FRAME.size, name_length)
     if len(body) - start != 4 * channels * n:
         raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
@@ -188,6 +195,7 @@ def _decode_mark(body: bytes) -> Mark:
     name_length, sequence, raster, power, noise, overflows, lost, drift, clock, channels = fixed
     if clock >= len(_CLOCK_STATES) or channels > MAX_MICROPHONES:
         raise WireError(f"mark: expected a known clock state and at most 16 channels, got {clock} and {channels}")
+    _check_raster(raster, "mark")
     name, start = _name(body, _MARK.size, name_length)
     if len(body) - start != 8 * channels:
         raise WireError(f"mark: expected {8 * channels} bytes of channel powers, got {len(body) - start}")
@@ -216,16 +224,26 @@ def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
     return type_(**fields)
 
 
+def _check_raster(raster: int, what: str) -> None:
+    if abs(raster) > MAX_RASTER:
+        raise WireError(f"{what}: expected a raster index from -{MAX_RASTER} to {MAX_RASTER}, got {raster}")
+
+
+def _is_unicode(value: Any) -> bool:
+    """Half of a surrogate pair is valid in JSON, and nothing that could be told on."""
+    return isinstance(value, str) and not any("\ud800" <= character <= "\udfff" for character in value)
+
+
 def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value.encode("utf-8", "replace")) <= MAX_NAME_BYTES
+    return _is_unicode(value) and 0 < len(value.encode()) <= MAX_NAME_BYTES
 
 
 def _is_text(value: Any) -> bool:
-    return value is None or (isinstance(value, str) and len(value) <= 1000)
+    return value is None or (_is_unicode(value) and len(value) <= 1000)
 
 
 def _is_rate(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_RATE_HZ
 
 
 def _is_sequence(value: Any) -> bool:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from conftest import require
 from livessl.capture import sound_device
-from livessl.capture.sound_device import DeviceError, SoundDevice, input_devices
+from livessl.capture.devices import DeviceError
+from livessl.capture.sound_device import SoundDevice, input_devices
 from livessl.clock import UnpacedClock
 from livessl.config import SoundDeviceConfig
 from livessl.core.types import FRAME_NS

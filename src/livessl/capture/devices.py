@@ -109,6 +109,7 @@ class WavRecording:
             return soundfile.SoundFile(self._path)
         except (soundfile.LibsndfileError, OSError, TypeError) as error:
             reason = getattr(error, "error_string", None) or getattr(error, "strerror", None) or str(error)
+            reason = reason if self._path.exists() else "no such file"
             raise DeviceError(f"{self._path}: expected a WAV or FLAC file, cannot read it: {reason}") from error
 
     def _check(self, file: soundfile.SoundFile) -> None:

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from livessl.capture.devices import ArrayRecording, DeviceError, Looped, Placed, Spliced, WavRecording
 from livessl.capture.line import Line, recording_channels
 from livessl.config import SceneDeviceConfig, Site, WavDeviceConfig
+from livessl.core.types import FRAME_NS
 from livessl.session import Session
 from livessl.simulate.scene import make_scene, render, synthesised_sounds
+
+TOGETHER_NS: Final = 5_000_000_000
+"""Long against the difference between two processes' starts, short against a user's patience."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,16 @@ def parts_from_session(site: Site, session: Session) -> list[Part]:
 def end_ns(parts: Iterable[Part]) -> int:
     """Site time at which the last recording ends."""
     return max(part.placed.start_ns + round(part.placed.recording.duration_s * 1e9) for part in parts)
+
+
+def common_start_ns(now_ns: int, nodes: int) -> int:
+    """When files that stand in for devices begin: on the time raster, so that frames are cut as they are offline.
+
+    With several nodes, each a process that knows nothing of the others, at the next full `TOGETHER_NS` of the clock:
+    nodes started together begin together.
+    """
+    step_ns = FRAME_NS if nodes <= 1 else TOGETHER_NS
+    return -(-now_ns // step_ns) * step_ns
 
 
 def repeated(parts: Iterable[Part]) -> list[Part]:

@@ -175,10 +175,10 @@ class Grid:
         """Node coordinates along one axis, metres."""
         return np.asarray(self.lower_m[axis] + (np.arange(self.shape[axis]) + 0.5) * self.cell_m[axis])
 
-    def nodes_m(self) -> FloatArray:
-        """All nodes (G, 3), metres, z fastest: node g is at `numpy.unravel_index(g, shape)`."""
-        mesh = np.meshgrid(*(self.axis_m(axis) for axis in range(3)), indexing="ij")
-        return np.stack([coordinate.ravel() for coordinate in mesh], axis=1)
+    def nodes_m(self, which: slice = slice(None)) -> FloatArray:
+        """Nodes (G, 3), metres, all or some, z fastest: node g is at `numpy.unravel_index(g, shape)`."""
+        cells = np.unravel_index(np.arange(self.size)[which], self.shape)
+        return np.stack([self.axis_m(axis)[cell] for axis, cell in enumerate(cells)], axis=1)
 
     def node_m(self, index: int) -> FloatArray:
         """Position (3,) of one node, metres."""

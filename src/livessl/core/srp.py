@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from livessl.core.geometry import Grid
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray
+
+_SLAB_NODES: Final = 1 << 15
+"""Nodes whose delays are worked out at once: what fits the second-level cache."""
 
 
 def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float) -> FloatArray:
@@ -53,14 +57,15 @@ class SRPMapper:
 
     def __init__(self, spec: ArraySpec, grid: Grid, pairs: IntArray, lags_s: FloatArray, c_m_s: float) -> None:
         step = lags_s[1] - lags_s[0]
-        nodes = grid.nodes_m()
+        row = np.arange(len(pairs))[:, None] * len(lags_s)
         columns = np.empty((grid.size, len(pairs)), dtype=np.int32)
-        for p, pair in enumerate(pairs):
-            lag = steering_delays_s(nodes, spec.microphones_m, pair[None], c_m_s)[0]
-            columns[:, p] = np.rint((lag - lags_s[0]) / step) + p * len(lags_s)
+        for first in range(0, grid.size, _SLAB_NODES):
+            nodes = grid.nodes_m(slice(first, first + _SLAB_NODES))
+            lags = steering_delays_s(nodes, spec.microphones_m, pairs, c_m_s)
+            columns[first : first + len(nodes)] = (np.rint((lags - lags_s[0]) / step) + row).T
         weight = np.full(columns.size, pair_weight(len(spec.microphones_m)), dtype=np.float32)
-        first = np.arange(0, columns.size + 1, len(pairs), dtype=np.int32)
-        self._look_up = csr_array((weight, columns.ravel(), first), shape=(grid.size, len(pairs) * len(lags_s)))
+        starts = np.arange(0, columns.size + 1, len(pairs), dtype=np.int32)
+        self._look_up = csr_array((weight, columns.ravel(), starts), shape=(grid.size, len(pairs) * len(lags_s)))
 
     def __call__(self, gcc: GCC) -> Float32Array:
         """Power (G,) at every node, float32."""

@@ -115,10 +115,8 @@ class Ingest:
             return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
         peer = Peer(routing_id, hello, now_ns, same_run.sequences if same_run else {})
-        self._peers = {
-            key: other for key, other in self._peers.items() if other.hello.node != hello.node and key != routing_id
-        }
-        self._peers[routing_id] = peer
+        others = {k: other for k, other in self._peers.items() if other.hello.node != hello.node and k != routing_id}
+        self._peers = {**others, routing_id: peer}  # replaced, never changed: other threads read it
         if same_run is None:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         return Arrival(joined=None if same_run else hello, reply=_ack(peer))

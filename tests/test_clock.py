@@ -1,0 +1,94 @@
+"""Instants as text, and clocks that wait."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns, utc_text
+
+NS = 1_000_000_000
+
+
+def test_text_of_an_instant() -> None:
+    assert utc_text(0) == "1970-01-01T00:00:00.000000Z"
+    assert utc_text(1_769_860_800_050_000_000) == "2026-01-31T12:00:00.050000Z"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2026-01-31T12:00:00Z",
+        "2026-01-31T12:00:00+00:00",
+        "2026-01-31T13:00:00+01:00",
+        "2026-01-31T07:30:00.000-04:30",
+        "2026-01-31 12:00:00Z",
+    ],
+)
+def test_instant_of_a_text(text: str) -> None:
+    assert utc_ns(text) == 1_769_860_800 * NS
+
+
+@pytest.mark.parametrize("text", ["", "now", "2026-01-31", "2026-01-31T12:00:00", "2026-13-01T00:00:00Z", "12:00Z"])
+def test_text_that_is_no_instant(text: str) -> None:
+    with pytest.raises(ValueError, match="expected RFC 3339 with an offset") as caught:
+        utc_ns(text)
+    assert repr(text) in str(caught.value)
+
+
+@given(st.text())
+def test_any_text_is_an_instant_or_a_value_error(text: str) -> None:
+    try:
+        utc_ns(text)
+    except ValueError:
+        pass
+
+
+@given(st.datetimes(min_value=datetime(1970, 1, 1), max_value=datetime(2262, 1, 1)))  # noqa: DTZ001 - bounds are naive
+def test_text_and_back_to_the_microsecond(moment: datetime) -> None:
+    microseconds = (moment.replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
+    assert utc_ns(utc_text(microseconds * 1000)) == microseconds * 1000
+    assert utc_text(microseconds * 1000 + 999) == utc_text(microseconds * 1000)  # rounded down, never into the future
+
+
+def test_system_clock_is_utc_and_waits() -> None:
+    clock = SystemClock()
+    assert abs(clock.now_ns() - datetime.now(UTC).timestamp() * 1e9) < 1e9
+    until_ns = clock.now_ns() + 20_000_000
+    clock.sleep_until_ns(until_ns)
+    assert clock.now_ns() >= until_ns
+
+
+@pytest.mark.parametrize("clock", [SystemClock(), PacedClock(100 * NS), UnpacedClock(100 * NS)])
+def test_what_is_past_is_not_waited_for(clock: SystemClock | PacedClock | UnpacedClock) -> None:
+    began = time.monotonic()
+    clock.sleep_until_ns(clock.now_ns() - NS)
+    assert time.monotonic() - began < 0.5
+
+
+def test_paced_clock_runs_at_its_speed() -> None:
+    began = time.monotonic_ns()
+    clock = PacedClock(100 * NS, speed=50.0)
+    clock.sleep_until_ns(102 * NS)
+    assert clock.now_ns() >= 102 * NS
+    took_ns = time.monotonic_ns() - began
+    # 2 s at fifty times the speed are 40 ms; it may oversleep, never wake too early
+    assert 40_000_000 <= took_ns < 1 * NS
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
+def test_paced_clock_needs_a_speed(speed: float) -> None:
+    with pytest.raises(ValueError, match="expected > 0"):
+        PacedClock(0, speed)
+
+
+def test_unpaced_clock_jumps_and_never_goes_back() -> None:
+    clock = UnpacedClock(5)
+    assert clock.now_ns() == 5
+    clock.sleep_until_ns(10 * NS)
+    clock.sleep_until_ns(9 * NS)
+    assert clock.now_ns() == 10 * NS

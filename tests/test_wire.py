@@ -1,0 +1,319 @@
+"""Messages survive the wire unchanged, and what is no message is refused in words, whatever it is."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
+
+from livessl import wire
+from livessl.core.types import ClockState, Frame, Mark
+from livessl.wire import Ack, Bye, Hello, WireError, WireMessage, decode, encode
+from small_site import frame, mark
+
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=16)
+TEXTS = st.none() | st.text(st.characters(exclude_categories=["Cs"]), max_size=100)
+RASTERS = st.integers(-wire.MAX_RASTER, wire.MAX_RASTER)
+POWERS = st.floats(min_value=0, allow_nan=False, allow_infinity=False)
+RATES = st.floats(min_value=1.0, max_value=wire.MAX_RATE_HZ)
+SAMPLES = hnp.arrays(
+    np.float32,
+    st.tuples(st.integers(2, 16), st.integers(1, 40)),
+    elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+)
+FRAMES = st.builds(
+    Frame,
+    array=NAMES,
+    sequence=st.integers(0, 2**63 - 1),
+    raster=RASTERS,
+    time_ns=st.integers(-(2**63), 2**63 - 1),
+    sample_rate_hz=RATES,
+    samples=SAMPLES,
+    power=POWERS,
+    active=st.booleans(),
+)
+MARKS = st.builds(
+    Mark,
+    array=NAMES,
+    sequence=st.integers(0, 2**63 - 1),
+    raster=RASTERS,
+    power=POWERS,
+    noise_power=POWERS,
+    channel_power=st.lists(POWERS, max_size=16).map(tuple),
+    overflows=st.integers(0, 2**64 - 1),
+    lost_frames=st.integers(0, 2**64 - 1),
+    drift_ppm=st.floats(allow_nan=False, allow_infinity=False),
+    clock=st.sampled_from(ClockState),
+)
+HELLOS = st.builds(
+    Hello,
+    node=NAMES,
+    run_id=NAMES,
+    arrays=st.dictionaries(NAMES, RATES, max_size=6),
+    replay=st.booleans(),
+    problem=TEXTS,
+)
+ACKS = st.builds(
+    Ack,
+    run_id=NAMES,
+    sequences=st.dictionaries(NAMES, st.integers(0, 2**63 - 1), max_size=6),
+    who_are_you=st.booleans(),
+    refused=TEXTS,
+)
+BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
+
+EXAMPLES: list[WireMessage] = [
+    frame(),
+    mark(),
+    Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged"),
+    Ack("run", {"north": 7}),
+    Bye("lab-pc", "run"),
+]
+
+
+def assert_same(got: WireMessage, sent: WireMessage) -> None:
+    assert type(got) is type(sent)
+    if isinstance(sent, Frame):
+        assert isinstance(got, Frame)
+        assert_array_equal(got.samples.view(np.uint32), sent.samples.view(np.uint32))  # to the bit: -0.0 is not 0.0
+        fields = ("array", "sequence", "raster", "time_ns", "sample_rate_hz", "power", "active")
+        assert [getattr(got, name) for name in fields] == [getattr(sent, name) for name in fields]
+    else:
+        assert got == sent
+
+
+def refusal(data: bytes) -> str:
+    with pytest.raises(WireError) as caught:
+        decode(data)
+    return str(caught.value)
+
+
+@given(FRAMES | MARKS | HELLOS | ACKS | BYES)
+def test_round_trip(message: WireMessage) -> None:
+    data = encode(message)
+    assert len(data) <= wire.MAX_MESSAGE_BYTES
+    assert_same(decode(data), message)
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_every_truncation_is_refused(message: WireMessage) -> None:
+    data = encode(message)
+    for length in [*range(min(len(data), 200)), len(data) - 1]:
+        refusal(data[:length])
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_anything_added_is_refused(message: WireMessage) -> None:
+    assert_same(decode(encode(message)), message)
+    for tail in (b"\0", b"x", b"{}", bytes(8)):
+        refusal(encode(message) + tail)
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
+    rng = random.Random(5)
+    data = encode(message)[:600]
+    if isinstance(message, Frame):  # a short one, so that header and samples are both hit
+        short = Frame("north", 1, 1000, 0, 16000.0, np.zeros((4, 20), dtype=np.float32), 0.5, True)
+        data = encode(short)
+    refused = 0
+    for _ in range(4000):
+        mutated = bytearray(data)
+        for _ in range(rng.randint(1, 4)):
+            mutated[rng.randrange(len(mutated))] = rng.randrange(256)
+        try:
+            encode(decode(bytes(mutated)))  # what is let in can be told on
+        except WireError:
+            refused += 1
+    assert refused > 400
+
+
+@given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
+@settings(max_examples=500)
+def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
+    for data in (body, struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + body):
+        try:
+            decode(data)
+        except WireError:
+            pass
+
+
+JSON_VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.just(10**400)
+    | st.floats()
+    | st.text()
+    | st.sampled_from(["\ud800", "x" * 2000]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=4,
+)
+
+
+@given(
+    st.sampled_from([(3, "node run_id arrays replay problem"), (4, "run_id sequences who_are_you refused")]), st.data()
+)
+@settings(max_examples=300)
+def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
+    kind, names = form
+    fields = {name: data.draw(JSON_VALUES) for name in names.split()}
+    try:
+        message = decode(struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + json.dumps(fields).encode())
+    except WireError:
+        return
+    encode(message)
+
+
+def hello_with(**fields: Any) -> bytes:
+    whole = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None, **fields}
+    return encode(EXAMPLES[2])[:6] + json.dumps(whole).encode()
+
+
+def test_hello_of_plain_json_is_taken() -> None:
+    assert decode(hello_with()) == Hello("a", "b", {"n": 16000})
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"node": ""},
+        {"node": 5},
+        {"node": "n" * 65},
+        {"node": "ä" * 33},
+        {"node": "\ud800"},
+        {"run_id": None},
+        {"arrays": ["n"]},
+        {"arrays": {"n": 0}},
+        {"arrays": {"n": -1}},
+        {"arrays": {"n": True}},
+        {"arrays": {"n": "16000"}},
+        {"arrays": {"n": 10**400}},
+        {"arrays": {"n": 1e9}},
+        {"arrays": {"n": math.nan}},
+        {"arrays": {"n": math.inf}},
+        {"arrays": {"": 16000}},
+        {"replay": 0},
+        {"problem": 3},
+        {"problem": "p" * 1001},
+        {"problem": "half a pair: \udc00"},
+        {"extra": 1},
+    ],
+    ids=str,
+)
+def test_field_of_a_wrong_value_is_refused(fields: dict[str, Any]) -> None:
+    said = refusal(hello_with(**fields))
+    assert said.startswith("hello: ")
+
+
+def test_wrong_head_says_what_was_expected() -> None:
+    data = encode(EXAMPLES[1])
+    assert "at least a header" in refusal(data[:5])
+    assert "beginning with b'LSSL', got b'HTTP'" in refusal(b"HTTP" + data[4:])
+    assert "expected wire version 1, got 2; run the same livessl" in refusal(data[:4] + b"\2" + data[5:])
+    assert "known kind of message, got 9" in refusal(data[:5] + b"\x09" + data[6:])
+
+
+def test_oversize_is_refused_before_it_is_read() -> None:
+    said = refusal(bytes(wire.MAX_MESSAGE_BYTES + 1))
+    assert f"expected at most {wire.MAX_MESSAGE_BYTES}" in said
+    said = refusal(hello_with(problem="p" * wire.MAX_JSON_BYTES))
+    assert f"expected at most {wire.MAX_JSON_BYTES}" in said
+
+
+def test_largest_frame_goes_through() -> None:
+    samples = np.zeros((16, wire.MAX_FRAME_SAMPLES), dtype=np.float32)
+    largest = Frame("n" * wire.MAX_NAME_BYTES, 1, 1, 1, wire.MAX_RATE_HZ, samples, 0.0, False)
+    data = encode(largest)
+    assert len(data) <= wire.MAX_MESSAGE_BYTES
+    assert_same(decode(data), largest)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_samples_must_be_finite(bad: float) -> None:
+    samples = np.zeros((4, 10), dtype=np.float32)
+    samples[2, 3] = bad
+    said = refusal(encode(Frame("north", 1, 1, 1, 16000.0, samples, 0.0, False)))
+    assert "array 'north'" in said
+    assert "NaN or infinity" in said
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"sample_rate_hz": 0.0}, "rate"),
+        ({"sample_rate_hz": math.nan}, "rate"),
+        ({"sample_rate_hz": 1e12}, "rate"),
+        ({"power": -1.0}, "power"),
+        ({"power": math.inf}, "power"),
+        ({"raster": 2**62}, "raster"),
+        ({"raster": -(2**62)}, "raster"),
+        ({"samples": np.zeros((1, 10), dtype=np.float32)}, "2 to 16 channels, got 1"),
+        ({"samples": np.zeros((17, 10), dtype=np.float32)}, "2 to 16 channels, got 17"),
+        ({"samples": np.zeros((4, 0), dtype=np.float32)}, "samples, got 0"),
+        ({"samples": np.zeros((2, wire.MAX_FRAME_SAMPLES + 1), dtype=np.float32)}, "got 19201"),
+    ],
+)
+def test_frame_outside_the_limits_is_refused(values: dict[str, Any], expected: str) -> None:
+    good: dict[str, Any] = {
+        "array": "north",
+        "sequence": 1,
+        "raster": 1,
+        "time_ns": 1,
+        "sample_rate_hz": 16000.0,
+        "samples": np.zeros((4, 10), dtype=np.float32),
+        "power": 0.0,
+        "active": False,
+    }
+    decode(encode(Frame(**good)))
+    assert expected in refusal(encode(Frame(**(good | values))))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"power": math.nan}, "finite powers"),
+        ({"noise_power": -1.0}, "finite powers"),
+        ({"channel_power": (0.0, math.inf)}, "finite powers"),
+        ({"channel_power": (0.0,) * 17}, "at most 16 channels"),
+        ({"drift_ppm": math.nan}, "finite drift"),
+        ({"raster": 2**62}, "raster"),
+    ],
+)
+def test_mark_outside_the_limits_is_refused(values: dict[str, Any], expected: str) -> None:
+    good: dict[str, Any] = {
+        "array": "north",
+        "sequence": 1,
+        "raster": 1,
+        "power": 0.0,
+        "noise_power": 0.0,
+        "channel_power": (0.0,) * 4,
+    }
+    decode(encode(Mark(**good)))
+    assert expected in refusal(encode(Mark(**(good | values))))
+
+
+@pytest.mark.parametrize("name", ["", "n" * 65])
+def test_name_that_does_not_fit_is_not_sent(name: str) -> None:
+    with pytest.raises(ValueError, match="expected 1 to 64 bytes"):
+        encode(Mark(name, 1, 1, 0.0, 0.0, ()))
+
+
+def test_name_that_is_no_text_is_refused() -> None:
+    data = encode(Mark("nn", 1, 1, 0.0, 0.0, ()))
+    assert "UTF-8" in refusal(data[:-2] + b"\xff\xfe")
+
+
+def test_samples_come_back_read_only() -> None:
+    got = decode(encode(frame()))
+    assert isinstance(got, Frame)
+    assert not got.samples.flags.writeable
