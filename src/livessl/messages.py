@@ -67,6 +67,8 @@ class Messages:
             "covariance_m2": covariance,
             "confidence": confidence,
             "arrays": arrays,
+            "status": str(update.status),
+            "contributions": [_contribution(c) for c in update.contributions],
             "zones": self._site.zones_of(position),
             "level_dbfs": dbfs(update.power),
         }

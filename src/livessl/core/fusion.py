@@ -340,19 +340,20 @@ class Fusion:
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
         sounds: dict[str, Sound] = {}
-        power = 0.0
+        powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
-            heard = [r for r in window if stream.has_active(r)]
-            pieces, _ = stream.segments(heard)
+            pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
                 sounds[name] = _sound(pieces)
-                power = max(power, *(frame.power for piece in pieces for frame in piece))
+                powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
         found = self._estimator.locate(sounds)
         middle_ns = (window.start + window.stop) * FRAME_NS // 2
         estimate = _estimate(found, middle_ns, sounds)
-        update = Update(self._id(event.start), estimate, power)
+        status, _ = self._judge(estimate)
+        loudest = max(float(power.max()) for power in powers.values())
+        update = Update(self._id(event.start), status, estimate, loudest, self._contributions(powers, estimate))
         snapshot = MapSnapshot(middle_ns, found.fused, found.maps)
         tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
         return [update, snapshot, *tracks]
@@ -384,7 +385,11 @@ class Fusion:
         if not sounds:
             return []
         start_ns, end_ns = first * FRAME_NS, (last + 1) * FRAME_NS
-        status, reason, estimate = self._judge(sounds, (start_ns + end_ns) // 2)
+        estimate: Estimate | None = None
+        status, reason = Status.REFUSED, f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
+        if len(sounds) >= parameters.min_arrays:
+            estimate = _estimate(self._estimator.locate(sounds), (start_ns + end_ns) // 2, sounds)
+            status, reason = self._judge(estimate)
         return [
             Event(
                 id=self._id(event.start),
@@ -395,28 +400,25 @@ class Fusion:
                 estimate=estimate,
                 power=max(float(power.max()) for power in powers.values()),
                 method=self._estimator.name,
-                contributions=tuple(_contribution(self._streams[name].spec, powers[name], estimate) for name in sounds)
-                if estimate is not None
-                else (),
+                contributions=() if estimate is None else self._contributions(powers, estimate),
                 heard_by=tuple(sounds),
                 late_frames=event.late_frames,
                 latency_s=(self._now_ns - end_ns) / 1e9,
             )
         ]
 
-    def _judge(self, sounds: Mapping[str, Sound], time_ns: int) -> tuple[Status, str | None, Estimate | None]:
-        wanted = self._parameters.min_arrays
-        if len(sounds) < wanted:
-            return Status.REFUSED, f"heard by {len(sounds)} of at least {wanted} arrays", None
-        found = self._estimator.locate(sounds)
-        estimate = _estimate(found, time_ns, sounds)
-        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
-        distances = [direction_deg(self._streams[name].spec.centre_m, found.position_m)[2] for name in sounds]
-        if spread_m > RANGE_UNKNOWN * min(distances):
-            who = "one array cannot" if len(sounds) == 1 else "these arrays cannot"
-            reason = f"{who} tell how far away it is: +-{spread_m:.2f} m at {min(distances):.2f} m"
-            return Status.DIRECTION_ONLY, reason, estimate
-        return Status.LOCATED, None, estimate
+    def _judge(self, estimate: Estimate) -> tuple[Status, str | None]:
+        """Whether the estimate is a place, or only a direction, and why."""
+        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
+        centres = [self._streams[name].spec.centre_m for name in estimate.arrays]
+        nearest_m = min(direction_deg(centre, estimate.position_m)[2] for centre in centres)
+        if spread_m <= RANGE_UNKNOWN * nearest_m:
+            return Status.LOCATED, None
+        who = "one array cannot" if len(centres) == 1 else "these arrays cannot"
+        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: +-{spread_m:.2f} m at {nearest_m:.2f} m"
+
+    def _contributions(self, powers: Mapping[str, FloatArray], estimate: Estimate) -> tuple[Contribution, ...]:
+        return tuple(_contribution(self._streams[name].spec, powers[name], estimate) for name in powers)
 
     def _id(self, raster: int) -> str:
         return f"{self._site}-{raster * FRAME_NS // 1_000_000}"

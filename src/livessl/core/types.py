@@ -294,11 +294,13 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """Where the sound that is still going on seems to be."""
+    """Where the sound that is still going on seems to be: as in `Event`, from its last moments."""
 
     event_id: str
+    status: Status
     estimate: Estimate
     power: float
+    contributions: tuple[Contribution, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
