@@ -61,7 +61,7 @@ def small(changes: Changes | None = None) -> dict[str, Any]:
 
 def text_of(changes: Changes | None = None) -> str:
     """The small site's YAML, changed."""
-    return yaml.safe_dump(small(changes), sort_keys=False)
+    return yaml.safe_dump(small(changes), sort_keys=False, allow_unicode=True)
 
 
 def site_of(changes: Changes | None = None, directory: Path | None = None) -> Site:

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -71,7 +70,7 @@ class LiveRun:
     page: list[dict[str, Any]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     readme_client: str = ""
-    javascript_client: list[dict[str, Any]] = field(default_factory=list)
+    javascript_client: list[list[Any]] = field(default_factory=list)
     curl_clients: dict[str, str] = field(default_factory=dict)
     site: dict[str, Any] = field(default_factory=dict)
     after_the_end: str = ""
@@ -119,7 +118,7 @@ def located(session: Session) -> str:
 
 
 @pytest.fixture(scope="module")
-def live(session: Session) -> Iterator[LiveRun]:
+def live(session: Session) -> LiveRun:
     """Server, two nodes, a subscriber, the documented clients and a browser, while the session plays once."""
     require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
     seen = LiveRun()
@@ -130,12 +129,9 @@ def live(session: Session) -> Iterator[LiveRun]:
         wait_for(lambda: answers(session.url), "the server to answer")
         listener = Thread(target=listen, args=(session.url, seen.messages), daemon=True)
         listener.start()
-        client = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
-        clients.append(
-            subprocess.Popen(
-                [sys.executable, "-u", "-c", client], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
-        )
+        code = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
+        reader = [sys.executable, "-u", "-c", code]
+        clients.append(subprocess.Popen(reader, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         wait_for(lambda: time.time() % TOGETHER_S < 1.0, "a new five seconds: nodes started within them begin together")
         for node, array in (("north-pc", "north"), ("south-pc", "south")):
             wav = f"{array}={session.directory / array}.wav"
@@ -152,12 +148,13 @@ def live(session: Session) -> Iterator[LiveRun]:
         seen.curl_clients = curl_examples(session)
     finally:
         for process in [*nodes, server]:
-            process.send_signal(signal.SIGTERM) if process.poll() is None else None
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
         assert server.wait(timeout=5) == 0
-        for process in clients:
-            process.send_signal(signal.SIGTERM)
-            seen.readme_client, _ = process.communicate(timeout=5)
-    yield seen
+        for client in clients:
+            client.send_signal(signal.SIGTERM)
+            seen.readme_client, _ = client.communicate(timeout=5)
+    return seen
 
 
 def watch_in_browser(session: Session, seen: LiveRun, nodes: list[subprocess.Popen[bytes]]) -> None:
@@ -246,10 +243,9 @@ def readme_block(language: str) -> str:
 
 
 def listen(url: str, messages: list[dict[str, Any]]) -> None:
-    with connect(f"ws{url.removeprefix('http')}/api/v1/live") as socket_:
+    with connect(f"ws{url.removeprefix('http')}/api/v1/live") as live_:
         try:
-            for text in socket_:
-                messages.append(json.loads(text))
+            messages.extend(json.loads(text) for text in live_)
         except ConnectionClosed:
             return
 

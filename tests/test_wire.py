@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import random
@@ -141,10 +142,8 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
 @settings(max_examples=500)
 def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
     for data in (body, struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + body):
-        try:
+        with contextlib.suppress(WireError):
             decode(data)
-        except WireError:
-            pass
 
 
 JSON_VALUES = st.recursive(

@@ -383,7 +383,11 @@ def check_endpoint(endpoint: str) -> str:
     """
     scheme, _, rest = endpoint.partition("://")
     host, _, port = rest.rpartition(":")
-    tcp = scheme == "tcp" and host != "" and (port == "*" or (port.isdigit() and int(port) <= 65535))
+    tcp = (
+        scheme == "tcp"
+        and host != ""
+        and (port == "*" or (re.fullmatch("[0-9]{1,5}", port) is not None and int(port) <= 65535))
+    )
     if not (tcp or (scheme == "ipc" and rest)):
         raise ValueError(f"expected tcp://HOST:PORT or ipc://PATH, got {endpoint!r}")
     return endpoint
@@ -488,13 +492,13 @@ def _valid_part(data: Mapping[str, Any]) -> tuple[Site | None, list[_Finding]]:
         if not found:  # what is missing in later rounds has been taken away here
             found = [(_path(item["loc"]), _sentence(item)) for item in items]
         for part in {_part(_path(item["loc"]), item["type"] == "extra_forbidden") for item in items}:
-            if not _take_away(left, part):
+            if not part or not _take_away(left, part):
                 return None, found
 
 
 def _part(path: _Place, unknown_key: bool) -> _Place:
     """The smallest part of the file that can be left out for a fault at `path`."""
-    return path if unknown_key else path[: 2 if path[0] in ("arrays", "nodes", "zones") else 1]
+    return path if unknown_key else path[: 2 if path[:1] in (("arrays",), ("nodes",), ("zones",)) else 1]
 
 
 def _take_away(data: dict[str, Any], path: _Place) -> bool:

@@ -56,9 +56,9 @@ def test_ideal_stamps_give_exact_boundaries(rate_hz: float, offset: int) -> None
     cuts = cut_all(framer, stream(400, lambda index: ideal_ns(index, rate_hz, start_ns)))
     assert_contiguous(cuts)
     for cut in cuts:
-        # sample n is taken at (n + offset) / rate after the second: the frame begins with the first sample in it
-        begins = (cut.raster * FRAME_NS - 1_700_000_000 * 10**9) / 1e9 * rate_hz - offset
-        assert cut.samples[0, 0] == (begins if begins == round(begins) else np.floor(begins))
+        # sample n is taken (n + offset) / rate after the whole second, raster interval r begins r / 20 after it;
+        # at 22.05 kHz every other one begins half-way between two samples, and takes in the earlier
+        assert cut.samples[0, 0] == (cut.raster - 20 * 1_700_000_000) * int(rate_hz) // 20 - offset
         assert cut.time_ns == pytest.approx(ideal_ns(int(cut.samples[0, 0]), rate_hz, start_ns), abs=2)
         assert 0 <= cut.time_ns - cut.raster * FRAME_NS + 1e9 / rate_hz < 1.01e9 / rate_hz
     assert cuts[0].raster == 1_700_000_000 * 10**9 // FRAME_NS + (offset > 0)

@@ -386,7 +386,8 @@ class Fusion:
             return []
         start_ns, end_ns = first * FRAME_NS, (last + 1) * FRAME_NS
         estimate: Estimate | None = None
-        status, reason = Status.REFUSED, f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
+        status = Status.REFUSED
+        reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
         if len(sounds) >= parameters.min_arrays:
             estimate = _estimate(self._estimator.locate(sounds), (start_ns + end_ns) // 2, sounds)
             status, reason = self._judge(estimate)
