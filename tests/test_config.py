@@ -342,7 +342,7 @@ def test_poses_turn_the_right_way(tmp_path: Path) -> None:
     ]
     for turn, first, third, fourth in cases:
         turned = posed_square(tmp_path, **turn)
-        assert_allclose(turned, [first, -first, third, fourth], rtol=0, atol=1e-12, err_msg=str(turn))
+        assert_allclose(turned, np.stack([first, -first, third, fourth]), rtol=0, atol=1e-12, err_msg=str(turn))
 
 
 def test_absolute_microphones_are_the_posed_ones() -> None:

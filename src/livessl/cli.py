@@ -39,6 +39,7 @@ from livessl.core.types import FRAME_NS, Event
 from livessl.messages import JsonObject, Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
+from livessl.server.sinks import SinkError
 from livessl.server.store import StoreError
 from livessl.session import read_session
 from livessl.simulate.export import write_scene
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
-    except (BindError, StoreError, UndeliveredError, demo.DemoError, OSError) as error:
+    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -353,7 +354,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         _Once.polite = True
         _send_session(site, parts, arguments.server, start_ns, arguments.speed)
         return OK
-    here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "events_db": None})
+    here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "events_db": None, "sinks": ()})
     site = site.model_copy(update={"server": here})
     show: Callable[[JsonObject], None] = lambda event: _print_event(event, as_json=arguments.json)  # noqa: E731
     server = Server(site, SystemClock(), method=arguments.method, on_event=show)

@@ -252,12 +252,20 @@ class HttpConfig(_Model):
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
 
 
+class SinkConfig(_Model):
+    """Another place for events: a file with one JSON object a line."""
+
+    type: Literal["jsonl"]
+    path: Annotated[str, Field(min_length=1)]
+
+
 class ServerConfig(_Model):
     """The fusion server."""
 
     bind: str = "tcp://127.0.0.1:5570"
     http: HttpConfig = HttpConfig()
     events_db: str | None = None
+    sinks: tuple[SinkConfig, ...] = ()
 
     @field_validator("bind")
     @classmethod

@@ -89,9 +89,9 @@ def recording_channels(site: Site, array: str, recording: Recording, wanted: Seq
             f"{recording.sample_rate_hz:g} Hz; lower band_hz or use a recording with a higher rate"
         )
     if wanted is not None:
-        if len(wanted) != expected or min(wanted) < 1 or max(wanted) > recording.channels:
+        if not len(wanted) == len(set(wanted)) == expected or min(wanted) < 1 or max(wanted) > recording.channels:
             raise DeviceError(
-                f"{recording.name}: expected {expected} channel numbers from 1 to {recording.channels} for array "
+                f"{recording.name}: expected {expected} different channel numbers from 1 to {recording.channels} for array "
                 f"{array!r}, got {list(wanted)}"
             )
         return list(wanted)

@@ -17,6 +17,7 @@ from livessl.messages import JsonObject
 from livessl.server.engine import Engine
 from livessl.server.hub import Hub
 from livessl.server.receiver import BindError
+from livessl.server.sinks import Sinks
 from livessl.server.store import Store
 from livessl.server.web import create_app
 
@@ -42,8 +43,8 @@ class Server:
     ------
     BindError
         Where an address is taken.
-    StoreError
-        Where the event database cannot be used.
+    StoreError, SinkError
+        Where the event database or a sink cannot be used.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Server:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._http = _listen(site.server.http.host, site.server.http.port)
         try:
+            self._sinks = Sinks(site.server.sinks)
             self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
             self.engine = Engine(site, clock, self._store, self._publish, method)
         except BaseException:
@@ -83,6 +85,7 @@ class Server:
         finally:
             self.engine.stop()
             self._store.close()
+            self._sinks.close()
             self._http.close()
         if self.engine.failure is not None:
             raise self.engine.failure
@@ -108,8 +111,10 @@ class Server:
         self.stop()
 
     def _publish(self, message: JsonObject) -> None:
-        if self._on_event is not None and message["kind"] == "event":
-            self._on_event(message)
+        if message["kind"] == "event":
+            self._sinks.take(message)
+            if self._on_event is not None:
+                self._on_event(message)
         loop = self._loop
         if loop is None:
             return

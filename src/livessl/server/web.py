@@ -45,7 +45,7 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
         title="livessl",
         version=__version__,
         description="Where in the room a sound happened: events, live estimates, tracks, arrays and power maps.",
-        docs_url="/api/docs",
+        docs_url=None,  # its page would load scripts from elsewhere
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
     )
@@ -53,8 +53,7 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
     @app.middleware("http")
     async def _headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
         response: Response = await proceed(request)
-        if not request.url.path.startswith("/api/docs"):
-            response.headers["Content-Security-Policy"] = _CSP
+        response.headers["Content-Security-Policy"] = _CSP
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers.setdefault("Cache-Control", "no-cache")
         return response

@@ -1,0 +1,78 @@
+"""Where events go besides subscribers and the store. Each kind is a name in `SINKS`, chosen in the site file."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, Protocol
+
+from livessl.config import SinkConfig
+from livessl.messages import JsonObject
+
+_log = logging.getLogger(__name__)
+
+
+class SinkError(Exception):
+    """A sink that cannot be opened."""
+
+
+class Sink(Protocol):
+    """Takes events, one by one, on the engine's thread."""
+
+    def take(self, event: JsonObject) -> None:
+        """Deliver one event."""
+        ...
+
+    def close(self) -> None:
+        """Deliver what is held back, and end."""
+        ...
+
+
+class JsonLines:
+    """One event a line, appended to a file that `tail -f` and every log shipper can follow."""
+
+    def __init__(self, config: SinkConfig) -> None:
+        try:
+            self._file = Path(config.path).open("a", encoding="utf-8")  # noqa: SIM115 - closed by close()
+        except OSError as error:
+            raise SinkError(f"server.sinks: cannot append to {config.path}: {error.strerror}") from error
+
+    def take(self, event: JsonObject) -> None:
+        """Append a line and hand it to the operating system."""
+        self._file.write(json.dumps(event, separators=(",", ":")) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+SINKS: Final[dict[str, Callable[[SinkConfig], Sink]]] = {"jsonl": JsonLines}
+"""Name in the site file, and what makes it."""
+
+
+class Sinks:
+    """All of a site's sinks; one that fails is reported and does not hinder the others."""
+
+    def __init__(self, configs: Sequence[SinkConfig]) -> None:
+        self._sinks = [(config.type, SINKS[config.type](config)) for config in configs]
+        self.failures = 0
+
+    def take(self, event: JsonObject) -> None:
+        """Deliver an event to each."""
+        for name, sink in self._sinks:
+            try:
+                sink.take(event)
+            except OSError as error:
+                self.failures += 1
+                _log.error("sink %r did not take event %s: %s", name, event["id"], error)
+
+    def close(self) -> None:
+        """End all."""
+        for name, sink in self._sinks:
+            try:
+                sink.close()
+            except OSError as error:
+                _log.error("sink %r did not end well: %s", name, error)
