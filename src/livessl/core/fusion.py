@@ -161,6 +161,7 @@ class _Stream:
 class _OpenEvent:
     start: int
     last_active: int
+    closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
 
 
@@ -293,11 +294,11 @@ class Fusion:
         return outputs
 
     def _may_close(self, raster: int) -> bool:
+        while self._reached and self._reached[0][0] < raster:
+            self._reached.popleft()
         late = [stream for stream in self._streams.values() if self._is_waited_for(stream, raster)]
         if not late:
             return True
-        while self._reached and self._reached[0][0] < raster:
-            self._reached.popleft()
         first_ns = self._reached[0][1] if self._reached else self._now_ns
         if self._now_ns - first_ns < self._parameters.deadline_s * 1e9:
             return False
@@ -321,10 +322,11 @@ class Fusion:
     def _close(self, raster: int) -> list[Output]:
         active = any(stream.has_active(raster) for stream in self._streams.values())
         if active and self._event is None:
-            self._event = _OpenEvent(raster, raster)
+            self._event = _OpenEvent(raster, raster, raster)
         event = self._event
         if event is None:
             return []
+        event.closed = raster
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
@@ -362,10 +364,8 @@ class Fusion:
         event, self._event = self._event, None
         assert event is not None
         parameters = self._parameters
-        span = range(
-            max(event.start - round(parameters.pre_roll_s / FRAME_S), self._heard_until),
-            event.last_active + round(parameters.hang_over_s / FRAME_S) + 1,
-        )
+        pre_roll = round(parameters.pre_roll_s / FRAME_S)
+        span = range(max(event.start - pre_roll, self._heard_until), event.closed + 1)
         sounds: dict[str, Sound] = {}
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
