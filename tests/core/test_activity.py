@@ -29,7 +29,7 @@ NOISE = 1e-6
 
 
 def sine(frequency_hz: float, amplitude: float, rate_hz: float = RATE_HZ, n: int = 800) -> FloatArray:
-    return amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / rate_hz + 0.4)
+    return np.asarray(amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / rate_hz + 0.4))
 
 
 def causal(power: Iterable[float], parameters: ActivityParameters | None = None) -> BoolArray:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.estimators import ESTIMATORS, Localization, Sound, SrpPhat
-from livessl.core.geometry import Grid, circle
+from livessl.core.geometry import Grid, circle, posed
 from livessl.core.types import ArraySpec, FloatArray
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
@@ -35,9 +35,7 @@ def sounds_from(
 ) -> dict[str, Sound]:
     n = round(0.2 * rate_hz)
     sound = burst(n, seed)
-    return {
-        spec.name: Sound((heard(spec, source_m, sound, rate_hz, c_m_s),), rate_hz) for spec in (NORTH, SOUTH)
-    }
+    return {spec.name: Sound((heard(spec, source_m, sound, rate_hz, c_m_s),), rate_hz) for spec in (NORTH, SOUTH)}
 
 
 def error_m(found: Localization, source_m: FloatArray = SOURCE_M) -> float:
@@ -154,7 +152,7 @@ def test_silence_and_dead_channels_are_survived(estimator: SrpPhat) -> None:
 
 
 def test_arrays_of_two_to_sixteen_microphones_work_together() -> None:
-    round_table = ArraySpec("table", circle(0.15, 16) + [2.2, 2.4, 0.8], BAND_HZ)
+    round_table = ArraySpec("table", posed(circle(0.15, 16), [2.2, 2.4, 0.8]), BAND_HZ)
     pair = ArraySpec("pair", np.array([[2.5, 4.9, 1.2], [2.8, 4.9, 1.25]]), BAND_HZ)
     specs = (round_table, pair, SOUTH)
     sound = burst(3200)

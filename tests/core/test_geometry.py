@@ -144,8 +144,9 @@ def test_nodes_are_numbered_z_fastest() -> None:
     nodes_m = grid.nodes_m()
     for index in (0, 1, 9, 108, 777, grid.size - 1):
         np.testing.assert_allclose(grid.node_m(index), nodes_m[index])
-        cell = np.unravel_index(index, grid.shape)
-        np.testing.assert_allclose([grid.axis_m(axis)[cell[axis]] for axis in range(3)], nodes_m[index])
+        cell = [int(i) for i in np.unravel_index(index, grid.shape)]
+        along = [float(grid.axis_m(axis)[cell[axis]]) for axis in range(3)]
+        np.testing.assert_allclose(along, nodes_m[index])
     np.testing.assert_allclose(nodes_m[0], [-0.85, 0.65, 0.35])
     np.testing.assert_allclose(nodes_m[1] - nodes_m[0], [0.0, 0.0, 0.3], atol=1e-12)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from livessl.core import peaks
 from livessl.core.gcc import GCCPhat, mean_square_angular_frequency
-from livessl.core.geometry import Grid, line
+from livessl.core.geometry import Grid, line, posed
 from livessl.core.srp import HeardBy, SRPFunctional
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray
 
@@ -42,7 +42,7 @@ def covariance_of(evidence: list[HeardBy], grid: Grid = GRID, place_m: FloatArra
 
 
 # The slope of a cubic through lags h apart errs by h^3 R^(4) / 12, so a top by (w h)^2 h / 20 = 34 ns for 6 kHz at an
-# eighth of 16 kHz: 12 um of way. Over 0.3 m that is 40 urad, 0.1 mm at 2.5 m; five times that where directions cross flat:
+# eighth of 16 kHz: 12 um of way. Over 0.3 m that is 40 urad, 0.1 mm at 2.5 m; where directions cross flat, 5 times:
 NEAR_M = 5e-4
 
 
@@ -177,8 +177,9 @@ def test_covariance_is_one_and_within_the_volumes(noise: float, seed: int, both:
 
 
 def test_without_evidence_the_covariance_is_the_volumes() -> None:
-    nothing = [HeardBy(NORTH, GCC(e.gcc.pairs.copy(), e.gcc.lags_s.copy(), 0 * e.gcc.values)) for e in evidence_of((NORTH,))]
-    np.testing.assert_allclose(covariance_of(nothing), np.diag(np.array([4.2, 5.1, 2.7]) ** 2 / 12), rtol=1e-9)
+    gcc = evidence_of((NORTH,))[0].gcc
+    nothing = HeardBy(NORTH, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), 0.0 * gcc.values))
+    np.testing.assert_allclose(covariance_of([nothing]), np.diag(np.array([4.2, 5.1, 2.7]) ** 2 / 12), rtol=1e-9)
 
 
 def test_one_array_knows_the_direction_better_than_the_distance() -> None:
@@ -199,7 +200,7 @@ def test_noise_widens_the_covariance() -> None:
 
 def test_covariance_of_one_pair_in_closed_form() -> None:
     """Broadside of two microphones, along their line alone: var(tau) = s^2 kappa / (g kappa)^2, and w = 2/K = 1."""
-    spec = ArraySpec("pair", line(0.4, 2) + [2.0, 2.0, 1.0], BAND_HZ)
+    spec = ArraySpec("pair", posed(line(0.4, 2), [2.0, 2.0, 1.0]), BAND_HZ)
     grid = Grid(((0.0, 4.0), (4.0, 4.0), (1.0, 1.0)), 0.1)
     source_m = np.array([2.0, 4.0, 1.0])
     (heard_by,) = evidence_of((spec,), source_m, noise=0.003)
@@ -236,9 +237,9 @@ def squared_distances() -> FloatArray:
 
 
 # The scale takes an array's pairs for as many delays as are independent, K - 1 of K (K - 1) / 2: it holds where one
-# microphone's noise is in all of its pairs alike. Where every pair's noise is its own (low SNR), the pairs together know
-# K / 2 = 2 times as much. The truth lies between, so the median may be half the chi-square's. The median of 200 draws
-# has a standard deviation of 1 / (2 p(2.37) sqrt(200)) = 0.19, 8 %; three of them on either side:
+# microphone's noise is in all of its pairs alike. Where every pair's noise is its own (low SNR), the pairs together
+# know K / 2 = 2 times as much. The truth lies between, so the median may be half the chi-square's. The median of 200
+# draws has a standard deviation of 1 / (2 p(2.37) sqrt(200)) = 0.19, 8 %; three of them on either side:
 LOWEST, HIGHEST = 0.76 * CHI2_3_MEDIAN / 2, 1.24 * CHI2_3_MEDIAN
 
 

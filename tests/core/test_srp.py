@@ -40,7 +40,9 @@ def off_axis_deg(spec: ArraySpec, place_m: FloatArray) -> float:
 
 def test_steering_delay_is_how_much_later_the_second_hears_it() -> None:
     microphones_m = np.array([[0.0, 0.0, 0.0], [0.0, 3.43, 0.0], [1.0, 0.0, 0.0]])
-    delays = steering_delays_s(np.array([[0.0, -1.0, 0.0], [0.0, 4.43, 0.0]]), microphones_m, microphone_pairs(3), 343.0)
+    delays = steering_delays_s(
+        np.array([[0.0, -1.0, 0.0], [0.0, 4.43, 0.0]]), microphones_m, microphone_pairs(3), 343.0
+    )
     assert delays.shape == (3, 2)
     np.testing.assert_allclose(delays[0], [0.01, -0.01])
     np.testing.assert_allclose(delays[1], [(np.sqrt(2.0) - 1) / 343, (np.hypot(1.0, 4.43) - 4.43) / 343])

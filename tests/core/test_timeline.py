@@ -30,9 +30,7 @@ def numbered(first: int, count: int) -> Float32Array:
     return np.stack([index, -index])
 
 
-def stream(
-    blocks: int, stamp: Callable[[int], int] = ideal_ns, block: int = 480, first: int = 0
-) -> Iterator[Block]:
+def stream(blocks: int, stamp: Callable[[int], int] = ideal_ns, block: int = 480, first: int = 0) -> Iterator[Block]:
     for k in range(blocks):
         index = first + k * block
         yield Block(index, numbered(index, block), stamp(index))
@@ -40,6 +38,10 @@ def stream(
 
 def cut_all(framer: Framer, blocks: Iterator[Block]) -> list[Cut]:
     return [cut for block in blocks for cut in framer.push(block)]
+
+
+def state_of(framer: Framer) -> ClockState:
+    return framer.timeline.state
 
 
 def assert_contiguous(cuts: list[Cut]) -> None:
@@ -182,20 +184,20 @@ def test_clock_is_locked_after_two_seconds() -> None:
 def test_step_of_the_clock_is_seen_after_some_blocks(step_ns: int) -> None:
     framer = Framer(RATE_HZ)
     before = cut_all(framer, stream(200))
-    assert framer.timeline.state is ClockState.LOCKED
+    assert state_of(framer) is ClockState.LOCKED
     cuts_after: list[Cut] = []
     for count, block in enumerate(stream(100, lambda index: ideal_ns(index) + step_ns, first=200 * 480), start=1):
         cuts = framer.push(block)
         if count < STEP_BLOCKS:
             before += cuts
-            assert framer.timeline.state is ClockState.LOCKED
+            assert state_of(framer) is ClockState.LOCKED
         else:
             cuts_after += cuts
         if count == STEP_BLOCKS:
             assert framer.timeline.steps == 1
-            assert framer.timeline.state is ClockState.STEPPED
+            assert state_of(framer) is ClockState.STEPPED
     assert framer.lost_frames == 1  # the one that the step tore
-    assert framer.timeline.state is ClockState.LOCKED  # again
+    assert state_of(framer) is ClockState.LOCKED  # again
     assert framer.timeline.steps == 1
     assert_contiguous(before)
     assert_contiguous(cuts_after)

@@ -17,7 +17,7 @@ import numpy as np
 from livessl.core.activity import THRESHOLD, exact_mask, runs
 from livessl.core.estimators import Estimator, Localization, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.tracker import Tracker
+from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
@@ -208,10 +208,11 @@ class Fusion:
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
+        outputs = self._start_over() if self._went_back(now_ns) else []
         self._now_ns = now_ns
         for message in messages:
             self._accept(message)
-        outputs = self._close_ready()
+        outputs += self._close_ready()
         if self._event is not None and self._everyone_silent():
             outputs += self._finish()
         outputs += self._tracker.step(now_ns)
@@ -238,6 +239,18 @@ class Fusion:
         """How every array is doing."""
         return [_status(stream, now_ns) for stream in self._streams.values()]
 
+    def _went_back(self, now_ns: int) -> bool:
+        return self._next is not None and (self._next - 1) * FRAME_NS - now_ns > LATEST_NS
+
+    def _start_over(self) -> list[Output]:
+        """The server's clock was set back: what came before lies in its future now, and would make all else late."""
+        outputs = self._finish() if self._event is not None else []
+        outputs += self._tracker.step(self._now_ns + round(2e9 * SILENCE_S))
+        self._streams = {name: _Stream(old.spec, counters=old.counters) for name, old in self._streams.items()}
+        self._reached.clear()
+        self._next, self._heard_until = None, -(2**63)
+        return outputs
+
     def _accept(self, message: Message) -> None:
         stream = self._streams.get(message.array)
         if stream is None:
@@ -258,6 +271,8 @@ class Fusion:
         stream.watermark = message.raster if stream.watermark is None else max(stream.watermark, message.raster)
         if not self._reached or message.raster > self._reached[-1][0]:
             self._reached.append((message.raster, self._now_ns))
+        if (self._reached[-1][0] - message.raster) * FRAME_S < self._parameters.deadline_s:
+            stream.waited_for = True
         if self._next is None:
             self._next = message.raster
 
@@ -310,10 +325,7 @@ class Fusion:
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
         if stream.watermark is None or stream.heard_ns is None or stream.left:
             return False
-        if stream.watermark >= raster:
-            stream.waited_for = True
-            return False
-        return stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
+        return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
     def _everyone_silent(self) -> bool:
         quiet_ns = self._parameters.deadline_s * 1e9 + self._parameters.hang_over_s * 1e9
