@@ -34,6 +34,7 @@ from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConf
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
 from livessl.messages import JsonObject, Messages
+from livessl.plan import design, figure, words
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, OSError) as error:
+    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -159,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--node", required=True, help="name of the node in the site file")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must not hold a session")
     sub.add_argument("--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV")
-    sub.add_argument("--duration", type=_seconds, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
+    sub.add_argument("--duration", type=_above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
     _add_wav(sub, "record FILE at real speed instead of the device: a rehearsal")
 
     sub = command(
@@ -176,6 +177,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
     sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
 
+    _add_plan(command)
+
     sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
     sub.add_argument("site", type=Path)
     sub.add_argument("--json", action="store_true", help="print the result as JSON")
@@ -183,6 +186,27 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("devices", _devices, "list audio devices", "livessl devices")
     sub.add_argument("--json", action="store_true", help="print the list as JSON")
     return parser
+
+
+def _add_plan(command: Callable[..., Any]) -> None:
+    sub = command(
+        "plan",
+        _plan,
+        "tell what error to expect where, and where arrays should go",
+        "livessl plan --site site.yaml --rt60 0.7 --out plan/",
+    )
+    _add_site(sub)
+    sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
+    sub.add_argument("--height", type=_not_negative, metavar="M", help="of the sounds (default 1.5, if searched)")
+    sub.add_argument(
+        "--calibration",
+        type=_above_zero,
+        default=design.CALIBRATION_M,
+        metavar="M",
+        help=f"how well the microphones' places are known (default {design.CALIBRATION_M:g})",
+    )
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
 
 
 def _add_site(parser: Any) -> None:
@@ -445,6 +469,25 @@ def _simulate(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def _plan(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    if arguments.out is not None:
+        figure.require_matplotlib()
+    try:
+        with progress.counted("trying places", "array") as bar:
+            plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
+    except ValueError as error:
+        _complain(str(error))
+        return WRONG_USE
+    result = words.as_json(plan)
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
+        figure.draw(plan, arguments.out / "plan.png")
+    print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))
+    return OK
+
+
 def _check(arguments: argparse.Namespace) -> int:
     try:
         site = load_site(arguments.site)
@@ -541,7 +584,7 @@ def _not_negative(text: str) -> float:
     return _number(text, lambda value: value >= 0, "a number >= 0")
 
 
-def _seconds(text: str) -> float:
+def _above_zero(text: str) -> float:
     return _number(text, lambda value: value > 0, "a number > 0")
 
 
