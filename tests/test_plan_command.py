@@ -14,7 +14,7 @@ from livessl.cli import main
 from livessl.core.planning import Move
 from livessl.plan.design import make_plan
 from livessl.plan.warn import warnings
-from livessl.plan.words import as_json, move_text
+from livessl.plan.words import addition_text, as_json, move_text
 from small_site import Changes, site_of, write_site
 
 ROOM: Changes = {"room.size_m": [8.0, 10.0, 4.0]}
@@ -68,6 +68,7 @@ def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: py
     assert 1 <= len(plan["advice"]) <= 3
     for advice in plan["advice"]:
         name = advice["array"]
+        assert advice["kind"] == "move"
         assert advice["text"].startswith(f"move {name} ")
         assert advice["median_after_m"] < 0.95 * advice["median_before_m"]
         assert advice["median_before_m"] == pytest.approx(plan["predicted_error"]["p50_m"], rel=1e-9)
@@ -81,6 +82,18 @@ def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: py
         np.testing.assert_allclose(there["arrays"][name]["centre_m"], advice["position_m"], rtol=0, atol=1e-6)
 
 
+def test_one_array_is_told_where_a_second_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one: Changes = {**ROOM, "arrays.south": ..., "nodes": ...}
+    [added] = [advice for advice in object_of(tmp_path, capsys, one)["advice"] if advice["kind"] == "add"]
+    assert added["text"].startswith("add an array like north, ")
+    assert added["median_after_m"] < 0.5 * added["median_before_m"]
+    position_m = [float(x) for x in np.add([1.9, 1.3, 1.4], added["offset_m"])]
+    two = {**ROOM, "nodes": ..., "arrays.south.position_m": position_m}
+    there = object_of(tmp_path, capsys, two)
+    assert there["predicted_error"]["p50_m"] == pytest.approx(added["median_after_m"], rel=1e-9)
+    assert [advice for advice in there["advice"] if advice["kind"] == "add"] == []
+
+
 @pytest.mark.parametrize(
     ("offset_m", "text"),
     [
@@ -91,6 +104,7 @@ def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: py
 )
 def test_moves_in_words(offset_m: tuple[float, float], text: str) -> None:
     assert move_text(Move("south", offset_m, 0.31, 0.18)) == text
+    assert addition_text(Move("south", offset_m, 0.31, 0.18)).endswith(text.removeprefix("move south"))
 
 
 def test_text_is_readable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

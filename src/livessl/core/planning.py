@@ -318,7 +318,7 @@ def radial_tangential_m(
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One array at another place: what the median of the predicted error was, and would be."""
+    """One array, or one more like it, at another place: what the median of the predicted error was, and would be."""
 
     array: str
     offset_m: tuple[float, float]
@@ -365,17 +365,46 @@ def best_moves(
     moves = []
     for index, spec in enumerate(specs):
         others = [other.microphones_m for k, other in enumerate(specs) if k != index]
-        best = Move(spec.name, (0.0, 0.0), before, before)
-        for offset in shifts_m(spec, others, room_size_m, step_m):
-            there = information_1_m2(moved(spec, offset), points_m, conditions)
-            after = _median_error_m(everything - own[index] + there, extent_m)
-            if after < best.after_m:
-                best = Move(spec.name, offset, before, after)
-        if best.after_m < before:
+        shifts = shifts_m(spec, others, room_size_m, step_m)
+        best = _best_of(shifts, spec, everything - own[index], before, points_m, conditions, extent_m)
+        if best is not None:
             moves.append(best)
         if progress is not None:
             progress(index + 1, len(specs))
     return sorted(moves, key=lambda move: move.after_m)
+
+
+def best_addition(
+    spec: ArraySpec,
+    points_m: FloatArray,
+    conditions: Conditions,
+    room_size_m: ArrayLike,
+    extent_m: FloatArray,
+    step_m: float = 0.5,
+) -> Move | None:
+    """Where a second array like a lone one lowers the median error most, as a shift from it; as in `best_moves`."""
+    own = information_1_m2(spec, points_m, conditions)
+    shifts = shifts_m(spec, [spec.microphones_m], room_size_m, step_m)
+    return _best_of(shifts, spec, own, _median_error_m(own, extent_m), points_m, conditions, extent_m)
+
+
+def _best_of(
+    shifts: Sequence[tuple[float, float]],
+    spec: ArraySpec,
+    others: FloatArray,
+    before_m: float,
+    points_m: FloatArray,
+    conditions: Conditions,
+    extent_m: FloatArray,
+) -> Move | None:
+    """The shift of an array that lowers the median error most, beside others' information; None if none does."""
+    best = None
+    for shift in shifts:
+        there = information_1_m2(moved(spec, shift), points_m, conditions)
+        after = _median_error_m(others + there, extent_m)
+        if after < (before_m if best is None else best.after_m):
+            best = Move(spec.name, shift, before_m, after)
+    return best
 
 
 def shifts_m(

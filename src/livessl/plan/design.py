@@ -110,7 +110,10 @@ class ArrayPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A site's plan; the map's columns are at `x_m`, its rows at `y_m`, all at `height_m`."""
+    """A site's plan; the map's columns are at `x_m`, its rows at `y_m`, all at `height_m`.
+
+    Of a site with one array, `addition` says where a second one like it would go.
+    """
 
     site: Site
     rt60_s: float
@@ -122,6 +125,7 @@ class Plan:
     arrays: tuple[ArrayPlan, ...]
     fused: Errors
     moves: tuple[planning.Move, ...]
+    addition: planning.Move | None
 
 
 def make_plan(
@@ -168,9 +172,11 @@ def make_plan(
         for spec, own in zip(site.specs, information, strict=True)
     )
     middle = np.mean([spec.centre_m for spec in site.specs], axis=0)
-    moves = planning.best_moves(
-        site.specs, points, conditions, site.room.size_m, extent, _step_m(site.room.size_m), progress
-    )
+    room, step = site.room.size_m, _step_m(site.room.size_m)
+    moves = planning.best_moves(site.specs, points, conditions, room, extent, step, progress)
+    addition = None
+    if len(site.specs) == 1:
+        addition = planning.best_addition(site.specs[0], points, conditions, room, extent, step)
     return Plan(
         site=site,
         rt60_s=rt60_s,
@@ -182,6 +188,7 @@ def make_plan(
         arrays=arrays,
         fused=_errors(np.sum(information, axis=0), floor, extent, middle),
         moves=tuple(move for move in moves if move.after_m <= WORTH_WHILE * move.before_m)[:MOST_MOVES],
+        addition=addition,
     )
 
 

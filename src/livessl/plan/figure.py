@@ -11,7 +11,7 @@ import numpy as np
 from livessl.core.planning import angle_error_deg
 from livessl.core.types import FloatArray
 from livessl.plan.design import ANGLES_DEG, Errors, Plan
-from livessl.plan.words import move_text
+from livessl.plan.words import advice_texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -153,20 +153,26 @@ def _inside(errors: Errors) -> list[float]:
 
 
 def _moves(ax: Axes, plan: Plan) -> None:
-    for move in plan.moves:
+    for move in (*plan.moves, *(() if plan.addition is None else (plan.addition,))):
         x, y, _ = plan.site.array(move.array).centre_m
         dx, dy = move.offset_m
         ax.annotate(
             "",
             (x + dx, y + dy),
             xytext=(x, y),
-            arrowprops={"arrowstyle": "->", "color": "#d62728", "linewidth": 1.8, "linestyle": "--"},
+            arrowprops={
+                "arrowstyle": "-|>" if move is plan.addition else "->",
+                "color": "#d62728",
+                "linewidth": 1.8,
+                "linestyle": ":" if move is plan.addition else "--",
+            },
         )
-    if plan.moves:
+    texts = advice_texts(plan)
+    if texts:
         ax.text(
             0.5,
             -0.16,
-            "\n".join(move_text(move) for move in plan.moves),
+            "\n".join(texts),
             transform=ax.transAxes,
             ha="center",
             va="top",

@@ -17,13 +17,25 @@ JsonObject = dict[str, Any]
 
 def move_text(move: Move) -> str:
     """Say a move as a person would: east is +x, north is +y."""
+    return f"move {move.array} {_way(move)}"
+
+
+def addition_text(move: Move) -> str:
+    """Say where one more array goes."""
+    return f"add an array like {move.array}, {_way(move)}"
+
+
+def advice_texts(plan: Plan) -> list[str]:
+    """All advice, the most helpful first."""
+    added = [] if plan.addition is None else [addition_text(plan.addition)]
+    return added + [move_text(move) for move in plan.moves]
+
+
+def _way(move: Move) -> str:
     (dx, dy) = move.offset_m
     ways = [f"{abs(dx):.1f} m {'east' if dx > 0 else 'west'}"] if dx else []
     ways += [f"{abs(dy):.1f} m {'north' if dy > 0 else 'south'}"] if dy else []
-    return (
-        f"move {move.array} {' and '.join(ways)}: "
-        f"median predicted error {_length(move.before_m)} → {_length(move.after_m)} m"
-    )
+    return f"{' and '.join(ways)}: median predicted error {_length(move.before_m)} → {_length(move.after_m)} m"
 
 
 def as_text(plan: Plan) -> str:
@@ -56,7 +68,7 @@ def _lines(plan: Plan) -> Iterator[str]:
         yield from _array_lines(plan, array)
     yield ""
     yield "advice (east is +x, north is +y)"
-    yield from [f"  {move_text(move)}" for move in plan.moves] or ["  no move of a single array is worth while"]
+    yield from [f"  {text}" for text in advice_texts(plan)] or ["  no move of a single array is worth while"]
     found = warnings(plan)
     if found:
         yield ""
@@ -114,17 +126,22 @@ def as_json(plan: Plan) -> JsonObject:
         "arrays": {array.spec.name: _array_json(array) for array in plan.arrays},
         "map": {"x_m": _list(plan.x_m), "y_m": _list(plan.y_m), "error_m": _list(plan.fused.total_m)},
         "advice": [
-            {
-                "array": move.array,
-                "offset_m": [*move.offset_m, 0.0],
-                "position_m": _list(plan.site.array(move.array).centre_m + np.array([*move.offset_m, 0.0])),
-                "median_before_m": move.before_m,
-                "median_after_m": move.after_m,
-                "text": move_text(move),
-            }
-            for move in plan.moves
+            *([] if plan.addition is None else [_advice(plan, "add", plan.addition, addition_text(plan.addition))]),
+            *(_advice(plan, "move", move, move_text(move)) for move in plan.moves),
         ],
         "warnings": warnings(plan),
+    }
+
+
+def _advice(plan: Plan, kind: str, move: Move, text: str) -> JsonObject:
+    return {
+        "kind": kind,
+        "array": move.array,
+        "offset_m": [*move.offset_m, 0.0],
+        "position_m": _list(plan.site.array(move.array).centre_m + np.array([*move.offset_m, 0.0])),
+        "median_before_m": move.before_m,
+        "median_after_m": move.after_m,
+        "text": text,
     }
 
 
