@@ -138,7 +138,7 @@ def test_without_matplotlib(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(planned(tmp_path, None, "--out", str(tmp_path / "plan"))) == 1
-    assert "pip install 'livessl[figures]'" in capsys.readouterr().err
+    assert "run `sh scripts/setup.sh figures`" in capsys.readouterr().err
     assert not (tmp_path / "plan").exists()
     assert main(planned(tmp_path)) == 0, "text needs none"
 

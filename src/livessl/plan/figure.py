@@ -41,7 +41,7 @@ def require_matplotlib() -> None:
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise FigureError(
-            "plan.png needs matplotlib, which is not installed; pip install 'livessl[figures]', or leave --out away"
+            "plan.png needs matplotlib, which is not installed; run `sh scripts/setup.sh figures`, or leave --out away"
         ) from error
 
 
