@@ -148,13 +148,13 @@ class Ingest:
             and now_ns - peer.heard_ns < GONE_NS
         ]
         for other in others:
+            if other.hello.replay != hello.replay:
+                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
             if other.hello.node == hello.node:
                 return f"a node named {hello.node!r} is connected already; names must differ"
             taken = sorted(set(other.hello.arrays) & set(hello.arrays))
             if taken:
                 return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
-            if other.hello.replay != hello.replay:
-                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
         return None
 
     def _reject(self, error: wire.WireError, now_ns: int) -> Arrival:
