@@ -14,7 +14,7 @@ import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from livessl import __version__, demo, progress, replay
 from livessl.capture.devices import DeviceError
@@ -42,6 +42,8 @@ from livessl.server.store import StoreError
 from livessl.session import SESSION_FILE, read_session
 from livessl.simulate.export import write_scene
 from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
+
+T = TypeVar("T")
 
 OK: Final = 0
 FAILED: Final = 1
@@ -330,18 +332,19 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
         with progress.counted("simulating the room", "source") as bar:
             parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:
-        wavs = dict(arguments.wav)
+        wavs = _once_each(arguments.wav, "--wav")
         strangers = sorted(set(wavs) - set(site.nodes[arguments.node].arrays))
         if strangers:
             known = ", ".join(site.nodes[arguments.node].arrays)
             raise DeviceError(f"--wav {strangers[0]}=…: node {arguments.node!r} has the arrays {known}")
-        parts = parts_from_wavs(site, wavs, dict(arguments.channels), start_ns)
+        parts = parts_from_wavs(site, wavs, _once_each(arguments.channels, "--channels"), start_ns)
     return repeated(parts) if getattr(arguments, "loop", False) else parts
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
-    parts = parts_from_wavs(site, dict(arguments.wav), dict(arguments.channels))
+    wavs, channels = _once_each(arguments.wav, "--wav"), _once_each(arguments.channels, "--channels")
+    parts = parts_from_wavs(site, wavs, channels)
     messages = Messages(site, 0, utc=False)
     found = 0
     with progress.timed("listening", *span_ns(parts)) as bar:
@@ -547,6 +550,14 @@ def _complain(text: str, kind: str = "error") -> None:
 
 def _xyz(position: Sequence[float] | None) -> str:
     return "-" if position is None else "(" + ", ".join(f"{x:5.2f}" for x in position) + ")"
+
+
+def _once_each(pairs: Sequence[tuple[str, T]], option: str) -> dict[str, T]:
+    names = [name for name, _ in pairs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; take one away")])
+    return dict(pairs)
 
 
 def _assignment(text: str) -> tuple[str, Path]:

@@ -351,6 +351,23 @@ def test_array_that_was_away_catches_up() -> None:
     assert status_of(fusion, "south", 140).counters["late"] == 6
 
 
+def test_array_that_is_always_late_delays_nobody() -> None:
+    active = range(100, 106)
+    arrivals = node("north", active, range(140)) + node("south", active, range(140), 3 * DEADLINE)
+    (when, event), *_ = events_of(play(fusion_of(), arrivals, 140))
+    assert (when, event.heard_by) == (106 + HANG_OVER, ("north",))
+
+
+def test_array_that_is_punctual_again_is_waited_for() -> None:
+    """Behind by less than the deadline, it never comes first again; but it need not."""
+    active = {*range(10, 16), *range(100, 106)}
+    south = node("south", active, range(140), 3 * DEADLINE)
+    south = [(max(when - 25, 80.0) if message.raster - START >= 50 else when, message) for when, message in south]
+    said = events_of(play(fusion_of(), node("north", active, range(140)) + south, 145))
+    assert said[0][1].heard_by == ("north",)
+    assert (said[-1][0], said[-1][1].heard_by) == (106 + HANG_OVER + 5, ("north", "south"))
+
+
 def test_late_active_frames_are_counted() -> None:
     delay = 12  # over the deadline, but before the event is over
     fusion = fusion_of()

@@ -19,6 +19,7 @@ from livessl.core.geometry import (
     speed_of_sound_m_s,
     tetrahedron,
 )
+from livessl.core.types import FloatArray
 
 X, Y, Z = np.eye(3)
 BOUNDS_M = ((-1.0, 2.3), (0.5, 4.1), (0.2, 2.9))
@@ -93,7 +94,7 @@ def test_line_goes_along_x_around_the_origin() -> None:
     ],
 )
 def test_pose_rolls_then_pitches_then_yaws(
-    angles: dict[str, float], x_to: ArrayLike, y_to: ArrayLike, z_to: ArrayLike
+    angles: dict[str, float], x_to: FloatArray, y_to: FloatArray, z_to: FloatArray
 ) -> None:
     shift = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(posed(np.eye(3), shift, **angles) - shift, [x_to, y_to, z_to], atol=1e-15)

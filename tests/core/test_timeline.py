@@ -95,8 +95,15 @@ def test_frames_do_not_care_how_samples_came_in_blocks(sizes: list[int], offset:
 def test_one_sided_jitter_leaves_frames_whole() -> None:
     rng = np.random.default_rng(1)
     framer = Framer(RATE_HZ)
-    cuts = cut_all(framer, stream(2000, lambda index: ideal_ns(index) + int(rng.uniform(0, JITTER_NS))))
+    cuts: list[Cut] = []
+    drifts_ppm = []
+    for block in stream(2000, lambda index: ideal_ns(index) + int(rng.uniform(0, JITTER_NS))):
+        cuts += framer.push(block)
+        # With a sum S of squared x, jitter of sd 1.44 ms makes 1.44 ms sqrt(S) / (S + 1e4 s^2) of drift, at its most
+        # 7.2 ppm (1 sd): the prior holds it down while a line through a second of stamps would be 800 ppm off.
+        drifts_ppm.append(abs(framer.timeline.drift_ppm))
     assert framer.lost_frames == 0
+    assert max(drifts_ppm) < 4 * 7.2
     assert_contiguous(cuts)
     settled = cuts[200:]
     lengths = np.array([cut.samples.shape[1] for cut in settled])
@@ -238,6 +245,14 @@ def test_gap_drops_the_torn_frame_and_no_other() -> None:
     assert (whole - torn) % 800 == 0
     assert after[0].raster - before[-1].raster == (whole - torn) // 800 + 1
     assert all(abs(cut.raster * FRAME_NS - ideal_ns(int(cut.samples[0, 0]))) < 1e9 / RATE_HZ for cut in after)
+
+
+def test_gap_before_the_first_frame_tears_none() -> None:
+    framer = Framer(RATE_HZ)
+    assert framer.push(Block(0, numbered(0, 10), ideal_ns(0))) == []
+    cuts = cut_all(framer, stream(20, first=500))
+    assert framer.lost_frames == 0
+    assert_contiguous(cuts)
 
 
 def test_overflow_drops_the_torn_frame_and_starts_a_new_line() -> None:

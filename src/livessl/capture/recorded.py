@@ -42,6 +42,11 @@ def parts_from_wavs(
         With every file that does not fit, one a line.
     """
     wanted = channels or {}
+    strangers = sorted(set(wanted) - set(wavs))
+    if strangers:
+        raise DeviceError(
+            f"channels of array {strangers[0]!r}: no recording of it is given; there are {', '.join(wavs)}"
+        )
     return _parts(
         site,
         [
@@ -129,12 +134,15 @@ def parts_from_node(
     Raises
     ------
     DeviceError
-        With every file that does not fit, one a line.
+        With every file that does not fit, one a line; or why there is no such scene.
     """
     config = site.nodes[node].device
     arrays = site.nodes[node].arrays
     if isinstance(config, SceneDeviceConfig):
-        parts = parts_from_scene(site, arrays, config, start_ns, progress)
+        try:
+            parts = parts_from_scene(site, arrays, config, start_ns, progress)
+        except ValueError as error:
+            raise DeviceError(f"nodes.{node}.device: {error}") from error
     else:
         assert isinstance(config, WavDeviceConfig)
         missing = [array for array in arrays if array not in config.files]
@@ -159,7 +167,14 @@ def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping
         except DeviceError as error:
             faults.append(str(error))
             continue
-        stretches.setdefault(array, []).append(Placed(recording, start_ns))
+        first = stretches.setdefault(array, [Placed(recording, start_ns)])[0].recording
+        if recording.sample_rate_hz != first.sample_rate_hz:
+            faults.append(
+                f"{path}: expected {first.sample_rate_hz:g} Hz as in {first.name}, of array {array!r}, too; "
+                f"got {recording.sample_rate_hz:g} Hz; resample one of them"
+            )
+        elif recording is not first:
+            stretches[array].append(Placed(recording, start_ns))
     if faults:
         raise DeviceError("\n".join(faults))
     return [Part(array, _spliced(placed), chosen[array]) for array, placed in stretches.items()]

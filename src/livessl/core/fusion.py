@@ -47,8 +47,9 @@ SILENT_NS: Final = 1_000_000_000
 """All-zero samples for so long are a dead microphone: any real one has noise."""
 
 EARLIEST_NS: Final = -30_000_000_000
-LATEST_NS: Final = 2_000_000_000
-"""Frames this far from the server's time come from a clock that is wrong; older ones a node's buffer cannot hold."""
+LATEST_NS: Final = 500_000_000
+"""Frames this far from the server's time come from a clock that is wrong: sound is never ahead of its time by more than
+two clocks that NTP keeps can differ, and what is older a node's buffer cannot hold."""
 
 JUMP_FRAMES: Final = 1200
 """A gap of a minute is skipped, not walked through."""
