@@ -32,6 +32,9 @@ class HandClock:
     def now_ns(self) -> int:
         return self.time_ns
 
+    def monotonic_ns(self) -> int:
+        return self.time_ns
+
     def sleep_until_ns(self, time_ns: int) -> bool:
         self.time_ns = max(self.time_ns, time_ns)
         return True
@@ -370,3 +373,23 @@ def test_restart_of_the_real_server_loses_nothing_and_doubles_nothing() -> None:
     for got in (first, second):
         assert got == sorted(set(got))
     assert set(first) | set(second) == set(range(1, 61))
+
+
+def test_a_clock_set_back_an_hour_stops_nothing() -> None:
+    """Stamps may jump; intervals are counted by a time that nobody sets."""
+
+    class SetBack(HandClock):
+        def now_ns(self) -> int:
+            return self.time_ns - 3_600_000_000_000
+
+    for clock in (HandClock(), SetBack()):
+        with Router() as router:
+            link = Link(router.endpoint, HELLO, clock)
+            try:
+                wait_until(lambda link=link: link.service() or link._hello_ns > 0, "the first greeting to go out")
+                before = link._hello_ns
+                clock.time_ns += 1_000_000_000
+                link.service()
+                assert link._hello_ns > before
+            finally:
+                link.close(bye=False)

@@ -64,7 +64,7 @@ class SrpPhat:
         self._arrays = {spec.name: spec for spec in arrays}
         self._grid = grid
         self._c_m_s = c_m_s
-        self._tools: dict[tuple[str, float], tuple[GCCPhat, SRPMapper]] = {}
+        self._tools: dict[str, tuple[float, GCCPhat, SRPMapper]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
@@ -91,13 +91,14 @@ class SrpPhat:
         )
 
     def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper]:
-        key = (array, sample_rate_hz)
-        if key not in self._tools:
-            spec = self._arrays[array]
-            correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s)
-            mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s)
-            self._tools[key] = (correlate, mapper)
-        return self._tools[key]
+        known = self._tools.get(array)
+        if known is not None and known[0] == sample_rate_hz:
+            return known[1:]
+        spec = self._arrays[array]
+        correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s)
+        mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s)
+        self._tools[array] = (sample_rate_hz, correlate, mapper)
+        return correlate, mapper
 
 
 ESTIMATORS: Final[dict[str, Callable[[Sequence[ArraySpec], Grid, float], Estimator]]] = {SrpPhat.name: SrpPhat}

@@ -61,7 +61,7 @@ class GCCPhat:
     """
 
     def __init__(self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float) -> None:
-        low, high = spec.band_hz
+        high = spec.band_hz[1]
         if high >= sample_rate_hz / 2:
             raise ValueError(
                 f"array {spec.name!r}: band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, "
@@ -70,7 +70,7 @@ class GCCPhat:
         self.pairs = microphone_pairs(len(spec.microphones_m))
         self._band_hz = spec.band_hz
         self._rate_hz = sample_rate_hz
-        self._envelope = low > ENVELOPE_ABOVE * (high - low)
+        self._envelope = uses_envelope(spec.band_hz)
         largest = spec.aperture_m / c_m_s * sample_rate_hz
         fine = int(np.ceil(largest * OVERSAMPLING)) + 2 * OVERSAMPLING
         self.lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
@@ -111,6 +111,12 @@ class GCCPhat:
             correlation = (scipy.fft.irfft(whitened, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
         around = np.concatenate([correlation[:, -self._coarse :], correlation[:, : self._coarse + 1]], axis=1)
         return np.asarray(around / max(1, high - low), dtype=np.complex64)
+
+
+def uses_envelope(band_hz: tuple[float, float]) -> bool:
+    """Whether R is the magnitude instead of the real part: see `GCCPhat`."""
+    low, high = band_hz
+    return low > ENVELOPE_ABOVE * (high - low)
 
 
 def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:
