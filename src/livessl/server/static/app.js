@@ -279,7 +279,7 @@ function showLink(link, silentMs) {
   state.link = link;
   document.body.dataset.link = link;
   find("connection").dataset.state = link;
-  write(find("connection-word"), { live: "live", stale: "stale", down: silentMs === null ? "connecting" : "no contact" }[link]);
+  write(find("connection-word"), { live: "connected", stale: "stale", down: silentMs === null ? "connecting" : "no contact" }[link]);
   const banner = find("banner");
   banner.hidden = link === "live" || (silentMs === null && performance.now() < 1000);
   write(find("banner-for"), silentMs === null ? " yet" : ` for ${duration(silentMs / 1000)}`);
