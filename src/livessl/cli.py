@@ -36,6 +36,7 @@ from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import ConfigError, Fault, Site, SoundDeviceConfig, load_site
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
+from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
@@ -177,6 +178,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--count", type=_positive, default=8, help="sounds in the scene (default 8)")
     sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
     sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
+
+    sub = command(
+        "evaluate",
+        _evaluate,
+        "repeat the paper's experiments in simulated rooms",
+        "livessl evaluate one-array --events sounds/ --positions 10 --out evaluation/",
+    )
+    evaluation.add_arguments(sub)
 
     sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
     sub.add_argument("site", type=Path)
@@ -447,6 +456,18 @@ def _simulate(arguments: argparse.Namespace) -> int:
         _complain(str(error))
         return WRONG_USE
     logging.info("%d sounds in %.1f s written to %s", len(scene.sources), scene.duration_s, arguments.out)
+    return OK
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    try:
+        with _bar(f"evaluating {arguments.experiment}", "position") as bar:
+            written = evaluation.run(arguments, arguments.jobs or os.cpu_count() or 1, bar)
+    except ValueError as error:
+        _complain(str(error))
+        return WRONG_USE
+    for path in written:
+        print(path)
     return OK
 
 
