@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -14,10 +15,13 @@ import numpy as np
 import soundfile
 import yaml
 
+from livessl.capture.devices import ArrayRecording, Placed
+from livessl.capture.recorded import Part
 from livessl.clock import SystemClock
 from livessl.config import Site, parse_site
 from livessl.core.types import Float32Array, Frame, Mark
 from livessl.server.app import Server
+from livessl.simulate.scene import Scene, make_scene, render
 
 RATE_HZ = 16000
 SMALL: dict[str, Any] = {
@@ -86,6 +90,37 @@ def write_wav(path: Path, samples: Float32Array, rate_hz: int = RATE_HZ, subtype
     """Samples (channels, n) as a file; returns its path."""
     soundfile.write(path, samples.T, rate_hz, subtype=subtype)
     return path
+
+
+@cache
+def scene(count: int = 2) -> Scene:
+    """Bursts of noise in the small room, without reverberation."""
+    site = site_of()
+    return make_scene(
+        site.room.size_m,
+        rt60_s=0.0,
+        sounds=[("burst", hiss(0.4, 1)[0])],
+        count=count,
+        sample_rate_hz=RATE_HZ,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=2,
+        lead_s=0.7,
+    )
+
+
+@cache
+def heard(array: str, count: int = 2) -> Float32Array:
+    """What an array's microphones record of the scene, (4, n)."""
+    return render(scene(count), site_of().array(array).microphones_m, seed=3 + len(array))
+
+
+def scene_parts(start_ns: int, count: int = 2) -> list[Part]:
+    """The scene's recordings, begun at a site time."""
+    return [
+        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard(name, count)), start_ns), (1, 2, 3, 4))
+        for name in SMALL["arrays"]
+    ]
 
 
 def frame(sequence: int = 1, raster: int = 1000, array: str = "north", *, active: bool = True, seed: int = 0) -> Frame:

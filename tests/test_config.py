@@ -364,13 +364,13 @@ def test_shapes() -> None:
     distances = np.linalg.norm(tetrahedron[:, None] - tetrahedron[None], axis=2)
     assert_allclose(distances[~np.eye(4, dtype=bool)], 0.5)
     assert tetrahedron[0, 2] > 0.3
-    assert_allclose(tetrahedron[1], [0.5 / np.sqrt(3), 0, tetrahedron[2, 2]], atol=1e-12)
+    assert_allclose(tetrahedron[1], np.array([0.5 / np.sqrt(3), 0, tetrahedron[2, 2]]), atol=1e-12)
     circle = shape(circle={"radius_m": 0.1, "count": 4})
-    assert_allclose(circle, [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]], atol=1e-12)
+    assert_allclose(circle, np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]]), atol=1e-12)
     clockwise = shape(circle={"radius_m": 0.1, "count": 4, "clockwise": True})
     assert_allclose(clockwise, circle[[0, 3, 2, 1]], atol=1e-12)
     line = shape(line={"spacing_m": 0.1, "count": 3})
-    assert_allclose(line, [[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]], atol=1e-12)
+    assert_allclose(line, np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]]), atol=1e-12)
 
 
 def test_speed_of_sound() -> None:

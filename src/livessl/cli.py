@@ -11,29 +11,26 @@ import sys
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
-from tqdm import tqdm
-
-from livessl import __version__, demo, replay
+from livessl import __version__, demo, progress, replay
 from livessl.capture.devices import DeviceError
-from livessl.capture.line import Line
-from livessl.capture.node import Node, UndeliveredError
-from livessl.capture.record import Recorder, record_parts
+from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
+from livessl.capture.record import Recorder, record_device, record_parts
 from livessl.capture.recorded import (
     Part,
     common_start_ns,
-    end_ns,
     parts_from_node,
     parts_from_session,
     parts_from_wavs,
     repeated,
+    span_ns,
 )
-from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns
-from livessl.config import ConfigError, Fault, Site, SoundDeviceConfig, load_site
+from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
+from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig, load_site
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
@@ -42,7 +39,7 @@ from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
 from livessl.server.store import StoreError
-from livessl.session import read_session
+from livessl.session import SESSION_FILE, read_session
 from livessl.simulate.export import write_scene
 from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
 
@@ -54,8 +51,6 @@ INTERRUPTED: Final = 130
 WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
-_stop = threading.Event()
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code: 0 success, 1 failure at run time, 2 wrong use or configuration."""
@@ -63,15 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
-    _stop.clear()
-    previous = [signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
-        return int(parsed.run(parsed))
-    except ConfigError as error:
-        for fault in error.faults:
-            _complain(str(fault))
-        return WRONG_USE
-    except DeviceError as error:
+        with _sigterm_interrupts():
+            return int(parsed.run(parsed))
+    except (ConfigError, DeviceError) as error:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
@@ -80,21 +70,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """SIGTERM does what Ctrl-C does."""
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
     finally:
-        for number, handler in zip((signal.SIGINT, signal.SIGTERM), previous, strict=True):
+        signal.signal(signal.SIGTERM, previous)
+
+
+@contextmanager
+def _polite_stop() -> Iterator[threading.Event]:
+    """Within it, Ctrl-C and SIGTERM only set the event: loops look at it and end in order."""
+    stop = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)
-
-
-class _Once:
-    """Ctrl-C and SIGTERM mean the same: loops look at `_stop`, everything else is interrupted."""
-
-    polite = False
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signal module's signature
-    _stop.set()
-    if not _Once.polite:
-        raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -220,7 +218,10 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 def _demo(arguments: argparse.Namespace) -> int:
     clock = SystemClock()
-    with tempfile.TemporaryDirectory(prefix="livessl-demo-") as name, _bar("simulating the room", "source") as bar:
+    with (
+        tempfile.TemporaryDirectory(prefix="livessl-demo-") as name,
+        progress.counted("simulating the room", "source") as bar,
+    ):
         directory = Path(name)
         site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
         truth = demo.read_truth(directory)
@@ -284,33 +285,35 @@ def _capture(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     config = _node(site, arguments.node, arguments.site)
     clock = SystemClock()
-    run_id = f"{arguments.node}-{os.getpid()}-{clock.now_ns()}"[-64:]
+    run_id = _run_id(arguments.node, clock)
     if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
-        from livessl.capture.sound_device import SoundDevice
-
-        device = SoundDevice(config.device, max(map(max, config.arrays.values())), clock)
-        line = Line(site, config.arrays, device.sample_rate_hz)
-        node = Node(arguments.node, config.server, [line], clock, run_id)
-        _Once.polite = True
-        node.run_device(device, _stop.is_set)
+        device = _sound_device(config, config.device, clock)
+        with _polite_stop() as stop:
+            capture_device(site, arguments.node, device, clock, run_id, stop.is_set)
         return OK
-    with _bar("simulating the room", "source") as bar:
-        parts = _played_parts(arguments, site, clock.now_ns(), bar)
-    lines = [part.line(site) for part in parts]
-    node = Node(arguments.node, config.server, lines, clock, run_id)
-    _Once.polite = True
-    with _seconds_bar(parts) as progress:
-        node.run_recordings([part.placed for part in parts], _stop.is_set, clock=clock, progress=progress)
+    parts = _played_parts(arguments, site, clock.now_ns())
+    with _polite_stop() as stop, progress.timed("playing", *span_ns(parts)) as bar:
+        capture_recordings(site, arguments.node, parts, clock, run_id, stop.is_set, bar)
     return OK
 
 
-def _played_parts(
-    arguments: argparse.Namespace, site: Site, now_ns: int, bar: Callable[[int, int], None]
-) -> list[Part]:
+def _sound_device(config: NodeConfig, device: SoundDeviceConfig, clock: Clock) -> Any:
+    from livessl.capture.sound_device import SoundDevice
+
+    return SoundDevice(device, max(map(max, config.arrays.values())), clock)
+
+
+def _run_id(node: str, clock: Clock) -> str:
+    """New at each start, and short enough for the wire whatever the node's name is."""
+    return f"{clock.now_ns()}-{os.getpid()}-{node}"[:64]
+
+
+def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[Part]:
     """What a node plays instead of a device."""
     start_ns = getattr(arguments, "start_at", None) or common_start_ns(now_ns, len(site.nodes))
     if not arguments.wav:
-        parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
+        with progress.counted("simulating the room", "source") as bar:
+            parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:
         wavs = dict(arguments.wav)
         strangers = sorted(set(wavs) - set(site.nodes[arguments.node].arrays))
@@ -326,8 +329,8 @@ def _locate(arguments: argparse.Namespace) -> int:
     parts = parts_from_wavs(site, dict(arguments.wav), dict(arguments.channels))
     messages = Messages(site, 0, utc=False)
     found = 0
-    with _seconds_bar(parts) as progress:
-        for output in replay.run(site, parts, UnpacedClock(), method=arguments.method, progress=progress):
+    with progress.timed("listening", *span_ns(parts)) as bar:
+        for output in replay.run(site, parts, UnpacedClock(), method=arguments.method, progress=bar):
             if isinstance(output, Event):
                 found += 1
                 _print_event(messages.event(output), as_json=arguments.json)
@@ -358,25 +361,25 @@ def _replay(arguments: argparse.Namespace) -> int:
     session = read_session(arguments.directory)
     site = load_site(arguments.site) if arguments.site else session.site()
     parts = parts_from_session(site, session)
-    start_ns = min(part.placed.start_ns for part in parts)
     if arguments.server is not None:
-        _Once.polite = True
-        _send_session(site, parts, arguments.server, start_ns, arguments.speed)
+        with _polite_stop() as stop:
+            _send(site, arguments.server, parts, arguments.speed, stop)
         return OK
     here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "events_db": None, "sinks": ()})
     site = site.model_copy(update={"server": here})
     show: Callable[[JsonObject], None] = lambda event: _print_event(event, as_json=arguments.json)  # noqa: E731
     server = Server(site, SystemClock(), method=arguments.method, on_event=show)
     logging.info("dashboard on %s", server.url)
+    stop = threading.Event()
     failures: list[Exception] = []
 
     def send() -> None:
         try:
-            _send_session(site, parts, server.engine.endpoint, start_ns, arguments.speed)
-        except Exception as error:  # noqa: BLE001 - raised again by the main thread
+            _send(site, server.engine.endpoint, parts, arguments.speed, stop)
+            server.engine.wait_idle()
+        except Exception as error:  # noqa: BLE001 - raised again below
             failures.append(error)
         if arguments.once or failures:
-            server.engine.wait_idle()
             server.stop()
         else:
             logging.info("the session has ended; the dashboard stays until Ctrl-C")
@@ -384,50 +387,42 @@ def _replay(arguments: argparse.Namespace) -> int:
     sender = threading.Thread(target=send, daemon=True)
     sender.start()
     _run_server(server)
-    _stop.set()
+    stop.set()
     sender.join(timeout=4.0)
     if failures:
         raise failures[0]
     return OK
 
 
-def _send_session(site: Site, parts: Sequence[Part], endpoint: str, start_ns: int, speed: float) -> None:
+def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: threading.Event) -> None:
     clock = SystemClock()
-    pace = UnpacedClock(start_ns) if speed == float("inf") else PacedClock(start_ns, speed)
-    lines = [part.line(site) for part in parts]
-    node = Node("replay", endpoint, lines, clock, f"replay-{os.getpid()}-{clock.now_ns()}", replay=True)
-    node.link.wait_connected(_stop.is_set)
-    with _seconds_bar(parts) as progress:
-        node.run_recordings([part.placed for part in parts], _stop.is_set, clock=pace, progress=progress)
+    begin_ns, end_ns = span_ns(parts)
+    pace = UnpacedClock(begin_ns) if speed == float("inf") else PacedClock(begin_ns, speed)
+    with progress.timed("playing", begin_ns, end_ns) as bar:
+        send_session(site, endpoint, parts, pace, clock, _run_id("replay", clock), stop.is_set, bar)
 
 
 def _record(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     config = _node(site, arguments.node, arguments.site)
-    clock = SystemClock()
-    if (arguments.out / "session.yaml").exists():
+    if (arguments.out / SESSION_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "already holds a session; choose another folder")])
-    _Once.polite = True
+    clock = SystemClock()
     begun_ns = clock.now_ns()
+    with _polite_stop() as stop:
 
-    def over() -> bool:
-        spent_s = (clock.now_ns() - begun_ns) / 1e9
-        return _stop.is_set() or (arguments.duration is not None and spent_s >= arguments.duration)
+        def over() -> bool:
+            spent_s = (clock.now_ns() - begun_ns) / 1e9
+            return stop.is_set() or (arguments.duration is not None and spent_s >= arguments.duration)
 
-    if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
-        from livessl.capture.sound_device import SoundDevice
-
-        device = SoundDevice(config.device, max(map(max, config.arrays.values())), clock)
-        with device, Recorder(arguments.out, site, config.arrays, device.sample_rate_hz, arguments.format) as recorder:
-            for block in device:
-                recorder.push(block)
-                if over():
-                    break
-        recorded = recorder.recorded
-    else:
-        with _bar("simulating the room", "source") as bar:
-            parts = _played_parts(arguments, site, clock.now_ns(), bar)
-        recorded = record_parts(arguments.out, site, parts, clock, over, arguments.format)
+        if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
+            device = _sound_device(config, config.device, clock)
+            recorder = Recorder(arguments.out, site, config.arrays, device.sample_rate_hz, arguments.format)
+            record_device(recorder, device, over)
+            recorded = recorder.recorded
+        else:
+            parts = _played_parts(arguments, site, begun_ns)
+            recorded = record_parts(arguments.out, site, parts, clock, over, arguments.format)
     if not recorded:
         _complain("nothing was recorded: the device delivered no sound")
         return FAILED
@@ -450,7 +445,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
             keep_away_m=[spec.centre_m for spec in site.specs],
             seed=arguments.seed,
         )
-        with _bar("simulating the room", "source") as bar:
+        with progress.counted("simulating the room", "source") as bar:
             write_scene(arguments.out, site, scene, seed=arguments.seed, progress=bar)
     except ValueError as error:
         _complain(str(error))
@@ -517,48 +512,11 @@ def _device_json(device: Any) -> JsonObject:
     }
 
 
-def _node(site: Site, name: str, path: Path) -> Any:
+def _node(site: Site, name: str, path: Path) -> NodeConfig:
     if name not in site.nodes:
         known = ", ".join(site.nodes) or "none"
         raise ConfigError([Fault(f"{path}: nodes", f"expected one of {known}, got --node {name}")])
     return site.nodes[name]
-
-
-def _bar(what: str, unit: str) -> Any:
-    return _Progress(what, unit)
-
-
-class _Progress:
-    """A progress bar on stderr, only on a terminal and only for what takes longer than 2 s."""
-
-    def __init__(self, what: str, unit: str) -> None:
-        self._bar: Any = tqdm(desc=what, unit=unit, delay=2.0, leave=False, disable=None, total=1)
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._bar.close()
-
-    def __call__(self, done: int, total: int) -> None:
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-
-
-class _seconds_bar:  # noqa: N801 - used as a function
-    """A progress bar over the site time of recordings."""
-
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self._start_ns = min(part.placed.start_ns for part in parts)
-        endless = any(part.placed.recording.duration_s == float("inf") for part in parts)
-        self._total = 0 if endless else round((end_ns(parts) - self._start_ns) / 1e9)
-        self._progress = _Progress("listening", "s")
-
-    def __enter__(self) -> Callable[[int], None]:
-        return lambda now_ns: self._progress(round((now_ns - self._start_ns) / 1e9), self._total)
-
-    def __exit__(self, *exc: object) -> None:
-        self._progress.__exit__()
 
 
 def _complain(text: str, kind: str = "error") -> None:

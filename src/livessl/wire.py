@@ -27,6 +27,9 @@ MAX_FRAME_SAMPLES: Final = 19_200
 MAX_RATE_HZ: Final = 384_000.0
 """No sound card samples faster."""
 
+MAX_POWER: Final = 1e80
+"""Of samples that a float32 can hold; sums of such powers do not overflow."""
+
 MAX_RASTER: Final = (2**63 - 1) // FRAME_NS - 1
 """Site times are 64-bit nanoseconds: until the year 2262."""
 
@@ -161,8 +164,10 @@ def _decode_frame(body: bytes) -> Frame:
         raise WireError(f"frame: expected 2 to 16 channels, got {channels}")
     if not 0 < n <= MAX_FRAME_SAMPLES:
         raise WireError(f"frame: expected 1 to {MAX_FRAME_SAMPLES} samples, got {n}")
-    if not (0 < rate <= MAX_RATE_HZ and math.isfinite(power) and power >= 0):
-        raise WireError(f"frame: expected 0 < rate <= {MAX_RATE_HZ:g} Hz and power >= 0, got {rate} and {power}")
+    if not (0 < rate <= MAX_RATE_HZ and 0 <= power <= MAX_POWER):
+        raise WireError(
+            f"frame: expected 0 < rate <= {MAX_RATE_HZ:g} Hz and 0 <= power <= {MAX_POWER:g}, got {rate} and {power}"
+        )
     _check_raster(raster, "frame")
     name, start = _name(body, _FRAME.size, name_length)
     if len(body) - start != 4 * channels * n:
@@ -200,8 +205,8 @@ def _decode_mark(body: bytes) -> Mark:
     if len(body) - start != 8 * channels:
         raise WireError(f"mark: expected {8 * channels} bytes of channel powers, got {len(body) - start}")
     channel_power = tuple(np.frombuffer(body, dtype="<f8", offset=start).tolist())
-    if not all(math.isfinite(value) and value >= 0 for value in (power, noise, *channel_power)):
-        raise WireError(f"mark of array {name!r}: expected finite powers >= 0")
+    if not all(0 <= value <= MAX_POWER for value in (power, noise, *channel_power)):
+        raise WireError(f"mark of array {name!r}: expected powers from 0 to {MAX_POWER:g}")
     if not math.isfinite(drift):
         raise WireError(f"mark of array {name!r}: expected a finite drift, got {drift}")
     return Mark(name, sequence, raster, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])

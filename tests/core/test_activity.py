@@ -29,7 +29,7 @@ NOISE = 1e-6
 
 
 def sine(frequency_hz: float, amplitude: float, rate_hz: float = RATE_HZ, n: int = 800) -> FloatArray:
-    return amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / rate_hz + 0.4)
+    return np.asarray(amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / rate_hz + 0.4))
 
 
 def causal(power: Iterable[float], parameters: ActivityParameters | None = None) -> BoolArray:
@@ -170,7 +170,7 @@ def test_tail_slower_than_the_release_becomes_background() -> None:
 
 def test_quieter_sound_after_a_pause_is_found() -> None:
     pause = round(3.0 / FRAME_S)
-    first, second = [1e-2] * 10, [1e-3 * 0.5] * 10  # 13 dB less: under a tenth, but 3 s release 13 dB
+    first, second = [1e-2] * 10, [1e-2 * 10**-2.2] * 10  # 22 dB less: 10 are the rule's, and 3 s release 13 more
     power = np.concatenate([noise(60), first, noise(pause, seed=2), second, noise(20, seed=3)])
     mask = causal(power)[1:]
     assert runs(mask) == [(59, 69), (69 + pause, 79 + pause)]

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from livessl.core import gcc as module
 from livessl.core.gcc import OVERSAMPLING, GCCPhat, mean_square_angular_frequency, microphone_pairs
 from livessl.core.geometry import line
-from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray
 
 SOURCE_M = np.array([2.31, 1.17, 0.83])
 TETRA = tetra("north", [0.4, 0.2, 1.1])
@@ -38,7 +38,7 @@ def pair(spacing_m: float = 0.3, band_hz: tuple[float, float] = BAND_HZ) -> Arra
     return ArraySpec("pair", line(spacing_m, 2), band_hz)
 
 
-def correlate(spec: ArraySpec, *segments: Float32Array, rate_hz: float = RATE_HZ) -> module.GCC:
+def correlate(spec: ArraySpec, *segments: Float32Array, rate_hz: float = RATE_HZ) -> GCC:
     return GCCPhat(spec, rate_hz, C_M_S)(segments)
 
 

@@ -19,6 +19,7 @@ from livessl.core.geometry import (
     speed_of_sound_m_s,
     tetrahedron,
 )
+from livessl.core.types import FloatArray
 
 X, Y, Z = np.eye(3)
 BOUNDS_M = ((-1.0, 2.3), (0.5, 4.1), (0.2, 2.9))
@@ -93,7 +94,7 @@ def test_line_goes_along_x_around_the_origin() -> None:
     ],
 )
 def test_pose_rolls_then_pitches_then_yaws(
-    angles: dict[str, float], x_to: ArrayLike, y_to: ArrayLike, z_to: ArrayLike
+    angles: dict[str, float], x_to: FloatArray, y_to: FloatArray, z_to: FloatArray
 ) -> None:
     shift = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(posed(np.eye(3), shift, **angles) - shift, [x_to, y_to, z_to], atol=1e-15)
@@ -144,8 +145,9 @@ def test_nodes_are_numbered_z_fastest() -> None:
     nodes_m = grid.nodes_m()
     for index in (0, 1, 9, 108, 777, grid.size - 1):
         np.testing.assert_allclose(grid.node_m(index), nodes_m[index])
-        cell = np.unravel_index(index, grid.shape)
-        np.testing.assert_allclose([grid.axis_m(axis)[cell[axis]] for axis in range(3)], nodes_m[index])
+        cell = [int(i) for i in np.unravel_index(index, grid.shape)]
+        along = [float(grid.axis_m(axis)[cell[axis]]) for axis in range(3)]
+        np.testing.assert_allclose(along, nodes_m[index])
     np.testing.assert_allclose(nodes_m[0], [-0.85, 0.65, 0.35])
     np.testing.assert_allclose(nodes_m[1] - nodes_m[0], [0.0, 0.0, 0.3], atol=1e-12)
 

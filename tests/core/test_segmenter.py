@@ -14,7 +14,6 @@ from livessl.core.segmenter import WARM_UP_FRAMES, Segmenter
 from livessl.core.timeline import Framer
 from livessl.core.types import (
     FRAME_NS,
-    FRAME_S,
     ArraySpec,
     Block,
     ClockState,
@@ -30,15 +29,16 @@ N = 800
 START = 20 * 1_700_000_000
 SPEC = ArraySpec("north", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), (100.0, 6000.0))
 CHANNELS = np.array([2, 0, 1])
-PARAMETERS = ActivityParameters(pre_roll_s=0.2, hang_over_s=0.15)
 PRE_ROLL, HANG_OVER = 4, 3
+"""Frames of 50 ms."""
+PARAMETERS = ActivityParameters(pre_roll_s=0.05 * PRE_ROLL, hang_over_s=0.05 * HANG_OVER)
 QUIET, LOUD = 1e-3, 0.2
 
 
 def sound(levels: list[float], seed: int = 1) -> Float32Array:
     """Four channels of white noise, of a standard deviation for each 50 ms."""
     samples = np.random.default_rng(seed).standard_normal((4, N * len(levels)))
-    return (samples * np.repeat(levels, N)).astype(np.float32)
+    return np.asarray(samples * np.repeat(levels, N), dtype=np.float32)
 
 
 def segmenter() -> Segmenter:
@@ -191,4 +191,3 @@ def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes
     sent = rasters(whole, Frame)
     assert all(earlier < later for earlier, later in pairwise(sent))  # no frame twice
     assert len(rasters(whole, Mark)) + len(set(sent) - set(rasters(whole, Mark))) == len(loud)
-    assert FRAME_S * PRE_ROLL == PARAMETERS.pre_roll_s

@@ -40,7 +40,9 @@ def off_axis_deg(spec: ArraySpec, place_m: FloatArray) -> float:
 
 def test_steering_delay_is_how_much_later_the_second_hears_it() -> None:
     microphones_m = np.array([[0.0, 0.0, 0.0], [0.0, 3.43, 0.0], [1.0, 0.0, 0.0]])
-    delays = steering_delays_s(np.array([[0.0, -1.0, 0.0], [0.0, 4.43, 0.0]]), microphones_m, microphone_pairs(3), 343.0)
+    delays = steering_delays_s(
+        np.array([[0.0, -1.0, 0.0], [0.0, 4.43, 0.0]]), microphones_m, microphone_pairs(3), 343.0
+    )
     assert delays.shape == (3, 2)
     np.testing.assert_allclose(delays[0], [0.01, -0.01])
     np.testing.assert_allclose(delays[1], [(np.sqrt(2.0) - 1) / 343, (np.hypot(1.0, 4.43) - 4.43) / 343])
@@ -75,8 +77,10 @@ def test_map_is_the_functional_to_half_a_fine_lag() -> None:
         gcc = ideal(array)
         on_grid = mapped(array, gcc)
         smooth = SRPFunctional([HeardBy(array, gcc)], C_M_S).value(GRID.nodes_m())
-        # linear between fine lags, so half a step off at most: half the largest difference, for every pair
-        bound = 0.5 * np.abs(np.diff(gcc.values, axis=1)).max(axis=1).sum() * 2 / len(array.microphones_m)
+        # half a fine lag off at most: half the largest difference, and what the largest curvature takes off
+        steepest = 0.5 * np.abs(np.diff(gcc.values, axis=1)).max(axis=1)
+        bend = np.abs(np.diff(gcc.values, 2, axis=1)).max(axis=1) / 8
+        bound = (steepest + bend).sum() * 2 / len(array.microphones_m)
         assert np.abs(on_grid - smooth).max() <= bound + 1e-6  # of float32
         assert np.abs(on_grid - smooth).max() > 0.5 * bound / len(gcc.pairs)  # and the bound is no wide one
 
@@ -85,24 +89,34 @@ def test_functional_is_the_closed_form() -> None:
     points_m = np.random.default_rng(2).uniform(GRID.lower_m, GRID.upper_m, (500, 3))
     functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     expected = exact(NORTH, points_m) + exact(SOUTH, points_m)
-    # Linear between lags h apart errs by h^2 max |R''| / 8 = (2 pi 6 kHz h)^2 / 3 / 8 = 0.0036 of each of the 6 pairs
-    # of weight 1/2 of 2 arrays.
-    np.testing.assert_allclose(functional.value(points_m), expected, atol=6 * 0.0036)
-    assert functional.value(SOURCE_M[None])[0] == pytest.approx(6.0, abs=6 * 0.0036)
-    # half a per cent more of speed shows
-    other = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], 1.005 * C_M_S)
-    assert np.abs(other.value(points_m) - expected).max() > 2 * 6 * 0.0036
+    # Cubic between lags h apart errs by 3/128 h^4 max R^(4) = 3/128 (2 pi 6 kHz h)^4 / 5 = 3.5e-5 for each pair: 6 of
+    # weight 1/2 in each of 2 arrays.
+    np.testing.assert_allclose(functional.value(points_m), expected, atol=6 * 3.5e-5)
+    assert functional.value(SOURCE_M[None])[0] == pytest.approx(6.0, abs=6 * 3.5e-5)
+    # a tenth of a per mille more of speed shows
+    other = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], 1.0001 * C_M_S)
+    assert np.abs(other.value(points_m) - expected).max() > 2 * 6 * 3.5e-5
+
+
+def test_functional_has_no_kinks() -> None:
+    """Over half-millimetres its curvature is the closed form's: a roof at every fine lag would stop a climb."""
+    functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
+    h_m = 5e-4
+    path_m = SOURCE_M + h_m * np.arange(-100, 100)[:, None] * np.array([0.6, 0.0, 0.8])
+    second = np.diff(functional.value(path_m), 2) / h_m**2
+    expected = np.diff(exact(NORTH, path_m) + exact(SOUTH, path_m), 2) / h_m**2
+    assert np.abs(second - expected).max() < 0.1 * np.abs(expected).max()
 
 
 def test_source_scores_the_number_of_independent_delays() -> None:
+    x, y, z = (float(coordinate) for coordinate in SOURCE_M)
+    point = Grid(((x, x), (y, y), (z, z)), 1.0)
     for count in (2, 3, 8, 16):
         spec = ArraySpec("any", np.random.default_rng(count).uniform(0, 0.3, (count, 3)), BAND_HZ)
         functional = SRPFunctional([HeardBy(spec, ideal(spec))], C_M_S)
-        # K (K - 1) / 2 pairs of value 1 (h^2 |R''| / 8 less) and weight 2 / K
-        assert functional.value(SOURCE_M[None])[0] == pytest.approx(count - 1, rel=0.0036)
-        assert mapped(spec, ideal(spec), Grid(tuple((x, x) for x in SOURCE_M), 1.0))[0] == pytest.approx(  # type: ignore[arg-type]
-            count - 1, rel=4 * 0.0036
-        )
+        # K (K - 1) / 2 pairs of value 1 and weight 2 / K; a node half a fine lag off loses (w h / 2)^2 / 2 / 3
+        assert functional.value(SOURCE_M[None])[0] == pytest.approx(count - 1, rel=3.5e-5)
+        assert mapped(spec, ideal(spec), point)[0] == pytest.approx(count - 1, rel=0.0036)
     assert pair_weight(4) == 0.5
 
 

@@ -30,9 +30,7 @@ def numbered(first: int, count: int) -> Float32Array:
     return np.stack([index, -index])
 
 
-def stream(
-    blocks: int, stamp: Callable[[int], int] = ideal_ns, block: int = 480, first: int = 0
-) -> Iterator[Block]:
+def stream(blocks: int, stamp: Callable[[int], int] = ideal_ns, block: int = 480, first: int = 0) -> Iterator[Block]:
     for k in range(blocks):
         index = first + k * block
         yield Block(index, numbered(index, block), stamp(index))
@@ -40,6 +38,10 @@ def stream(
 
 def cut_all(framer: Framer, blocks: Iterator[Block]) -> list[Cut]:
     return [cut for block in blocks for cut in framer.push(block)]
+
+
+def state_of(framer: Framer) -> ClockState:
+    return framer.timeline.state
 
 
 def assert_contiguous(cuts: list[Cut]) -> None:
@@ -93,8 +95,15 @@ def test_frames_do_not_care_how_samples_came_in_blocks(sizes: list[int], offset:
 def test_one_sided_jitter_leaves_frames_whole() -> None:
     rng = np.random.default_rng(1)
     framer = Framer(RATE_HZ)
-    cuts = cut_all(framer, stream(2000, lambda index: ideal_ns(index) + int(rng.uniform(0, JITTER_NS))))
+    cuts: list[Cut] = []
+    drifts_ppm = []
+    for block in stream(2000, lambda index: ideal_ns(index) + int(rng.uniform(0, JITTER_NS))):
+        cuts += framer.push(block)
+        # With a sum S of squared x, jitter of sd 1.44 ms makes 1.44 ms sqrt(S) / (S + 1e4 s^2) of drift, at its most
+        # 7.2 ppm (1 sd): the prior holds it down while a line through a second of stamps would be 800 ppm off.
+        drifts_ppm.append(abs(framer.timeline.drift_ppm))
     assert framer.lost_frames == 0
+    assert max(drifts_ppm) < 4 * 7.2
     assert_contiguous(cuts)
     settled = cuts[200:]
     lengths = np.array([cut.samples.shape[1] for cut in settled])
@@ -182,20 +191,20 @@ def test_clock_is_locked_after_two_seconds() -> None:
 def test_step_of_the_clock_is_seen_after_some_blocks(step_ns: int) -> None:
     framer = Framer(RATE_HZ)
     before = cut_all(framer, stream(200))
-    assert framer.timeline.state is ClockState.LOCKED
+    assert state_of(framer) is ClockState.LOCKED
     cuts_after: list[Cut] = []
     for count, block in enumerate(stream(100, lambda index: ideal_ns(index) + step_ns, first=200 * 480), start=1):
         cuts = framer.push(block)
         if count < STEP_BLOCKS:
             before += cuts
-            assert framer.timeline.state is ClockState.LOCKED
+            assert state_of(framer) is ClockState.LOCKED
         else:
             cuts_after += cuts
         if count == STEP_BLOCKS:
             assert framer.timeline.steps == 1
-            assert framer.timeline.state is ClockState.STEPPED
+            assert state_of(framer) is ClockState.STEPPED
     assert framer.lost_frames == 1  # the one that the step tore
-    assert framer.timeline.state is ClockState.LOCKED  # again
+    assert state_of(framer) is ClockState.LOCKED  # again
     assert framer.timeline.steps == 1
     assert_contiguous(before)
     assert_contiguous(cuts_after)
@@ -236,6 +245,14 @@ def test_gap_drops_the_torn_frame_and_no_other() -> None:
     assert (whole - torn) % 800 == 0
     assert after[0].raster - before[-1].raster == (whole - torn) // 800 + 1
     assert all(abs(cut.raster * FRAME_NS - ideal_ns(int(cut.samples[0, 0]))) < 1e9 / RATE_HZ for cut in after)
+
+
+def test_gap_before_the_first_frame_tears_none() -> None:
+    framer = Framer(RATE_HZ)
+    assert framer.push(Block(0, numbered(0, 10), ideal_ns(0))) == []
+    cuts = cut_all(framer, stream(20, first=500))
+    assert framer.lost_frames == 0
+    assert_contiguous(cuts)
 
 
 def test_overflow_drops_the_torn_frame_and_starts_a_new_line() -> None:

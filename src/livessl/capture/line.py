@@ -91,8 +91,8 @@ def recording_channels(site: Site, array: str, recording: Recording, wanted: Seq
     if wanted is not None:
         if not len(wanted) == len(set(wanted)) == expected or min(wanted) < 1 or max(wanted) > recording.channels:
             raise DeviceError(
-                f"{recording.name}: expected {expected} different channel numbers from 1 to {recording.channels} for array "
-                f"{array!r}, got {list(wanted)}"
+                f"{recording.name}: expected {expected} different channel numbers from 1 to {recording.channels} "
+                f"for array {array!r}, got {list(wanted)}"
             )
         return list(wanted)
     if recording.channels < expected:

@@ -50,7 +50,7 @@ class Link:
     """
 
     def __init__(self, endpoint: str, hello: wire.Hello, clock: Clock) -> None:
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._hello = hello
         self._clock = clock
         self._context = zmq.Context()
@@ -111,7 +111,7 @@ class Link:
         now_ns = self._clock.now_ns()
         if not self.connected:
             if self._greeted:
-                _log.warning("no word from the server at %s; keeping sound and trying on", self._endpoint)
+                _log.warning("no word from the server at %s; keeping sound and trying on", self.endpoint)
                 self._lose()
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()
@@ -127,8 +127,8 @@ class Link:
                 self._unacknowledged.append(kept)
 
     def wait_connected(self, stop: Callable[[], bool]) -> None:
-        """Return when the server has answered, or on `stop`: a replay does not begin before."""
-        while not self.connected and not stop():
+        """Return when the server has answered, one way or the other, or on `stop`: a replay does not begin before."""
+        while not (self.connected or self.refused or stop()):
             self.service()
             self._socket.poll(20)
 
@@ -148,7 +148,7 @@ class Link:
             try:
                 message = wire.decode(data)
             except wire.WireError as error:
-                _log.warning("server at %s sent something else than an acknowledgement: %s", self._endpoint, error)
+                _log.warning("server at %s sent something else than an acknowledgement: %s", self.endpoint, error)
                 continue
             if isinstance(message, wire.Ack):
                 self._acknowledge(message)
@@ -162,13 +162,13 @@ class Link:
             return
         if ack.refused is not None:
             if ack.refused != self._complaint:
-                _log.error("the server at %s refuses us: %s", self._endpoint, ack.refused)
+                _log.error("the server at %s refuses us: %s", self.endpoint, ack.refused)
             self._complaint = ack.refused
             return
         self._heard_ns = self._clock.now_ns()
         self._complaint = None
         if not self._greeted:
-            _log.info("connected to the server at %s", self._endpoint)
+            _log.info("connected to the server at %s", self.endpoint)
         self._greeted = True
         while self._unacknowledged:
             kept = self._unacknowledged[0]

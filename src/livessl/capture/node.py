@@ -10,7 +10,9 @@ from livessl import wire
 from livessl.capture.devices import Device, Placed
 from livessl.capture.line import Line, played_messages
 from livessl.capture.link import Link
+from livessl.capture.recorded import Part
 from livessl.clock import Clock
+from livessl.config import NodeConfig, Site
 
 DRAIN_NS: Final = 3_000_000_000
 """How long a recording's end waits for the server's last acknowledgement."""
@@ -28,78 +30,109 @@ class UndeliveredError(Exception):
 
 
 Stop = Callable[[], bool]
+Progress = Callable[[int], None]
 
 
-class Node:
-    """Sends what its lines make of the sound.
-
-    Parameters
-    ----------
-    name : str
-        The node's name in the site file.
-    endpoint : str
-        The server's address.
-    lines : sequence of Line
-    clock : Clock
-    run_id : str
-        New at each start.
-    replay : bool
-        Whether the sound carries past times.
-    """
-
-    def __init__(
-        self, name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False
-    ) -> None:
-        rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-        self._endpoint = endpoint
-        self._replay = replay
-        self._lines = lines
-        self._clock = clock
-        self.link = Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
-
-    def run_device(self, device: Device, stop: Stop) -> None:
-        """Capture from a device until told to stop; whatever happens to device or server, carry on."""
-        (line,) = self._lines
-        problem = None
-        with device:
-            for block in device:
-                if stop():
-                    break
-                if device.problem != problem:
-                    problem = device.problem
-                    _log.warning("%s", problem) if problem else _log.info("device %r delivers sound", device.name)
-                    self.link.tell(problem)
-                self.link.send(line.push(block))
-        self.link.close(bye=True)
-
-    def run_recordings(
-        self, placed: Sequence[Placed], stop: Stop, *, clock: Clock, progress: Callable[[int], None] | None = None
-    ) -> None:
-        """Play recordings, one for each line, by `clock`; then wait for the last acknowledgement.
-
-        Raises
-        ------
-        UndeliveredError
-            Where the server has not acknowledged everything.
-        """
-        for end_ns, batch in played_messages(self._lines, placed, clock):
+def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: str, stop: Stop) -> None:
+    """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
+    config: NodeConfig = site.nodes[name]
+    line = Line(site, config.arrays, device.sample_rate_hz)
+    link = _link(name, config.server, [line], clock, run_id)
+    problem = None
+    with device:
+        for block in device:
             if stop():
                 break
-            self.link.send(batch)
-            if progress is not None:
-                progress(end_ns)
-            while self._replay and self.link.pending > MAX_PENDING and not stop():
-                self._pause()
-        deadline_ns = self._clock.now_ns() + DRAIN_NS
-        while self.link.pending and not stop() and self._clock.now_ns() < deadline_ns:
-            self._pause()
-        undelivered = self.link.pending + self.link.dropped
-        refused = self.link.refused
-        self.link.close(bye=True)
-        if undelivered and not stop():
-            why = f"it refused: {refused}" if refused else "is a server running there?"
-            raise UndeliveredError(f"{undelivered} messages were never taken by the server at {self._endpoint}; {why}")
+            if device.problem != problem:
+                problem = device.problem
+                _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
+                link.tell(problem)
+            link.send(line.push(block))
+    link.close(bye=True)
 
-    def _pause(self) -> None:
-        self._clock.sleep_until_ns(self._clock.now_ns() + WAIT_NS)
-        self.link.service()
+
+def capture_recordings(
+    site: Site,
+    name: str,
+    parts: Sequence[Part],
+    clock: Clock,
+    run_id: str,
+    stop: Stop,
+    progress: Progress | None = None,
+) -> None:
+    """Run a node on recordings at real speed, to their end.
+
+    Raises
+    ------
+    UndeliveredError
+        Where the server has not acknowledged everything.
+    """
+    lines = [part.line(site) for part in parts]
+    link = _link(name, site.nodes[name].server, lines, clock, run_id)
+    for end_ns, batch in played_messages(lines, _placed(parts), clock):
+        if stop():
+            break
+        link.send(batch)
+        if progress is not None:
+            progress(end_ns)
+    _finish(link, clock, stop)
+
+
+def send_session(
+    site: Site,
+    endpoint: str,
+    parts: Sequence[Part],
+    pace: Clock,
+    clock: Clock,
+    run_id: str,
+    stop: Stop,
+    progress: Progress | None = None,
+) -> None:
+    """Play a recorded session to a server at its original times, at the speed of the clock `pace`.
+
+    Raises
+    ------
+    UndeliveredError
+        Where the server refuses it, or has not acknowledged everything.
+    """
+    lines = [part.line(site) for part in parts]
+    link = _link("replay", endpoint, lines, clock, run_id, replay=True)
+    link.wait_connected(stop)
+    for end_ns, batch in played_messages(lines, _placed(parts), pace):
+        if stop() or link.refused:
+            break
+        link.send(batch)
+        if progress is not None:
+            progress(end_ns)
+        while link.pending > MAX_PENDING and not (stop() or link.refused):
+            _pause(link, clock)
+    _finish(link, clock, stop)
+
+
+def _link(name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False) -> Link:
+    rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
+    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
+
+
+def _placed(parts: Sequence[Part]) -> list[Placed]:
+    return [part.placed for part in parts]
+
+
+def _finish(link: Link, clock: Clock, stop: Stop) -> None:
+    """Wait for the last acknowledgement, then say good-bye."""
+    deadline_ns = clock.now_ns() + DRAIN_NS
+    while link.pending and not (stop() or link.refused) and clock.now_ns() < deadline_ns:
+        _pause(link, clock)
+    undelivered, refused = link.pending + link.dropped, link.refused
+    link.close(bye=True)
+    if refused and not stop():
+        raise UndeliveredError(f"the server at {link.endpoint} refused the sound: {refused}")
+    if undelivered and not stop():
+        raise UndeliveredError(
+            f"{undelivered} messages were never taken by the server at {link.endpoint}; is one running there?"
+        )
+
+
+def _pause(link: Link, clock: Clock) -> None:
+    clock.sleep_until_ns(clock.now_ns() + WAIT_NS)
+    link.service()

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import numpy as np
 import soundfile
 
-from livessl.capture.devices import played
+from livessl.capture.devices import Device, played
 from livessl.capture.recorded import Part
 from livessl.clock import Clock
 from livessl.config import Site
@@ -120,6 +120,15 @@ class Recorder:
         self._open.clear()
         if self._pieces:
             write_session(self._directory, self._site, self._pieces)
+
+
+def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) -> None:
+    """Record a device until `over`."""
+    with device, recorder:
+        for block in device:
+            recorder.push(block)
+            if over():
+                break
 
 
 def record_parts(

@@ -42,6 +42,11 @@ def parts_from_wavs(
         With every file that does not fit, one a line.
     """
     wanted = channels or {}
+    strangers = sorted(set(wanted) - set(wavs))
+    if strangers:
+        raise DeviceError(
+            f"channels of array {strangers[0]!r}: no recording of it is given; there are {', '.join(wavs)}"
+        )
     return _parts(
         site,
         [
@@ -63,11 +68,6 @@ def parts_from_session(site: Site, session: Session) -> list[Part]:
     return _parts(site, [(piece.array, session.path(piece), piece.start_ns) for piece in session.pieces], {})
 
 
-def end_ns(parts: Iterable[Part]) -> int:
-    """Site time at which the last recording ends."""
-    return max(part.placed.start_ns + round(part.placed.recording.duration_s * 1e9) for part in parts)
-
-
 def common_start_ns(now_ns: int, nodes: int) -> int:
     """When files that stand in for devices begin: on the time raster, so that frames are cut as they are offline.
 
@@ -76,6 +76,15 @@ def common_start_ns(now_ns: int, nodes: int) -> int:
     """
     step_ns = FRAME_NS if nodes <= 1 else TOGETHER_NS
     return -(-now_ns // step_ns) * step_ns
+
+
+def span_ns(parts: Iterable[Part]) -> tuple[int, int | None]:
+    """Site time at which the first recording begins and the last one ends; None where one is repeated for ever."""
+    placed = [part.placed for part in parts]
+    begin_ns = min(item.start_ns for item in placed)
+    if any(item.recording.duration_s == float("inf") for item in placed):
+        return begin_ns, None
+    return begin_ns, max(item.start_ns + round(item.recording.duration_s * 1e9) for item in placed)
 
 
 def repeated(parts: Iterable[Part]) -> list[Part]:
@@ -125,12 +134,15 @@ def parts_from_node(
     Raises
     ------
     DeviceError
-        With every file that does not fit, one a line.
+        With every file that does not fit, one a line; or why there is no such scene.
     """
     config = site.nodes[node].device
     arrays = site.nodes[node].arrays
     if isinstance(config, SceneDeviceConfig):
-        parts = parts_from_scene(site, arrays, config, start_ns, progress)
+        try:
+            parts = parts_from_scene(site, arrays, config, start_ns, progress)
+        except ValueError as error:
+            raise DeviceError(f"nodes.{node}.device: {error}") from error
     else:
         assert isinstance(config, WavDeviceConfig)
         missing = [array for array in arrays if array not in config.files]

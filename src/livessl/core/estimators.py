@@ -90,11 +90,7 @@ class SrpPhat:
             maps[name] = to_map(*gccs)
         fused: Float32Array = np.asarray(np.sum(list(maps.values()), axis=0, dtype=np.float32))
         functional = SRPFunctional(evidence, self._c_m_s)
-        tops = [
-            peaks.refine(functional, self._grid.node_m(node), self._grid)
-            for node in peaks.highest_nodes(fused, self._grid)
-        ]
-        position, _ = max(tops, key=lambda top: top[1])
+        position = peaks.best_peak(functional, fused, self._grid)
         return Localization(
             position,
             peaks.laplace_covariance_m2(functional, evidence, position, self._grid),

@@ -17,7 +17,7 @@ import numpy as np
 from livessl.core.activity import THRESHOLD, exact_mask, runs
 from livessl.core.estimators import Estimator, Localization, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.tracker import Tracker
+from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
@@ -47,8 +47,9 @@ SILENT_NS: Final = 1_000_000_000
 """All-zero samples for so long are a dead microphone: any real one has noise."""
 
 EARLIEST_NS: Final = -30_000_000_000
-LATEST_NS: Final = 2_000_000_000
-"""Frames this far from the server's time come from a clock that is wrong; older ones a node's buffer cannot hold."""
+LATEST_NS: Final = 500_000_000
+"""Frames this far from the server's time come from a clock that is wrong: sound is never ahead of its time by more than
+two clocks that NTP keeps can differ, and what is older a node's buffer cannot hold."""
 
 JUMP_FRAMES: Final = 1200
 """A gap of a minute is skipped, not walked through."""
@@ -161,6 +162,7 @@ class _Stream:
 class _OpenEvent:
     start: int
     last_active: int
+    closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
 
 
@@ -207,10 +209,11 @@ class Fusion:
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
+        outputs = self._start_over() if self._went_back(now_ns) else []
         self._now_ns = now_ns
         for message in messages:
             self._accept(message)
-        outputs = self._close_ready()
+        outputs += self._close_ready()
         if self._event is not None and self._everyone_silent():
             outputs += self._finish()
         outputs += self._tracker.step(now_ns)
@@ -237,6 +240,18 @@ class Fusion:
         """How every array is doing."""
         return [_status(stream, now_ns) for stream in self._streams.values()]
 
+    def _went_back(self, now_ns: int) -> bool:
+        return self._next is not None and (self._next - 1) * FRAME_NS - now_ns > LATEST_NS
+
+    def _start_over(self) -> list[Output]:
+        """The server's clock was set back: what came before lies in its future now, and would make all else late."""
+        outputs = self._finish() if self._event is not None else []
+        outputs += self._tracker.step(self._now_ns + round(2e9 * SILENCE_S))
+        self._streams = {name: _Stream(old.spec, counters=old.counters) for name, old in self._streams.items()}
+        self._reached.clear()
+        self._next, self._heard_until = None, -(2**63)
+        return outputs
+
     def _accept(self, message: Message) -> None:
         stream = self._streams.get(message.array)
         if stream is None:
@@ -257,6 +272,8 @@ class Fusion:
         stream.watermark = message.raster if stream.watermark is None else max(stream.watermark, message.raster)
         if not self._reached or message.raster > self._reached[-1][0]:
             self._reached.append((message.raster, self._now_ns))
+        if (self._reached[-1][0] - message.raster) * FRAME_S < self._parameters.deadline_s:
+            stream.waited_for = True
         if self._next is None:
             self._next = message.raster
 
@@ -293,11 +310,11 @@ class Fusion:
         return outputs
 
     def _may_close(self, raster: int) -> bool:
+        while self._reached and self._reached[0][0] < raster:
+            self._reached.popleft()
         late = [stream for stream in self._streams.values() if self._is_waited_for(stream, raster)]
         if not late:
             return True
-        while self._reached and self._reached[0][0] < raster:
-            self._reached.popleft()
         first_ns = self._reached[0][1] if self._reached else self._now_ns
         if self._now_ns - first_ns < self._parameters.deadline_s * 1e9:
             return False
@@ -309,10 +326,7 @@ class Fusion:
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
         if stream.watermark is None or stream.heard_ns is None or stream.left:
             return False
-        if stream.watermark >= raster:
-            stream.waited_for = True
-            return False
-        return stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
+        return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
     def _everyone_silent(self) -> bool:
         quiet_ns = self._parameters.deadline_s * 1e9 + self._parameters.hang_over_s * 1e9
@@ -321,10 +335,11 @@ class Fusion:
     def _close(self, raster: int) -> list[Output]:
         active = any(stream.has_active(raster) for stream in self._streams.values())
         if active and self._event is None:
-            self._event = _OpenEvent(raster, raster)
+            self._event = _OpenEvent(raster, raster, raster)
         event = self._event
         if event is None:
             return []
+        event.closed = raster
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
@@ -362,10 +377,8 @@ class Fusion:
         event, self._event = self._event, None
         assert event is not None
         parameters = self._parameters
-        span = range(
-            max(event.start - round(parameters.pre_roll_s / FRAME_S), self._heard_until),
-            event.last_active + round(parameters.hang_over_s / FRAME_S) + 1,
-        )
+        pre_roll = round(parameters.pre_roll_s / FRAME_S)
+        span = range(max(event.start - pre_roll, self._heard_until), event.closed + 1)
         sounds: dict[str, Sound] = {}
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1

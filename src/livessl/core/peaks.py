@@ -12,14 +12,19 @@ from livessl.core.geometry import Grid
 from livessl.core.srp import HeardBy, PairTerms, SRPFunctional
 from livessl.core.types import Float32Array, FloatArray
 
-CANDIDATES: Final = 5
-"""Peaks refined: between two nodes a lower one on the grid may be the higher one in truth."""
+CANDIDATES: Final = 8
+"""Nodes looked at more closely: between two nodes a lower one on the grid may be the higher one in truth."""
+
+CLIMBED: Final = 2
+"""Of them, how many are followed to the top."""
 
 RIVAL_DISTANCE_M: Final = 1.0
 """A second peak is another place if it is further away than this."""
 
 _NEWTON_STEPS: Final = 30
-_CONVERGED_M: Final = 1e-6
+_CONVERGED_M: Final = 1e-5
+"""Steps below a hundredth of a millimetre change nothing that anyone could measure."""
+
 _SUBDIVISIONS: Final = 4
 
 
@@ -38,6 +43,16 @@ def highest_nodes(power: Float32Array, grid: Grid, count: int = CANDIDATES) -> l
     return [int(best[candidate]) for candidate in chosen]
 
 
+def best_peak(functional: SRPFunctional, power: Float32Array, grid: Grid) -> FloatArray:
+    """Where the highest peak is, off the grid: the highest nodes looked at more closely, the best of them climbed."""
+    starts = np.stack([grid.node_m(node) for node in highest_nodes(power, grid)])
+    near = (starts[:, None] + _offsets_m(grid)[None]).reshape(-1, 3)
+    values = functional.value(near).reshape(len(starts), -1)
+    order = np.argsort(-values.max(axis=1), kind="stable")[:CLIMBED]
+    tops = [_climb(functional, near[k * values.shape[1] + int(values[k].argmax())], grid) for k in order]
+    return max(tops, key=lambda top: top[1])[0]
+
+
 def refine(functional: SRPFunctional, start_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
     """Climb from a node to the top nearby: a finer local grid, then Newton steps that only ever go up.
 
@@ -48,30 +63,37 @@ def refine(functional: SRPFunctional, start_m: FloatArray, grid: Grid) -> tuple[
     value : float
         The functional there.
     """
-    axes = list(grid.free_axes)
+    near = start_m + _offsets_m(grid)
+    return _climb(functional, near[int(functional.value(near).argmax())], grid)
+
+
+def _offsets_m(grid: Grid) -> FloatArray:
+    """A cell's finer local grid, relative to its node: (n, 3)."""
     fraction = np.linspace(-0.5, 0.5, _SUBDIVISIONS + 1)
-    offsets = [fraction * edge if axis in axes else np.zeros(1) for axis, edge in enumerate(grid.cell_m)]
-    local = start_m + np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
-    values = functional.value(local)
-    position, value = local[int(values.argmax())], float(values.max())
+    offsets = [fraction * edge if edge > 0 else np.zeros(1) for edge in grid.cell_m]
+    return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
+
+
+def _climb(functional: SRPFunctional, position_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
+    axes = list(grid.free_axes)
+    value = float(functional.value(position_m[None])[0])
     reach = float(grid.cell_m.max()) / _SUBDIVISIONS
     for _ in range(_NEWTON_STEPS):
-        gradient, hessian = functional.derivatives(position)
+        gradient, hessian = functional.derivatives(position_m)
         step = np.zeros(3)
         step[axes] = _ascent(gradient[axes], hessian[np.ix_(axes, axes)])
-        length = float(np.linalg.norm(step))
-        step *= min(1.0, reach / max(length, 1e-12))
+        step *= min(1.0, reach / max(float(np.linalg.norm(step)), 1e-12))
         climbed = False
         while np.linalg.norm(step) > _CONVERGED_M:
-            trial = np.clip(position + step, grid.lower_m, grid.upper_m)
+            trial = np.clip(position_m + step, grid.lower_m, grid.upper_m)
             trial_value = float(functional.value(trial[None])[0])
             if trial_value > value:
-                position, value, climbed = trial, trial_value, True
+                position_m, value, climbed = trial, trial_value, True
                 break
             step /= 2.0
         if not climbed:
             break
-    return position, value
+    return position_m, value
 
 
 def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:

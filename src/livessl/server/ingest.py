@@ -8,7 +8,7 @@ from typing import Final
 
 from livessl import wire
 from livessl.config import Site
-from livessl.core.types import Message
+from livessl.core.types import Frame, Message
 
 ACK_NS: Final = 500_000_000
 """Every node hears from us at least this often."""
@@ -87,6 +87,15 @@ class Ingest:
                 wire.WireError(f"node {peer.hello.node!r} sent array {message.array!r}, which it did not announce"),
                 now_ns,
             )
+        rate_hz = peer.hello.arrays[message.array]
+        if isinstance(message, Frame) and message.sample_rate_hz != rate_hz:
+            return self._reject(
+                wire.WireError(
+                    f"node {peer.hello.node!r} sent {message.sample_rate_hz:g} Hz of array {message.array!r}, "
+                    f"announced were {rate_hz:g} Hz"
+                ),
+                now_ns,
+            )
         last = peer.sequences.get(message.array, 0)
         if message.sequence <= last:
             self.duplicates[message.array] += 1
@@ -125,6 +134,11 @@ class Ingest:
         unknown = [name for name in hello.arrays if name not in self._site.arrays]
         if unknown:
             return f"no array {unknown[0]!r} in the server's site file; it has {', '.join(self._site.arrays)}"
+        for name, rate_hz in hello.arrays.items():
+            high_hz = self._site.array(name).band_hz[1]
+            if high_hz >= rate_hz / 2:
+                needed = f"array {name!r} uses up to {high_hz:g} Hz and needs more than {2 * high_hz:g} Hz"
+                return f"{needed}, got {rate_hz:g} Hz; correct the node's sample_rate_hz"
         others = [
             peer
             for key, peer in self._peers.items()
@@ -134,13 +148,13 @@ class Ingest:
             and now_ns - peer.heard_ns < GONE_NS
         ]
         for other in others:
+            if other.hello.replay != hello.replay:
+                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
             if other.hello.node == hello.node:
                 return f"a node named {hello.node!r} is connected already; names must differ"
             taken = sorted(set(other.hello.arrays) & set(hello.arrays))
             if taken:
                 return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
-            if other.hello.replay != hello.replay:
-                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
         return None
 
     def _reject(self, error: wire.WireError, now_ns: int) -> Arrival:

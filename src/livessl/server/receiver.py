@@ -77,8 +77,8 @@ class Receiver:
             self._socket.close()
             self._context.term()
             raise BindError(
-                f"server.bind: cannot listen on {site.server.bind}: {error.strerror}; is another server running? "
-                "Stop it or choose another port"
+                f"server.bind: cannot listen on {site.server.bind}: {zmq.strerror(error.errno or 0)}; "
+                "is another server running? Stop it or choose another port"
             ) from error
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 

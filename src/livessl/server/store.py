@@ -82,7 +82,7 @@ class Store:
             "time_ns <= ?": query.until_ns,
             "confidence >= ?": query.min_confidence,
             "number < ?": query.before,
-            "EXISTS (SELECT 1 FROM json_each(json, '$.zones') WHERE value = ?)": query.zone,
+            "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": query.zone,
         }
         asked = {text: value for text, value in conditions.items() if value is not None}
         where = f"WHERE {' AND '.join(asked)} " if asked else ""

@@ -1,0 +1,347 @@
+"""A node's link over real sockets: nothing is lost while the server is away, and what is kept is bounded."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pytest
+import zmq
+
+from livessl import wire
+from livessl.capture.link import SILENT_NS, SPOOL_BYTES, Link
+from livessl.clock import SystemClock
+from livessl.core.types import Frame, Mark
+from livessl.server.receiver import Receiver
+from small_site import frame, mark, site_of, wait_until
+
+HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
+
+
+class HandClock:
+    """Time that the test moves."""
+
+    def __init__(self) -> None:
+        self.time_ns = 1_767_225_600_000_000_000
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def sleep_until_ns(self, time_ns: int) -> None:
+        self.time_ns = max(self.time_ns, time_ns)
+
+
+class Router:
+    """A server that does nothing by itself."""
+
+    def __init__(self, endpoint: str = "tcp://127.0.0.1:*") -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.bind(endpoint)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.got: list[wire.WireMessage] = []
+        self.peer = b""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+        self._context.term()
+
+    def read(self) -> int:
+        """Take in what has arrived; how many messages that was."""
+        before = len(self.got)
+        while self._socket.poll(2):
+            self.peer, data = self._socket.recv_multipart()
+            self.got.append(wire.decode(data))
+        return len(self.got) - before
+
+    def say(self, data: bytes) -> None:
+        self._socket.send_multipart([self.peer, data])
+
+    def ack(self, **sequences: int) -> None:
+        self.say(wire.encode(wire.Ack("run-1", sequences)))
+
+    def hellos(self) -> list[wire.Hello]:
+        return [message for message in self.got if isinstance(message, wire.Hello)]
+
+    def frames(self, array: str = "north") -> list[int]:
+        return [m.sequence for m in self.got if isinstance(m, Frame) and m.array == array]
+
+    def marks(self, array: str = "north") -> list[int]:
+        return [m.sequence for m in self.got if isinstance(m, Mark) and m.array == array]
+
+
+@contextmanager
+def linked(endpoint: str, clock: HandClock | SystemClock | None = None) -> Iterator[Link]:
+    link = Link(endpoint, HELLO, clock or SystemClock())
+    try:
+        yield link
+    finally:
+        link.close(bye=False)
+
+
+def together(link: Link, router: Router, condition: Callable[[], object], what: str) -> None:
+    """Let both do their work until the condition holds."""
+
+    def turn() -> object:
+        link.service()
+        router.read()
+        return condition()
+
+    wait_until(turn, what)
+
+
+def connect(link: Link, router: Router) -> None:
+    count = len(router.hellos())
+    together(link, router, lambda: len(router.hellos()) > count, "a greeting")
+    router.ack()
+    together(link, router, lambda: link.connected, "the connection")
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_node_may_start_before_the_server() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        link.send([frame(k) for k in range(1, 6)])
+        assert not link.connected
+        assert link.pending == 5
+        with Router(endpoint) as router:
+            connect(link, router)
+            assert router.hellos()[0] == HELLO
+            together(link, router, lambda: len(router.frames()) == 5, "the frames")
+            assert router.frames() == [1, 2, 3, 4, 5]
+            assert link.pending == 5
+            router.ack(north=3)
+            together(link, router, lambda: link.pending == 2, "the acknowledgement")
+            router.ack(north=5)
+            together(link, router, lambda: link.pending == 0, "the acknowledgement")
+
+
+def test_frames_arrive_unchanged() -> None:
+    with Router() as router, linked(router.endpoint) as link:
+        connect(link, router)
+        sent: list[Frame | Mark] = [frame(1), mark(2), frame(3, seed=5)]
+        link.send(sent)
+        together(link, router, lambda: len(router.frames()) == 2, "the frames")
+        arrived = [message for message in router.got if isinstance(message, Frame | Mark)]
+        assert [wire.encode(message) for message in arrived] == [wire.encode(message) for message in sent]
+
+
+def test_nobody_gets_sound_before_the_greeting_is_answered() -> None:
+    with Router() as router, linked(router.endpoint) as link:
+        link.send([frame()])
+        together(link, router, router.hellos, "a greeting")
+        link.service()
+        router.read()
+        assert router.frames() == []
+
+
+def test_server_that_was_started_anew_gets_what_the_old_one_had_not_acknowledged() -> None:
+    with linked(free_endpoint()) as link:
+        with Router(link.endpoint) as router:
+            connect(link, router)
+            link.send([frame(k) for k in range(1, 5)])
+            together(link, router, lambda: len(router.frames()) == 4, "the frames")
+            router.ack(north=2)
+            together(link, router, lambda: link.pending == 2, "the acknowledgement")
+        link.send([frame(5)])
+        with Router(link.endpoint) as router:
+            together(link, router, lambda: router.got, "anything")
+            router.say(wire.encode(wire.Ack("?", {}, who_are_you=True)))
+            together(link, router, router.hellos, "a greeting")
+            router.ack()
+            together(link, router, lambda: router.frames()[-3:] == [3, 4, 5], "the frames")
+
+
+def test_silence_of_the_server_is_noticed_and_survived() -> None:
+    clock = HandClock()
+    with Router() as router, linked(router.endpoint, clock) as link:
+        connect(link, router)
+        link.send([frame(1)])
+        together(link, router, lambda: router.frames() == [1], "the frame")
+        clock.time_ns += SILENT_NS
+        assert not link.connected
+        link.send([frame(2)])
+        connect(link, router)
+        together(link, router, lambda: router.frames()[-2:] == [1, 2], "both frames")
+
+
+def test_only_the_newest_mark_waits_for_the_server() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        for k in range(1, 101):
+            link.send([mark(k), mark(k, array="south")])
+        assert link.pending == 2
+        link.send([frame(101), mark(102)])
+        assert link.pending == 3
+        with Router(endpoint) as router:
+            connect(link, router)
+            together(link, router, lambda: router.marks("north"), "the mark")
+            assert router.marks("south") == [100]
+            assert router.frames() == [101]
+            assert router.marks("north") == [102]
+            # marks are not sent again: they say how things were
+            router.ack(north=101, south=100)
+            together(link, router, lambda: link.pending == 0, "the acknowledgement")
+
+
+def test_spool_is_bounded_and_counts_what_it_drops() -> None:
+    samples = np.zeros((16, wire.MAX_FRAME_SAMPLES), dtype=np.float32)
+    size = samples.nbytes
+    count = SPOOL_BYTES // size + 20
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        for k in range(1, count + 1):
+            link.send([Frame("north", k, k, k, 384_000.0, samples, 0.0, True)])
+        assert link.dropped + link.pending == count
+        assert 20 <= link.dropped <= 21
+        assert link.pending * size <= SPOOL_BYTES < (link.pending + 2) * size
+        with Router(endpoint) as router:
+            connect(link, router)
+            together(link, router, lambda: len(router.frames()) == link.pending, "what was kept")
+            assert router.frames() == list(range(link.dropped + 1, count + 1))  # the oldest went
+
+
+def test_refusal_is_kept_until_it_is_taken_back() -> None:
+    clock = HandClock()
+    with Router() as router, linked(router.endpoint, clock) as link:
+        assert link.refused is None
+        together(link, router, router.hellos, "a greeting")
+        router.say(wire.encode(wire.Ack("run-1", {}, refused="array 'north' is captured already")))
+        together(link, router, lambda: link.refused, "the refusal")
+        assert link.refused == "array 'north' is captured already"
+        assert not link.connected
+        clock.time_ns += 1_000_000_000
+        together(link, router, lambda: len(router.hellos()) == 2, "another greeting")
+        assert link.refused == "array 'north' is captured already"
+        router.ack()
+        together(link, router, lambda: link.connected, "the connection")
+        assert link.refused is None
+
+
+def test_greetings_are_not_more_than_one_a_second() -> None:
+    clock = HandClock()
+    with Router() as router, linked(router.endpoint, clock) as link:
+        together(link, router, router.hellos, "a greeting")
+        for _ in range(50):
+            link.service()
+        router.read()
+        assert len(router.hellos()) == 1
+        clock.time_ns += 1_000_000_000
+        together(link, router, lambda: len(router.hellos()) == 2, "another greeting")
+
+
+def test_what_is_no_acknowledgement_is_left_alone(caplog: pytest.LogCaptureFixture) -> None:
+    with Router() as router, linked(router.endpoint) as link:
+        connect(link, router)
+        link.send([frame(1)])
+        together(link, router, router.frames, "the frame")
+        for data in (b"", b"rubbish", wire.encode(wire.Bye("x", "y")), wire.encode(wire.Ack("run-0", {"north": 9}))):
+            router.say(data)
+        router.ack(south=3)
+        router.ack(north=1)
+        together(link, router, lambda: link.pending == 0, "the acknowledgement")
+        assert link.connected
+    assert "sent something else than an acknowledgement" in caplog.text
+
+
+def test_trouble_with_the_device_is_told_once() -> None:
+    with Router() as router, linked(router.endpoint) as link:
+        connect(link, router)
+        told = len(router.hellos())
+        for _ in range(3):
+            link.tell("input device 'UMC' is not connected")
+        link.tell(None)
+        together(link, router, lambda: len(router.hellos()) == told + 2, "the trouble and its end")
+        assert [hello.problem for hello in router.hellos()[told:]] == ["input device 'UMC' is not connected", None]
+
+
+def test_trouble_is_in_the_greeting_of_a_server_that_comes_later() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        link.tell("unplugged")
+        with Router(endpoint) as router:
+            together(link, router, router.hellos, "a greeting")
+            assert router.hellos()[0].problem == "unplugged"
+
+
+@pytest.mark.parametrize("bye", [True, False])
+def test_good_bye(bye: bool) -> None:
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, SystemClock())
+        connect(link, router)
+        link.send([frame(1)])
+        together(link, router, router.frames, "the frame")
+        link.close(bye=bye)
+        if bye:
+            wait_until(lambda: router.read() > 0, "the good-bye")
+        router.read()
+        assert (wire.Bye("lab-pc", "run-1") in router.got) is bye
+
+
+def test_close_does_not_wait_for_a_server_that_is_not_there() -> None:
+    clock = SystemClock()
+    link = Link(free_endpoint(), HELLO, clock)
+    link.send([frame(k) for k in range(1, 100)])
+    began_ns = clock.now_ns()
+    link.close(bye=True)
+    assert clock.now_ns() - began_ns < 1_000_000_000
+
+
+def test_wait_connected_can_be_stopped() -> None:
+    with linked(free_endpoint()) as link:
+        asked = iter([False, False, True])
+        link.wait_connected(lambda: next(asked))
+        assert not link.connected
+
+
+def test_restart_of_the_real_server_loses_nothing_and_doubles_nothing() -> None:
+    """The server ends amid sixty frames: each one gets to the old or the new, and to neither twice."""
+    clock = SystemClock()
+    site = site_of({"server.bind": free_endpoint()})
+    numbers = iter(range(1, 61))
+
+    def receive(link: Link, until: Callable[[list[int]], object]) -> list[int]:
+        receiver = Receiver(site, clock)
+        receiver.start()
+        got: list[int] = []
+
+        def take() -> None:
+            got.extend(item.sequence for item in receiver.take(100, 0.001) if isinstance(item, Frame))
+
+        def turn() -> object:
+            link.send([frame(k) for k in islice(numbers, 1)])
+            take()
+            return until(got)
+
+        try:
+            wait_until(turn, "frames")
+        finally:
+            receiver.stop()
+        take()
+        assert receiver.ingest.sequence_gaps["north"] == 0
+        return got
+
+    with linked(site.server.bind) as link:
+        first = receive(link, lambda got: len(got) >= 30)
+        second = receive(link, lambda got: got and got[-1] == 60 and link.pending == 0)
+        assert link.dropped == 0
+    assert first[-1] < 60
+    for got in (first, second):
+        assert got == sorted(set(got))
+    assert set(first) | set(second) == set(range(1, 61))

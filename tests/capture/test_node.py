@@ -1,0 +1,288 @@
+"""A capture node from sound to server: what it sends, how it ends, and what it says when nobody takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import count
+from threading import Thread
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pytest
+
+from livessl import wire
+from livessl.capture.devices import ArrayRecording, Placed
+from livessl.capture.link import Link
+from livessl.capture.node import MAX_PENDING, UndeliveredError, capture_device, capture_recordings, send_session
+from livessl.capture.recorded import Part
+from livessl.clock import SystemClock, UnpacedClock
+from livessl.config import Site
+from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
+from livessl.server.receiver import Item, Joined, Left, Receiver
+from small_site import RATE_HZ, hiss, mark, site_of, wait_until
+
+START_NS = 1_767_225_600_000_000_000
+FIRST = START_NS // FRAME_NS
+ARRAYS = ("north", "south")
+CLOCK = SystemClock()
+
+
+@dataclass
+class There:
+    """The real receiver, and all that came."""
+
+    receiver: Receiver
+    items: list[Item] = field(default_factory=list)
+
+    @property
+    def site(self) -> Site:
+        return site_of({"nodes.lab-pc.server": self.receiver.endpoint})
+
+    def of(self, kind: type[Item]) -> list[Item]:
+        """What has come of a kind."""
+        self.items += self.receiver.take(1000, 0.001)
+        return [item for item in self.items if isinstance(item, kind)]
+
+    def messages(self, array: str) -> list[Frame | Mark]:
+        return [item for item in self.items if isinstance(item, Frame | Mark) and item.array == array]
+
+
+@contextmanager
+def server() -> Iterator[There]:
+    receiver = Receiver(site_of(), CLOCK)
+    receiver.start()
+    try:
+        yield There(receiver)
+    finally:
+        receiver.stop()
+
+
+def sound() -> Float32Array:
+    """A second and a half, with a burst after the first second."""
+    samples = hiss(1.5, level=1e-3)
+    samples[:, RATE_HZ : RATE_HZ + RATE_HZ // 5] += hiss(0.2, seed=1, level=0.2)
+    return samples
+
+
+def parts(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[Part]:
+    heard = sound() if samples is None else samples
+    placed = Placed(ArrayRecording("burst", float(RATE_HZ), heard), start_ns)
+    return [Part(array, placed, (1, 2, 3, 4)) for array in ARRAYS]
+
+
+def never() -> bool:
+    return False
+
+
+def replay(there: There, played: list[Part], progress: Callable[[int], None] | None = None) -> None:
+    pace = UnpacedClock(START_NS)
+    send_session(there.site, there.receiver.endpoint, played, pace, CLOCK, "run-1", never, progress)
+
+
+def assert_whole(there: There, first: int = FIRST) -> None:
+    """Every message of both arrays is there, in order, the burst in frames."""
+    for array in ARRAYS:
+        messages = there.messages(array)
+        assert [message.sequence for message in messages] == list(range(1, len(messages) + 1))
+        assert [m.raster - first for m in messages if isinstance(m, Frame) and m.active] == [20, 21, 22, 23]
+        assert messages[-1].raster == first + 29
+
+
+def test_session_arrives_whole_and_is_said_good_bye_to() -> None:
+    with server() as there:
+        progress: list[int] = []
+        replay(there, parts(), progress.append)
+        wait_until(lambda: there.of(Left), "the good-bye")
+        hello = wire.Hello("replay", "run-1", {"north": 16000.0, "south": 16000.0}, replay=True)
+        assert there.items[0] == Joined(hello)
+        assert there.items[-1] == Left(hello)
+        assert_whole(there)
+        assert progress == sorted(progress)
+        assert progress[-1] == START_NS + 1_500_000_000
+
+
+def test_session_waits_for_a_server_that_comes_later() -> None:
+    with server() as there:
+        site = site_of({"server.bind": there.receiver.endpoint})
+    played = Thread(
+        target=send_session,
+        args=(site, site.server.bind, parts(), UnpacedClock(START_NS), CLOCK, "run-1", never),
+    )
+    played.start()
+    receiver = Receiver(site, CLOCK)
+    receiver.start()
+    late = There(receiver)
+    try:
+        wait_until(lambda: late.of(Left), "the good-bye")
+    finally:
+        receiver.stop()
+    played.join(timeout=5)
+    assert_whole(late)
+
+
+def knocking() -> Float32Array:
+    """Forty seconds of noise, every other half second: nearly every frame is kept."""
+    samples = hiss(40.0, level=0.1)
+    loud = np.arange(samples.shape[1]) // (RATE_HZ // 2) % 2 == 1
+    return np.where(loud, samples, 1e-3 * samples).astype(np.float32)
+
+
+def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
+    with server() as there:
+        played = Thread(target=replay, args=(there, parts(samples=knocking())))
+        played.start()
+        wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.now_ns()), "the node")
+        wait_until(there.receiver._queue.full, "a full queue")  # nobody takes anything
+        assert played.is_alive()
+        wait_until(lambda: there.of(Left), "the end", 30)
+        played.join()
+        assert len(there.of(Frame)) > 2 * MAX_PENDING
+        for array in ARRAYS:
+            assert [m.sequence for m in there.messages(array)] == list(range(1, len(there.messages(array)) + 1))
+
+
+def test_recordings_arrive_whole() -> None:
+    """At real speed; they began a little ago, so that there is nothing to wait for."""
+    with server() as there:
+        first = CLOCK.now_ns() // FRAME_NS - 30
+        capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), CLOCK, "run-1", never)
+        wait_until(lambda: there.of(Left), "the good-bye")
+        assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
+        for array in ARRAYS:
+            frames = [m.raster - first for m in there.messages(array) if isinstance(m, Frame)]
+            assert frames == list(range(12, 30))
+
+
+def test_nobody_there_is_told_at_the_end() -> None:
+    with server() as there:
+        endpoint, site = there.receiver.endpoint, there.site
+    with pytest.raises(UndeliveredError) as caught:
+        capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", never)
+    assert str(caught.value).endswith(f"were never taken by the server at {endpoint}; is one running there?")
+    assert int(str(caught.value).split()[0]) >= 36
+
+
+def test_refusal_is_told() -> None:
+    with server() as there:
+        first = Link(there.receiver.endpoint, wire.Hello("other-pc", "run-0", {"north": 16000.0}), CLOCK)
+        first.wait_connected(never)
+        sequence = count(1)
+
+        def heard() -> bool:
+            first.send([mark(next(sequence))])  # who is silent for 2 s no longer holds its arrays
+            return False
+
+        start_ns = CLOCK.now_ns() - 2_000_000_000
+        with pytest.raises(UndeliveredError, match="refused the sound: array 'north' is captured by node 'other-pc'"):
+            capture_recordings(there.site, "lab-pc", parts(start_ns), CLOCK, "run-1", heard)
+        with pytest.raises(UndeliveredError, match="refused the sound: live nodes are connected"):
+            send_session(there.site, first.endpoint, parts()[1:], UnpacedClock(START_NS), CLOCK, "run-2", heard)
+        first.close(bye=True)
+
+
+def test_stopping_is_no_failure() -> None:
+    with server() as there:
+        site = there.site
+    asked = count()
+    capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", lambda: next(asked) > 10)
+    send_session(site, "tcp://127.0.0.1:1", parts(), UnpacedClock(START_NS), CLOCK, "run-1", lambda: next(asked) > 15)
+
+
+class Scripted:
+    """A device whose troubles are written down: for each 50 ms None, or what is wrong instead of sound."""
+
+    name = "UMC1820"
+    sample_rate_hz = float(RATE_HZ)
+    channels = 8
+
+    def __init__(self, script: list[str | None], ready: Callable[[], object]) -> None:
+        self._script = script
+        self._ready = ready
+        self.problem: str | None = None
+        self.entered = self.left = False
+
+    def __enter__(self) -> Self:
+        self.entered = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.left = True
+
+    def __iter__(self) -> Iterator[Block]:
+        while not self._ready():
+            yield Block(0, np.zeros((8, 0), dtype=np.float32), START_NS)
+        samples, index = np.vstack([knocking(), knocking()]), 0
+        for problem in self._script:
+            self.problem = problem
+            stop = index if problem else index + RATE_HZ // 20
+            yield Block(index, samples[:, index:stop].copy(), START_NS + round(index / RATE_HZ * 1e9))
+            index = stop
+
+
+def captured(script: list[str | None], stop: Callable[[Scripted], bool]) -> tuple[There, Scripted]:
+    """What a server that knows the node gets of such a device."""
+    with server() as there:
+        device = Scripted(script, lambda: there.of(Joined))
+        capture_device(there.site, "lab-pc", device, CLOCK, "run-1", lambda: stop(device))
+        wait_until(lambda: there.of(Left), "the good-bye")
+        return there, device
+
+
+def test_device_is_entered_heard_and_left() -> None:
+    there, device = captured([None] * 30, lambda _: False)
+    assert device.entered
+    assert device.left
+    for array in ARRAYS:
+        frames = [m for m in there.messages(array) if isinstance(m, Frame)]
+        assert [frame.raster - FIRST for frame in frames if frame.active] == [*range(10, 20)]
+        assert there.messages(array)[-1].raster == FIRST + 29
+
+
+def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCaptureFixture) -> None:
+    unplugged = "input device 'UMC1820' is not connected"
+    seen: set[str | None] = set()
+    with server() as there:
+
+        def ask() -> bool:
+            seen.add(there.receiver.ingest.problem_of("south"))
+            return False
+
+        script = [None] * 15 + [unplugged] * 200 + [None] * 15
+        device = Scripted(script, lambda: there.of(Joined))
+        capture_device(there.site, "lab-pc", device, CLOCK, "run-1", ask)
+        wait_until(lambda: there.of(Left), "the good-bye")
+        [left] = there.of(Left)
+        assert isinstance(left, Left)
+        assert left.hello.problem is None
+        assert len(there.of(Joined)) == 1
+        assert there.messages("south")[-1].raster == FIRST + 29
+    assert seen <= {None, unplugged}
+    assert caplog.text.count("is not connected") == 1
+    assert "device 'UMC1820' delivers sound" in caplog.text
+
+
+def test_device_is_left_when_told_to_stop() -> None:
+    heard: list[bool] = []
+
+    def after_twenty(device: Scripted) -> bool:
+        heard.append(device.left)
+        return len(heard) > 20
+
+    there, device = captured([None] * 100, after_twenty)
+    assert device.left
+    assert all(m.raster < FIRST + 20 for m in there.messages("north"))
+
+
+def test_full_scale_and_beyond_arrive_as_they_are() -> None:
+    samples = sound()
+    samples[:, RATE_HZ] = 1.7
+    with server() as there:
+        replay(there, parts(samples=samples))
+        wait_until(lambda: there.of(Left), "the good-bye")
+        frames = [item for item in there.items if isinstance(item, Frame)]
+        assert max(float(frame.samples.max()) for frame in frames) == pytest.approx(1.7)

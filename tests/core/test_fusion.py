@@ -1,0 +1,641 @@
+"""Arrays joined on the time raster: whatever comes, when it comes, or does not come at all."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import weakref
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from free_field import C_M_S, RATE_HZ, burst, heard, tetra
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from livessl.core.activity import band_power
+from livessl.core.estimators import Localization, Sound, SrpPhat
+from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
+from livessl.core.geometry import Grid
+from livessl.core.types import (
+    FRAME_NS,
+    ArraySpec,
+    ClockState,
+    Event,
+    Float32Array,
+    FloatArray,
+    Frame,
+    MapSnapshot,
+    Mark,
+    Message,
+    Output,
+    Status,
+    Track,
+    TrackState,
+    Update,
+)
+
+NORTH = tetra("north", [2.7, 4.2, 1.3])
+SOUTH = tetra("south", [2.3, 1.1, 1.5], yaw_deg=71.0)
+GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.25)
+SOURCE_M = np.array([1.13, 3.31, 1.47])
+
+START = 20 * 1_700_000_000
+"""Raster index at which every test begins; those below count from it."""
+
+HANG_OVER = 6
+DEADLINE = 10
+"""Defaults, in raster intervals of 50 ms."""
+
+Arrivals = list[tuple[float, Message]]
+"""When, in raster intervals after START, a message comes in."""
+
+
+class Scripted:
+    """An estimator that says one place and remembers what it was given."""
+
+    name = "scripted"
+
+    def __init__(self) -> None:
+        self.calls: list[dict[str, list[int]]] = []
+        self.prepared: list[tuple[str, float]] = []
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        self.prepared.append((array, sample_rate_hz))
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
+        nothing = np.zeros((1, 1, 1), dtype=np.float32)
+        return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, nothing, dict.fromkeys(sounds, nothing))
+
+
+@pytest.fixture(scope="module")
+def located() -> SrpPhat:
+    return SrpPhat([NORTH, SOUTH], GRID, C_M_S)
+
+
+def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any) -> Fusion:
+    return Fusion("site", [NORTH, SOUTH], estimator or Scripted(), FusionParameters(**parameters), updates=updates)
+
+
+def frame(array: str, raster: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
+    made = Frame(
+        array, 0, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
+    )
+    return replace(made, **changes)
+
+
+def mark(array: str, raster: int, **changes: Any) -> Mark:
+    return replace(Mark(array, 0, START + raster, 1e-7, 1e-7, (1e-7,) * 4, clock=ClockState.LOCKED), **changes)
+
+
+def node(array: str, active: Collection[int], rasters: Iterable[int], delay: float = 0.0) -> Arrivals:
+    """What a node sends, each as its interval ends: frames while active and for a hang-over after, else marks."""
+    sent: Arrivals = []
+    for raster in rasters:
+        lately = any(raster - k in active for k in range(HANG_OVER + 1))
+        loud = raster in active
+        message = frame(array, raster, loud, 1e-2 if loud else 1e-7) if lately else mark(array, raster)
+        if loud and raster - 1 not in active:
+            sent += [(raster + 1 + delay, frame(array, raster - k, False, 1e-7)) for k in (2, 1)]
+        sent.append((raster + 1 + delay, message))
+    return sent
+
+
+def play(
+    fusion: Fusion, arrivals: Arrivals, end: int, start: int = 0, every: float = 1.0
+) -> list[tuple[float, Output]]:
+    """Step through time, in raster intervals; what came out, and when."""
+    waiting = sorted(arrivals, key=lambda arrival: arrival[0])
+    said: list[tuple[float, Output]] = []
+    for step in range(round((end - start) / every) + 1):
+        now = start + step * every
+        here = [message for when, message in waiting if when <= now]
+        waiting = waiting[len(here) :]
+        said += [(now, output) for output in fusion.step(here, now_ns(now))]
+    return said
+
+
+def now_ns(raster: float) -> int:
+    return START * FRAME_NS + round(raster * FRAME_NS)
+
+
+def events_of(said: Iterable[tuple[float, Output]]) -> list[tuple[float, Event]]:
+    return [(when, output) for when, output in said if isinstance(output, Event)]
+
+
+def only_event(said: Iterable[tuple[float, Output]]) -> Event:
+    ((_, event),) = events_of(said)
+    return event
+
+
+def told(outputs: Iterable[Output]) -> str:
+    """All that events say, to the last bit."""
+    return json.dumps([asdict(output) for output in outputs if isinstance(output, Event)], default=np.ndarray.tolist)
+
+
+def status_of(fusion: Fusion, array: str, now: float) -> ArrayStatus:
+    (status,) = [status for status in fusion.status(now_ns(now)) if status.name == array]
+    return status
+
+
+def sound_frames(
+    spec: ArraySpec, first: int, count: int, rate_hz: float = RATE_HZ, *, noise: float = 0.0
+) -> list[Frame]:
+    """A burst of noise from the source as an array hears it, in frames: real samples, power and activity."""
+    n = round(0.05 * rate_hz)
+    samples = heard(spec, SOURCE_M, burst(n * count), rate_hz)
+    samples += (noise * np.random.default_rng(1).standard_normal(samples.shape)).astype(np.float32)
+    made = []
+    for k in range(count):
+        piece: Float32Array = samples[:, k * n : (k + 1) * n].copy()
+        power = float(band_power(piece, rate_hz, spec.band_hz).mean())
+        made.append(frame(spec.name, first + k, power > 1e-4, power, samples=piece, sample_rate_hz=rate_hz))
+    return made
+
+
+def live(frames: Sequence[Frame], end: int) -> Arrivals:
+    """These frames as they end, and marks before and after."""
+    array, rasters = frames[0].array, {made.raster - START for made in frames}
+    quiet = [(k + 1.0, mark(array, k)) for k in range(end) if k not in rasters]
+    return [(made.raster - START + 1.0, made) for made in frames] + list[tuple[float, Message]](quiet)
+
+
+def position_of(event: Event) -> FloatArray:
+    assert event.estimate is not None
+    return event.estimate.position_m
+
+
+# --- what an event is made of
+
+
+def test_two_arrays_locate_together(located: SrpPhat) -> None:
+    frames = [sound_frames(spec, 10, 6) for spec in (NORTH, SOUTH)]
+    said = play(fusion_of(located), live(frames[0], 30) + live(frames[1], 30), 30)
+    ((when, event),) = events_of(said)
+    assert (event.status, event.reason) == (Status.LOCATED, None)
+    assert event.heard_by == ("north", "south")
+    assert event.id == f"site-{(START + 10) * 50}"  # site and milliseconds
+    # all of the burst; 1 mm is derived at the estimator's test, and the frames cut off only its faded ends
+    assert np.linalg.norm(position_of(event) - SOURCE_M) < 2e-3
+    assert event.start_ns == now_ns(10)
+    assert event.duration_s == pytest.approx(0.3)
+    assert event.power == max(made.power for some in frames for made in some)
+    assert event.method == "srp-phat"
+    assert event.late_frames == 0
+    # out when the hang-over has been seen to be quiet: the interval 15 + 6 ends at 22
+    assert when == 16 + HANG_OVER
+    assert event.latency_s == pytest.approx(HANG_OVER * 0.05)
+    for contribution, spec in zip(event.contributions, (NORTH, SOUTH), strict=True):
+        assert contribution.array == spec.name
+        assert contribution.active_s == pytest.approx(0.3)
+        assert contribution.distance_m == pytest.approx(float(np.linalg.norm(SOURCE_M - spec.centre_m)), abs=2e-3)
+    assert event.contributions[0].azimuth_deg == pytest.approx(np.degrees(np.arctan2(3.31 - 4.2, 1.13 - 2.7)), abs=0.2)
+
+
+def test_arrays_need_not_agree_to_the_sample(located: SrpPhat) -> None:
+    """An array's clock a whole frame off costs nothing: delays are formed within an array only."""
+    frames = [sound_frames(spec, first, 6) for spec, first in ((NORTH, 10), (SOUTH, 11))]
+    event = only_event(play(fusion_of(located), live(frames[0], 30) + live(frames[1], 30), 30))
+    assert np.linalg.norm(position_of(event) - SOURCE_M) < 2e-3
+
+
+def test_sounds_apart_are_two_events_of_one_array_each() -> None:
+    arrivals = node("north", range(10, 16), range(50)) + node("south", range(30, 36), range(50))
+    assert [event.heard_by for _, event in events_of(play(fusion_of(), arrivals, 50))] == [("north",), ("south",)]
+    # a pause within the hang-over does not part them
+    arrivals = node("north", range(10, 16), range(50)) + node("south", range(16 + HANG_OVER - 1, 30), range(50))
+    assert only_event(play(fusion_of(), arrivals, 50)).heard_by == ("north", "south")
+
+
+def test_one_small_array_tells_the_direction_only() -> None:
+    spec = tetra("north", NORTH.centre_m, edge_m=0.06)
+    fusion = Fusion("site", [spec], SrpPhat([spec], GRID, C_M_S), updates=False)
+    event = only_event(play(fusion, live(sound_frames(spec, 10, 6, noise=0.03), 30), 30))
+    # Its lags change with distance by d^2 / (2 c R^2) = 1.6 us a metre; side lobes of 0.1 in the GCCs leave them
+    # uncertain by s / sqrt(kappa) = 0.1 / 22 kHz = 5 us.
+    assert event.status is Status.DIRECTION_ONLY
+    assert event.reason is not None
+    assert event.reason.startswith("one array cannot tell how far away it is: +-")
+    towards, right = position_of(event) - spec.centre_m, SOURCE_M - spec.centre_m
+    # the direction by 5 us of 0.06 m over sqrt(3) independent lags, 0.9 degrees; by far less in truth, at 10 dB
+    assert towards @ right / np.linalg.norm(towards) / np.linalg.norm(right) > np.cos(np.radians(0.9))
+
+
+def test_arrays_of_different_rates_locate_together(located: SrpPhat) -> None:
+    north, south = sound_frames(NORTH, 10, 6), sound_frames(SOUTH, 10, 6, 48_000.0)
+    fusion = fusion_of(located)
+    event = only_event(play(fusion, live(north, 30) + live(south, 30), 30))
+    assert event.status is Status.LOCATED
+    assert np.linalg.norm(position_of(event) - SOURCE_M) < 2e-3
+    rates = [status.sample_rate_hz for status in fusion.status(now_ns(30))]
+    assert rates == [16_000.0, 48_000.0]
+    # and a rate misread is another place
+    wrong = [replace(made, sample_rate_hz=RATE_HZ) for made in south]
+    event = only_event(play(fusion_of(located), live(north, 30) + live(wrong, 30), 30))
+    assert np.linalg.norm(position_of(event) - SOURCE_M) > 0.02
+
+
+def test_active_frames_are_the_exact_rules_and_gaps_part_segments() -> None:
+    scripted = Scripted()
+    powers = {10: 1e-2, 11: 1e-3, 12: 0.9e-3, 13: 5e-3, 15: 5e-3}  # the third is under a tenth; 14 never comes
+    arrivals: Arrivals = [(k + 1.0, frame("north", k, power=power)) for k, power in powers.items()]
+    event = only_event(play(fusion_of(scripted), arrivals + node("north", (), range(16, 30)), 30))
+    assert scripted.calls == [{"north": [40, 20, 20]}]  # of 20 samples a frame
+    (contribution,) = event.contributions
+    assert contribution.active_s == pytest.approx(0.2)
+    assert contribution.power == pytest.approx(np.mean([1e-2, 1e-3, 5e-3, 5e-3]))
+    assert event.power == 1e-2
+    assert (event.start_ns, event.end_ns) == (now_ns(10), now_ns(16))
+
+
+def test_sound_in_the_pre_roll_counts_where_the_exact_rule_says_so() -> None:
+    """Live it was too soft to be sound, knowing only the past; it is a tenth of what then came."""
+    arrivals: Arrivals = [(k + 1.0, mark("north", k)) for k in range(10)]
+    arrivals += [(11.0, frame("north", k, False, 2e-3)) for k in (8, 9)]
+    arrivals += node("north", (), range(16, 30))
+    arrivals += [(11.0, frame("north", 10)), *((k + 1.0, frame("north", k, False, 1e-7)) for k in range(11, 16))]
+    event = only_event(play(fusion_of(), arrivals, 30))
+    assert event.start_ns == now_ns(8)
+    assert event.id == f"site-{(START + 10) * 50}"  # stable: it was told already in updates
+
+
+def test_too_few_arrays_are_refused() -> None:
+    scripted = Scripted()
+    arrivals = node("north", range(10, 15), range(30)) + node("south", (), range(30))
+    event = only_event(play(fusion_of(scripted, min_arrays=2, updates=True), arrivals, 30))
+    assert (event.status, event.estimate, event.contributions) == (Status.REFUSED, None, ())
+    assert event.reason == "heard by 1 of at least 2 arrays"
+    assert event.heard_by == ("north",)
+    assert scripted.calls == []
+
+
+# --- order and time
+
+
+@settings(deadline=None, max_examples=25)
+@given(data=st.data())
+def test_order_between_arrays_does_not_matter(data: st.DataObject, located: SrpPhat) -> None:
+    queues = [
+        [m for _, m in sorted(live(sound_frames(spec, 10, 5), 24), key=lambda arrival: arrival[0])]
+        for spec in (NORTH, SOUTH)
+    ]
+    straight = fusion_of(located)
+    expected = straight.step([m for pair in zip(*queues, strict=True) for m in pair], now_ns(24))
+    expected += straight.flush(now_ns(24))
+    turns = data.draw(st.permutations([0] * len(queues[0]) + [1] * len(queues[1])), label="whose turn")
+    batches = data.draw(st.lists(st.integers(1, 48), min_size=1), label="messages a step")
+    fusion, outputs = fusion_of(located), []
+    mixed = [queues[who].pop(0) for who in turns]
+    while mixed:
+        size = batches.pop(0) if batches else len(mixed)
+        outputs += fusion.step(mixed[:size], now_ns(24))
+        mixed = mixed[size:]
+    outputs += fusion.flush(now_ns(24))
+    assert told(outputs) == told(expected)
+    assert '"located"' in told(expected)
+
+
+def test_live_and_all_at_once_are_the_same() -> None:
+    active = {*range(10, 17), *range(40, 95)}
+    arrivals = node("north", active, range(120)) + node("south", active, range(120))
+    one, other = Scripted(), Scripted()
+    parted = [event for _, event in events_of(play(fusion_of(one, max_event_s=1.0), arrivals, 120))]
+    fusion = fusion_of(other, max_event_s=1.0)
+    at_once = fusion.step([message for _, message in arrivals], now_ns(120)) + fusion.flush(now_ns(120))
+    assert told(at_once) == told(replace(event, latency_s=(now_ns(120) - event.end_ns) / 1e9) for event in parted)
+    assert one.calls == other.calls
+    assert len(parted) == 4
+
+
+@pytest.mark.parametrize("stops", [0, 5, 12, 18])
+def test_silent_array_delays_by_the_deadline_at_most(stops: int) -> None:
+    """It stops sending before, in or after a sound of the other's; a raster interval later nobody waits for it."""
+    prompt = 16 + HANG_OVER
+    arrivals = node("north", range(10, 16), range(60)) + node("south", range(10, 16), range(stops))
+    ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
+    # its first missing interval is closed a deadline after the other's has come; then all that have come meanwhile
+    assert when == max(prompt, stops + 1 + DEADLINE if stops else 0)
+    assert event.heard_by == (("north", "south") if stops > 10 else ("north",))
+
+
+def test_deadline_can_be_chosen() -> None:
+    arrivals = node("north", range(10, 16), range(60)) + node("south", (), range(12))
+    for deadline_s in (0.1, 0.5, 1.0):
+        ((when, _),) = events_of(play(fusion_of(deadline_s=deadline_s), arrivals, 60))
+        assert when == max(22, 13 + round(deadline_s / 0.05))
+
+
+def test_late_array_is_waited_for_up_to_the_deadline() -> None:
+    for delay, heard_by in ((DEADLINE - 1, ("north", "south")), (3 * DEADLINE, ("north",))):
+        arrivals = node("north", range(10, 16), range(80)) + node("south", range(10, 16), range(80), delay)
+        (when, event), *_ = events_of(play(fusion_of(), arrivals, 80))
+        assert event.heard_by == heard_by
+        assert when <= 22 + DEADLINE
+
+
+def test_array_that_was_away_catches_up() -> None:
+    active = {*range(10, 16), *range(60, 66), *range(100, 106)}
+    south = [
+        (max(when, 46.0) if 5 <= message.raster - START < 45 else when, message)
+        for when, message in node("south", active, range(140))
+    ]
+    south = [(when + (4.0 if message.raster - START >= 95 else 0.0), message) for when, message in south]
+    fusion = fusion_of()
+    said = events_of(play(fusion, node("north", active, range(140)) + south, 140))
+    assert [event.heard_by for _, event in said] == [("north",), ("north", "south"), ("north", "south")]
+    # and it is waited for again: the third time it is 0.2 s behind
+    assert [when for when, _ in said] == [22, 72, 116]
+    assert status_of(fusion, "south", 140).counters["late"] == 6
+
+
+def test_array_that_is_always_late_delays_nobody() -> None:
+    active = range(100, 106)
+    arrivals = node("north", active, range(140)) + node("south", active, range(140), 3 * DEADLINE)
+    (when, event), *_ = events_of(play(fusion_of(), arrivals, 140))
+    assert (when, event.heard_by) == (106 + HANG_OVER, ("north",))
+
+
+def test_array_that_is_punctual_again_is_waited_for() -> None:
+    """Behind by less than the deadline, it never comes first again; but it need not."""
+    active = {*range(10, 16), *range(100, 106)}
+    south = node("south", active, range(140), 3 * DEADLINE)
+    south = [(max(when - 25, 80.0) if message.raster - START >= 50 else when, message) for when, message in south]
+    said = events_of(play(fusion_of(), node("north", active, range(140)) + south, 145))
+    assert said[0][1].heard_by == ("north",)
+    assert (said[-1][0], said[-1][1].heard_by) == (106 + HANG_OVER + 5, ("north", "south"))
+
+
+def test_late_active_frames_are_counted() -> None:
+    delay = 12  # over the deadline, but before the event is over
+    fusion = fusion_of()
+    arrivals = node("north", range(10, 30), range(80)) + node("south", range(10, 30), range(80), delay)
+    first = events_of(play(fusion, arrivals, 80))[0][1]
+    assert first.late_frames > 0
+    assert status_of(fusion, "south", 80).counters["late"] >= first.late_frames
+    assert status_of(fusion, "north", 80).counters["late"] == 0
+    status = status_of(fusion, "south", 80)
+    assert (status.state, status.reason) == (ArrayState.DEGRADED, "its frames come after their deadline")
+
+
+def test_long_sounds_are_parted_and_nothing_is_used_twice() -> None:
+    active = range(10, 110)
+    scripted = Scripted()
+    arrivals = node("north", active, range(140)) + node("south", active, range(140))
+    said = events_of(play(fusion_of(scripted, max_event_s=2.0), arrivals, 140))
+    assert [(event.start_ns, event.end_ns) for _, event in said] == [
+        (now_ns(10), now_ns(50)),
+        (now_ns(50), now_ns(90)),
+        (now_ns(90), now_ns(110)),
+    ]
+    assert [when for when, _ in said] == [50, 90, 110 + HANG_OVER]
+    assert sum(sum(call["north"]) for call in scripted.calls) == 20 * len(active)
+    assert len({event.id for _, event in said}) == 3
+
+
+def test_event_ends_when_everyone_stops_sending() -> None:
+    arrivals = node("north", range(10, 100), range(20)) + node("south", range(10, 100), range(20))
+    ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
+    # heard last at 20; nothing more for a deadline and a hang-over
+    assert when == 20 + DEADLINE + HANG_OVER + 1
+    assert event.end_ns == now_ns(20)
+
+
+def test_flush_tells_what_is_open() -> None:
+    fusion = fusion_of()
+    assert fusion.flush(now_ns(0)) == []
+    said = play(fusion, node("north", range(10, 100), range(20)) + node("south", (), range(15)), 20)
+    assert events_of(said) == []
+    assert fusion.event_id == f"site-{(START + 10) * 50}"
+    (event,) = fusion.flush(now_ns(21))
+    assert isinstance(event, Event)
+    assert event.end_ns == now_ns(20)
+    assert event.latency_s == pytest.approx(0.05)
+    assert fusion.event_id is None
+
+
+def test_long_pause_is_skipped() -> None:
+    fusion = fusion_of()
+    play(fusion, node("north", range(10, 100), range(20)), 20)
+    later = 20 * 3600 * 24 * 365 * 10  # ten years: walked through they would take hours
+    rasters = range(later, later + 40)
+    said = play(fusion, node("north", range(later + 10, later + 15), rasters), later + 40, start=later)
+    assert [event.start_ns for _, event in events_of(said)] == [now_ns(10), now_ns(later + 10)]
+
+
+def test_servers_clock_set_back_starts_over() -> None:
+    fusion = fusion_of(updates=True)
+    hour = 20 * 3600
+    said = play(fusion, node("north", range(hour + 10, hour + 100), range(hour, hour + 20)), hour + 20, start=hour)
+    assert any(isinstance(output, Track) for _, output in said)
+    said = play(fusion, node("north", range(10, 15), range(40)), 40)
+    assert [event.start_ns for _, event in events_of(said)] == [now_ns(hour + 10), now_ns(10)]
+    assert [track.id for _, track in said if isinstance(track, Track) and track.state is TrackState.END] == [1]
+    assert status_of(fusion, "north", 40).state is ArrayState.HEALTHY
+    assert status_of(fusion, "north", 40).counters["late"] == 0
+
+
+# --- what is said while a sound lasts
+
+
+def test_updates_come_only_while_there_is_sound() -> None:
+    scripted = Scripted()
+    arrivals = node("north", range(10, 20), range(120)) + node("south", range(14, 20), range(120))
+    said = play(fusion_of(scripted, updates=True), arrivals, 120)
+    updates = [(when, output) for when, output in said if isinstance(output, Update)]
+    assert [when for when, _ in updates] == [12, 14, 16, 18, 20]  # every 0.1 s, as the interval ends
+    assert {update.event_id for _, update in updates} == {f"site-{(START + 10) * 50}"}
+    assert [update.estimate.arrays for _, update in updates] == [("north",)] * 2 + [("north", "south")] * 3
+    # windows of 0.2 s, their middle 0.1 s ago; before the sound there is nothing to use
+    assert [update.estimate.time_ns for _, update in updates] == [now_ns(when - 2) for when, _ in updates]
+    assert [call["north"] for call in scripted.calls[:-1]] == [[40], [80], [80], [80], [80]]
+    maps = [(when, output) for when, output in said if isinstance(output, MapSnapshot)]
+    assert [(when, snapshot.time_ns) for when, snapshot in maps] == [(w, u.estimate.time_ns) for w, u in updates]
+    tracks = [(when, output) for when, output in said if isinstance(output, Track)]
+    assert [track.state for _, track in tracks] == [TrackState.NEW] + [TrackState.UPDATE] * 4 + [TrackState.END]
+    assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate
+
+
+def test_offline_nobody_is_updated() -> None:
+    arrivals = node("north", range(10, 20), range(40))
+    said = play(fusion_of(updates=False), arrivals, 40)
+    assert [type(output) for _, output in said] == [Event]
+
+
+# --- whom not to believe
+
+
+def test_unknown_array_is_counted_and_ignored() -> None:
+    fusion = fusion_of()
+    said = play(fusion, node("west", range(10, 16), range(40)), 40)
+    assert said == []
+    assert fusion.unknown_arrays == len(node("west", range(10, 16), range(40)))
+
+
+def test_wrong_number_of_channels_is_rejected() -> None:
+    fusion = fusion_of()
+    three = np.zeros((3, 20), np.float32)
+    arrivals: Arrivals = [
+        (when, replace(m, samples=three.copy()) if isinstance(m, Frame) else m)
+        for when, m in node("south", range(10, 16), range(40))
+    ]
+    event = only_event(play(fusion, node("north", range(10, 16), range(40)) + arrivals, 40))
+    assert event.heard_by == ("north",)
+    status = status_of(fusion, "south", 40)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason == "its frames have 3 channels, the server's site file says 4"
+    assert status.counters["rejected"] == 2 + 6 + HANG_OVER
+    assert status.counters["frames"] == 0
+
+
+@pytest.mark.parametrize(("off", "side"), [(72_000, "ahead of"), (-72_000, "behind")])
+def test_clock_an_hour_off_is_rejected_and_disturbs_nobody(off: int, side: str) -> None:
+    fusion = fusion_of()
+    north = node("north", range(10, 16), range(40))
+    astray = [(when, replace(m, raster=m.raster + off)) for when, m in node("south", range(10, 16), range(40))]
+    said = play(fusion, north + astray, 40)
+    alone = play(fusion_of(), north, 40)
+    assert told(output for _, output in said) == told(output for _, output in alone)
+    assert [when for when, _ in said] == [when for when, _ in alone]
+    status = status_of(fusion, "south", 40)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason is not None
+    assert status.reason.startswith("its clock is 3")
+    assert status.reason.endswith(f" s {side} the server's; set both by NTP")
+    assert status.counters["rejected"] == len(astray)
+
+
+def test_frames_up_to_half_a_minute_old_are_accepted() -> None:
+    for age, rejected in ((590, 0), (610, 1)):
+        fusion = fusion_of()
+        fusion.step([frame("north", 0)], now_ns(age))
+        assert status_of(fusion, "north", age).counters["rejected"] == rejected
+
+
+# --- how the arrays are doing
+
+
+def test_array_starts_then_is_healthy_then_lost() -> None:
+    fusion = fusion_of()
+    assert status_of(fusion, "north", 0) == ArrayStatus(
+        "north", ArrayState.STARTING, "not heard from yet", False, None, None, None, (), None, None, None,
+        dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0),
+    )  # fmt: skip
+    play(fusion, node("north", (), range(10)), 10)
+    status = status_of(fusion, "north", 12)
+    assert (status.state, status.reason) == (ArrayState.HEALTHY, None)
+    assert status.age_s == pytest.approx(0.1)
+    assert (status.power, status.noise_power, status.clock) == (1e-7, 1e-7, ClockState.LOCKED)
+    assert status.counters["marks"] == 10
+    assert status_of(fusion, "north", 49).state is ArrayState.HEALTHY
+    status = status_of(fusion, "north", 50)  # two seconds later
+    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 2 s")
+    play(fusion, node("north", (), range(60, 62)), 62, start=61)
+    assert status_of(fusion, "north", 62).state is ArrayState.HEALTHY
+    assert status_of(fusion, "south", 62).state is ArrayState.STARTING
+
+
+def test_array_is_active_while_its_frames_are() -> None:
+    fusion = fusion_of()
+    for raster, active in ((5, False), (12, True), (17, False), (30, False)):
+        play(fusion, node("north", range(10, 16), range(raster + 1)), raster + 1, start=raster)
+        assert status_of(fusion, "north", raster + 1).active == active
+    fusion = fusion_of()
+    play(fusion, node("north", range(10, 16), range(13)), 13)
+    assert status_of(fusion, "north", 14).active
+    assert not status_of(fusion, "north", 60).active  # lost
+
+
+def test_goodbye_is_told_and_nobody_waits() -> None:
+    fusion = fusion_of()
+    play(fusion, node("north", (), range(10)) + node("south", (), range(10)), 10)
+    fusion.leave("south")
+    fusion.leave("nobody")
+    status = status_of(fusion, "south", 10)
+    assert (status.state, status.reason) == (ArrayState.LOST, "its node has ended")
+    ((when, _),) = events_of(play(fusion, node("north", range(12, 16), range(10, 40)), 40, start=11))
+    assert when == 16 + HANG_OVER
+    play(fusion, node("south", (), range(40, 42)), 42, start=41)
+    assert status_of(fusion, "south", 42).state is ArrayState.HEALTHY
+
+
+@pytest.mark.parametrize(
+    ("powers", "said"),
+    [
+        ((1e-7, 1e-7, 0.0, 1e-7), "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"),
+        ((0.0,) * 4, "all channels are dead: all-zero samples; check cable, gain and channel numbers"),
+    ],
+)
+def test_dead_microphone_is_told_after_a_second(powers: tuple[float, ...], said: str) -> None:
+    fusion = fusion_of()
+    for raster in range(60):
+        dead = 10 <= raster < 50
+        message = mark("north", raster, channel_power=powers) if dead else mark("north", raster)
+        fusion.step([message], now_ns(raster + 1))
+        status = status_of(fusion, "north", raster + 1)
+        if 10 + 20 <= raster < 50:
+            assert (status.state, status.reason) == (ArrayState.DEGRADED, said)
+        else:
+            assert (status.state, status.reason) == (ArrayState.HEALTHY, None)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "said"),
+    [
+        ({"overflows": 3}, "its device loses samples; use larger blocks or a less busy machine"),
+        ({"lost_frames": 3}, "frames were torn by a gap in the sound"),
+        ({"clock": ClockState.STEPPED}, "its clock has stepped"),
+    ],
+)
+def test_trouble_is_told_for_ten_seconds(trouble: dict[str, Any], said: str) -> None:
+    fusion = fusion_of()
+    lasting = {name: value for name, value in trouble.items() if name != "clock"}
+    for raster in range(240):
+        changes = trouble if raster == 20 else lasting if raster > 20 else {}
+        fusion.step([mark("north", raster, **changes)], now_ns(raster + 1))
+        status = status_of(fusion, "north", raster + 1)
+        troubled = 20 <= raster < 20 + 200
+        assert status.state is (ArrayState.DEGRADED if troubled else ArrayState.HEALTHY)
+        assert status.reason == (said if troubled else None)
+    assert status.counters["overflows"] == trouble.get("overflows", 0)
+    assert status.counters["lost_frames"] == trouble.get("lost_frames", 0)
+
+
+def test_old_trouble_of_a_node_is_no_news() -> None:
+    fusion = fusion_of()
+    play(fusion, [(1.0, mark("north", 0, overflows=7, lost_frames=9))], 1)
+    assert status_of(fusion, "north", 1).state is ArrayState.HEALTHY
+
+
+def test_preparing_is_the_estimators() -> None:
+    scripted = Scripted()
+    fusion_of(scripted).prepare("north", 44_100.0)
+    assert scripted.prepared == [("north", 44_100.0)]
+
+
+# --- for ever
+
+
+@pytest.mark.parametrize("arrays", [("north",), ("north", "south")])
+def test_memory_does_not_grow(arrays: tuple[str, ...]) -> None:
+    """Hours of quiet with a sound now and then: what is held is the last second's, whatever came before."""
+    scripted = Scripted()
+    fusion = fusion_of(scripted, max_event_s=1.0)
+    held: list[weakref.ref[Float32Array]] = []
+    sizes = []
+    for raster in range(12_000):
+        loud = raster % 100 < 45
+        for array in arrays:
+            message: Message = frame(array, raster) if loud else mark(array, raster)
+            if isinstance(message, Frame):
+                held.append(weakref.ref(message.samples))
+            fusion.step([message], now_ns(raster + 1))
+        if raster % 2000 == 1999:
+            scripted.calls.clear()
+            sizes.append(len(pickle.dumps(fusion)))
+            held = [reference for reference in held if reference() is not None]
+            # an event of 20 frames, and 15 for pre-roll, window and hang-over before it
+            assert len(held) <= len(arrays) * (20 + 15 + 2)
+    assert max(sizes[1:]) <= sizes[0] + 200  # counters get longer

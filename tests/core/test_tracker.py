@@ -1,0 +1,158 @@
+"""Tracks: one for each source, as fast as it walks, as sure as its estimates, and over when it is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from livessl.core.tracker import ACCELERATION_M_S2, GATE_M, MIN_STD_M, SILENCE_S, Tracker
+from livessl.core.types import Estimate, FloatArray, Track, TrackState
+
+START_NS = 1_700_000_000 * 10**9
+STEP_S = 0.1
+STD_M = 0.1
+WALK_M_S = np.array([0.8, -0.5, 0.0])
+
+
+def at_ns(time_s: float) -> int:
+    return START_NS + round(time_s * 1e9)
+
+
+def estimate(time_s: float, position_m: ArrayLike, std_m: float = STD_M) -> Estimate:
+    return Estimate(at_ns(time_s), np.array(position_m, dtype=np.float64), std_m**2 * np.eye(3), 0.5, ("north",))
+
+
+def follow(tracker: Tracker, paths: Sequence[FloatArray], std_m: float = STD_M) -> list[list[Track]]:
+    """Steps of `STEP_S`: at each, one estimate of every path (n, 3)."""
+    steps = []
+    for k in range(len(paths[0])):
+        time_s = k * STEP_S
+        steps.append(tracker.step(at_ns(time_s), [estimate(time_s, path[k], std_m) for path in paths]))
+    return steps
+
+
+def walk(start_m: ArrayLike, steps: int = 60, seed: int = 1, velocity_m_s: FloatArray = WALK_M_S) -> FloatArray:
+    time_s = STEP_S * np.arange(steps)[:, None]
+    scatter = STD_M * np.random.default_rng(seed).standard_normal((steps, 3))
+    return np.asarray(np.asarray(start_m) + time_s * velocity_m_s + scatter)
+
+
+def test_walker_is_one_track() -> None:
+    steps = follow(Tracker(), [walk([1.0, 5.0, 1.5])])
+    assert all(len(step) == 1 for step in steps)
+    assert {step[0].id for step in steps} == {1}
+    assert [step[0].state for step in steps] == [TrackState.NEW] + [TrackState.UPDATE] * 59
+    assert [step[0].time_ns for step in steps] == [at_ns(k * STEP_S) for k in range(60)]
+
+
+def test_velocity_points_where_the_walker_goes() -> None:
+    for velocity_m_s in (WALK_M_S, -WALK_M_S):
+        (track,) = follow(Tracker(), [walk([3.0, 5.0, 1.5], velocity_m_s=velocity_m_s)])[-1]
+        # Of the steady state: with sd 0.11 m (0.1 and the least 0.05 m) each 0.1 s and 1 m/s^2 of acceleration the
+        # filter remembers sqrt(0.11 / 1) = 0.3 s; its velocity scatters by 0.2 m/s. Three of them:
+        np.testing.assert_allclose(track.velocity_m_s, velocity_m_s, atol=0.6)
+        assert track.velocity_m_s @ velocity_m_s > 0.5 * velocity_m_s @ velocity_m_s
+        assert np.linalg.norm(track.position_m - ([3.0, 5.0, 1.5] + 5.9 * velocity_m_s)) < 3 * STD_M
+
+
+def test_velocity_is_exact_without_scatter() -> None:
+    path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(200)[:, None] * WALK_M_S
+    (track,) = follow(Tracker(), [path])[-1]
+    np.testing.assert_allclose(track.velocity_m_s, WALK_M_S, atol=1e-3)  # metres a second, not a step
+    np.testing.assert_allclose(track.position_m, path[-1], atol=1e-3)
+
+
+def test_covariance_shrinks_below_one_estimates() -> None:
+    rest = np.zeros(3)
+    variances = [float(np.trace(s[0].covariance_m2)) for s in follow(Tracker(), [walk([1, 1, 1], velocity_m_s=rest)])]
+    assert variances[0] == pytest.approx(3 * (STD_M**2 + MIN_STD_M**2))
+    assert variances[5] < variances[1] < variances[0]
+    assert variances[-1] == pytest.approx(variances[-2], rel=1e-3)
+    # steady state of a constant-velocity filter: about sqrt(2) (T / 0.3 s) = 0.4 of one estimate's variance
+    assert 0.2 < variances[-1] / variances[0] < 0.6
+    np.testing.assert_array_less(0, np.linalg.eigvalsh(follow(Tracker(), [walk([1, 1, 1])])[-1][0].covariance_m2))
+
+
+def test_two_sources_are_two_tracks() -> None:
+    paths = [walk([1.0, 5.0, 1.5], seed=1), walk([6.0, 5.0, 1.5], seed=2)]
+    steps = follow(Tracker(), paths)
+    assert [[track.id for track in step] for step in steps] == [[1, 2]] * 60
+    for k, track in enumerate(steps[-1]):
+        assert np.linalg.norm(track.position_m - paths[k][-1]) < 4 * STD_M
+    # in turn, as the windows of a live server bring them, it is the same
+    tracker = Tracker()
+    ids = [tracker.step(at_ns(k * STEP_S), [estimate(k * STEP_S, paths[k % 2][k])])[0].id for k in range(60)]
+    assert ids == [1, 2] * 30
+
+
+def test_jump_beyond_the_gate_is_another_source() -> None:
+    for far_m, known in ((0.9 * GATE_M, True), (1.5 * GATE_M, False)):
+        tracker = Tracker()
+        follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+        (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.0 + far_m, 1.0, 1.0])])
+        assert (track.id == 1) == known
+        assert track.state is (TrackState.UPDATE if known else TrackState.NEW)
+
+
+def test_unsure_estimate_may_lie_further_off() -> None:
+    tracker = Tracker()
+    follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+    (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [3.0, 1.0, 1.0], std_m=1.0)])
+    assert track.id == 1
+    # and it moves the track little: its weight is the track's variance of some 0.1^2 against its own 1
+    assert abs(track.position_m[0] - 1.0) < 0.1
+
+
+def test_unsure_direction_moves_the_track_little_along_it() -> None:
+    tracker = Tracker()
+    follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+    covariance = np.diag([4.0, 0.0025, 0.0025])
+    found = Estimate(at_ns(3.0), np.array([1.6, 1.1, 1.0]), covariance, 0.5, ("north",))
+    (track,) = tracker.step(at_ns(3.0), [found])
+    x, y, _ = track.position_m - 1.0
+    assert abs(x) < 0.02
+    assert 0.02 < y < 0.1
+
+
+def test_track_ends_after_silence() -> None:
+    tracker = Tracker()
+    last = follow(tracker, [walk([1.0, 5.0, 1.5])])[-1][0]
+    silent_from_s = 59 * STEP_S
+    assert tracker.step(at_ns(silent_from_s + SILENCE_S)) == []
+    (ended,) = tracker.step(at_ns(silent_from_s + SILENCE_S + 0.01))
+    assert (ended.id, ended.state, ended.time_ns) == (1, TrackState.END, last.time_ns)
+    np.testing.assert_array_equal(ended.position_m, last.position_m)
+    assert tracker.step(at_ns(100.0)) == []
+    (again,) = tracker.step(at_ns(100.0), [estimate(100.0, last.position_m)])
+    assert (again.id, again.state) == (2, TrackState.NEW)
+
+
+def test_pause_widens_what_is_believed() -> None:
+    tracker = Tracker()
+    before = follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])[-1][0]
+    pause_s = 2.0
+    (after,) = tracker.step(at_ns(2.9 + pause_s), [estimate(2.9 + pause_s, [1.5, 1.0, 1.0])])
+    # in 2 s the acceleration alone may carry it by t^2 / 2 = 2 m: the new estimate outweighs the memory
+    assert ACCELERATION_M_S2 * pause_s**2 / 2 == 2.0
+    assert after.position_m[0] == pytest.approx(1.5, abs=0.02)
+    assert np.trace(after.covariance_m2) > np.trace(before.covariance_m2)
+
+
+def test_estimates_out_of_order_do_no_harm() -> None:
+    tracker = Tracker()
+    follow(tracker, [walk([1.0, 5.0, 1.5])])
+    (track,) = tracker.step(at_ns(5.9), [estimate(5.5, [1.0 + 0.8 * 5.5, 5.0 - 0.5 * 5.5, 1.5])])
+    assert track.id == 1
+    assert track.time_ns == at_ns(5.9)
+    assert np.linalg.eigvalsh(track.covariance_m2).min() > 0
+
+
+def test_fixed_axis_is_no_singularity() -> None:
+    tracker = Tracker()
+    flat = np.diag([0.01, 0.01, 0.0])
+    for k in range(10):
+        (track,) = tracker.step(at_ns(k * STEP_S), [Estimate(at_ns(k * STEP_S), np.ones(3), flat, 0.5, ("north",))])
+    assert track.position_m == pytest.approx([1.0, 1.0, 1.0])

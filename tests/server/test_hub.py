@@ -1,0 +1,167 @@
+"""Subscribers: everything numbered, filtered as asked, and a slow reader told what he missed."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from livessl.messages import API_VERSION, JsonObject
+from livessl.server.hub import BACKLOG, Filter, Hub, Subscription
+
+
+def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> JsonObject:
+    return {"kind": "update", "n": n, "confidence": confidence, "zones": list(zones)}
+
+
+def event(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> JsonObject:
+    return {**update(n, confidence, zones), "kind": "event"}
+
+
+async def waiting(subscription: Subscription) -> list[JsonObject]:
+    """All that waits for a subscriber."""
+    messages: list[JsonObject] = []
+    while True:
+        try:
+            messages.append(await asyncio.wait_for(subscription.next(), 0.02))
+        except TimeoutError:
+            return messages
+
+
+def drained(subscription: Subscription) -> list[JsonObject]:
+    """The same, where nothing is asked afterwards: a subscription belongs to one event loop."""
+    return asyncio.run(waiting(subscription))
+
+
+def test_messages_are_numbered_without_holes() -> None:
+    hub = Hub()
+    hub.publish(update())  # before anyone listens
+    one, two = hub.subscribe(Filter()), hub.subscribe(Filter())
+    for k in range(5):
+        hub.publish(update(k))
+    for subscription in (one, two):
+        got = drained(subscription)
+        assert [message["seq"] for message in got] == [2, 3, 4, 5, 6]
+        assert [message["n"] for message in got] == [0, 1, 2, 3, 4]
+        assert {message["v"] for message in got} == {API_VERSION}
+    assert hub.last_seq == 6
+
+
+def test_nothing_comes_after_unsubscribing() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    assert hub.clients == 1
+    hub.unsubscribe(subscription)
+    hub.unsubscribe(subscription)
+    assert hub.clients == 0
+    hub.publish(update())
+    assert drained(subscription) == []
+
+
+TRACK: JsonObject = {"kind": "track", "zones": ["door"]}
+ARRAYS: JsonObject = {"kind": "arrays", "arrays": []}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "passing"),
+    [
+        ({}, "all"),
+        ({"kinds": frozenset({"event"})}, "event sure, event unsure at the door"),
+        ({"kinds": frozenset({"event", "arrays"})}, "event sure, event unsure at the door, arrays"),
+        ({"kinds": frozenset()}, ""),
+        ({"min_confidence": 0.5}, "event sure, update, track, arrays"),
+        ({"zone": "door"}, "event unsure at the door, track, arrays"),
+        ({"zone": "door", "min_confidence": 0.5}, "track, arrays"),
+        ({"zone": "window"}, "arrays"),
+    ],
+)
+def test_filters(wanted: dict[str, Any], passing: str) -> None:
+    messages = {
+        "event sure": event(confidence=0.9),
+        "event unsure at the door": event(confidence=0.1, zones=("door", "hall")),
+        "update": update(confidence=0.5),
+        "track": TRACK,
+        "arrays": ARRAYS,
+    }
+    names = [name for name, message in messages.items() if Filter(**wanted).passes(message)]
+    assert names == (list(messages) if passing == "all" else [name for name in passing.split(", ") if name])
+
+
+def test_filtered_messages_keep_their_numbers() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter(kinds=frozenset({"event"})))
+    for k in range(6):
+        hub.publish(event(k) if k % 3 == 0 else update(k))
+    assert [message["seq"] for message in drained(subscription)] == [1, 4]
+
+
+def test_slow_reader_loses_the_oldest_that_are_no_events_and_is_told() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    events = [3, 50, 100]
+    total = BACKLOG + 120
+    for k in range(total):
+        hub.publish(event(k) if k in events else update(k))
+
+    async def read_twice() -> tuple[list[JsonObject], list[JsonObject]]:
+        first = await waiting(subscription)
+        hub.publish(update(total))
+        return first, await waiting(subscription)
+
+    (gap, *rest), later = asyncio.run(read_twice())
+    assert gap["kind"] == "gap"
+    assert gap["missed"] == 120
+    assert "reads too slowly; 120 messages were dropped" in gap["reason"]
+    assert len(rest) == BACKLOG
+    numbers = [message["n"] for message in rest]
+    assert numbers == sorted(numbers)
+    assert numbers == [*events, *range(120 + len(events), total)]
+    assert [message["n"] for message in later] == [total]  # told once
+
+
+def test_backlog_of_events_alone_is_bounded_too() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    for k in range(BACKLOG + 10):
+        hub.publish(event(k))
+    gap, *rest = drained(subscription)
+    assert gap["missed"] == 10
+    assert [message["n"] for message in rest] == list(range(10, BACKLOG + 10))
+
+
+def test_full_backlog_without_loss_is_no_gap() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    for k in range(BACKLOG):
+        hub.publish(update(k))
+    assert [message["n"] for message in drained(subscription)] == list(range(BACKLOG))
+
+
+def test_slow_reader_hinders_nobody() -> None:
+    hub = Hub()
+    hub.subscribe(Filter())
+    quick = hub.subscribe(Filter())
+
+    async def both() -> list[int]:
+        got = []
+        for k in range(3 * BACKLOG):
+            hub.publish(update(k))
+            got.append((await quick.next())["n"])
+        return got
+
+    assert asyncio.run(both()) == list(range(3 * BACKLOG))
+
+
+def test_next_waits_for_news() -> None:
+    hub = Hub()
+
+    async def wait() -> JsonObject:
+        subscription = hub.subscribe(Filter())
+        reading = asyncio.create_task(subscription.next())
+        await asyncio.sleep(0)
+        assert not reading.done()
+        hub.publish(update(7))
+        return await asyncio.wait_for(reading, 1.0)
+
+    assert asyncio.run(wait())["n"] == 7

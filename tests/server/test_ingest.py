@@ -1,0 +1,203 @@
+"""The server's side of the link, without sockets: who may join, what counts, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from livessl import wire
+from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Arrival, Ingest
+from livessl.wire import Ack, Bye, Hello
+from small_site import frame, mark, site_of
+
+NOW = 1_767_225_600_000_000_000
+HELLO = Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
+WEST = {"arrays.west": {"microphones_m": [[1, 1, 1], [1, 1.2, 1]], "band_hz": [100, 3000]}}
+
+
+def ingest() -> Ingest:
+    return Ingest(site_of(WEST))
+
+
+def tell(into: Ingest, message: wire.WireMessage, peer: bytes = b"p1", now_ns: int = NOW) -> Arrival:
+    return into.receive(peer, wire.encode(message), now_ns)
+
+
+def joined(**changes: Any) -> Ingest:
+    into = ingest()
+    assert tell(into, replace(HELLO, **changes)).joined is not None
+    return into
+
+
+def refusal(into: Ingest, hello: Hello, peer: bytes = b"p2", now_ns: int = NOW) -> str | None:
+    arrival = tell(into, hello, peer, now_ns)
+    assert arrival.reply is not None
+    assert arrival.reply.run_id == hello.run_id
+    assert (arrival.joined is None) or arrival.reply.refused is None
+    return arrival.reply.refused
+
+
+def test_greeting_is_answered_with_what_is_known() -> None:
+    into = ingest()
+    arrival = tell(into, HELLO)
+    assert arrival == Arrival(joined=HELLO, reply=Ack("run-1", {}))
+    tell(into, frame(1))
+    again = tell(into, HELLO)
+    assert again == Arrival(reply=Ack("run-1", {"north": 1}))  # the same run: nobody new
+
+
+def test_run_that_comes_back_by_another_connection_goes_on() -> None:
+    into = joined()
+    tell(into, frame(4))
+    assert tell(into, HELLO, b"p9").reply == Ack("run-1", {"north": 4})
+    assert tell(into, frame(4), b"p9").message is None
+    assert tell(into, frame(5), b"p9").message is not None
+    assert tell(into, frame(6), b"p1").reply == Ack("?", {}, who_are_you=True)  # the old connection is nobody now
+
+
+def test_new_run_counts_from_the_beginning() -> None:
+    into = joined()
+    tell(into, frame(100))
+    later = NOW + GONE_NS
+    assert tell(into, replace(HELLO, run_id="run-2"), b"p2", later).joined is not None
+    assert tell(into, frame(1), b"p2", later).message is not None
+    assert into.duplicates["north"] == 0
+    assert into.sequence_gaps["north"] == 0
+
+
+@pytest.mark.parametrize("message", [frame(), mark(), Bye("lab-pc", "run-1")])
+def test_stranger_is_asked_who_he_is(message: wire.WireMessage) -> None:
+    assert tell(ingest(), message) == Arrival(reply=Ack("?", {}, who_are_you=True))
+
+
+def test_messages_pass_once_each() -> None:
+    into = joined()
+    passed = [tell(into, frame(k)).message for k in (1, 2, 2, 1, 3)]
+    assert [None if message is None else message.sequence for message in passed] == [1, 2, None, None, 3]
+    assert into.duplicates == {"north": 2, "south": 0, "west": 0}
+    assert tell(into, frame(1, array="south")).message is not None  # each array counts for itself
+
+
+def test_gaps_in_the_sequence_are_counted() -> None:
+    into = joined()
+    for sequence in (7, 8, 12, 13):
+        assert tell(into, frame(sequence)).message is not None
+    assert into.sequence_gaps == {"north": 3, "south": 0, "west": 0}
+
+
+def test_good_bye_ends_a_run() -> None:
+    into = joined()
+    assert tell(into, Bye("lab-pc", "run-1")) == Arrival(left=HELLO)
+    assert into.live_nodes(NOW) == []
+    assert tell(into, frame(1)).reply == Ack("?", {}, who_are_you=True)
+    assert refusal(into, replace(HELLO, run_id="run-2")) is None
+
+
+def test_acknowledgements_twice_a_second() -> None:
+    into = joined()
+    tell(into, frame(3))
+    assert into.acknowledgements(NOW) == [(b"p1", Ack("run-1", {"north": 3}))]
+    assert into.acknowledgements(NOW + ACK_NS - 1) == []
+    assert into.acknowledgements(NOW + ACK_NS) == [(b"p1", Ack("run-1", {"north": 3}))]
+
+
+def test_silent_node_loses_its_place_and_is_forgotten_at_last() -> None:
+    into = joined()
+    assert into.live_nodes(NOW + GONE_NS - 1) == [HELLO]
+    assert into.live_nodes(NOW + GONE_NS) == []
+    assert len(into.acknowledgements(NOW + 29 * GONE_NS)) == 1  # it may have missed a few
+    assert into.acknowledgements(NOW + 30 * GONE_NS) == []
+    assert tell(into, frame(1), now_ns=NOW + 31 * GONE_NS).reply == Ack("?", {}, who_are_you=True)
+
+
+OTHER = Hello("other-pc", "run-9", {"west": 16000.0})
+
+
+@pytest.mark.parametrize(
+    ("hello", "reason"),
+    [
+        (OTHER, None),
+        (
+            replace(OTHER, arrays={"east": 16000.0}),
+            "no array 'east' in the server's site file; it has north, south, west",
+        ),
+        (replace(OTHER, node="lab-pc"), "a node named 'lab-pc' is connected already; names must differ"),
+        (replace(OTHER, arrays={"south": 16000.0}), "array 'south' is captured by node 'lab-pc' already"),
+        (replace(OTHER, replay=True), "live nodes are connected; stop them first"),
+        (
+            replace(OTHER, arrays={"west": 6000.0}),
+            "array 'west' uses up to 3000 Hz and needs more than 6000 Hz, got 6000 Hz",
+        ),
+        (replace(OTHER, arrays={"west": 6001.0}), None),
+    ],
+)
+def test_who_may_join(hello: Hello, reason: str | None) -> None:
+    into = joined()
+    said = refusal(into, hello)
+    if reason is None:
+        assert said is None
+        assert into.live_nodes(NOW) == [HELLO, hello]
+    else:
+        assert said is not None
+        assert said.startswith(reason)
+        assert into.live_nodes(NOW) == [HELLO]
+        # nothing that a refused node sends gets in
+        assert tell(into, mark(1, array="west"), b"p2").reply == Ack("?", {}, who_are_you=True)
+
+
+def test_live_node_waits_for_a_replay_to_end() -> None:
+    into = joined(replay=True)
+    assert refusal(into, OTHER) == "a replay is running"
+    tell(into, Bye("lab-pc", "run-1"))
+    assert refusal(into, OTHER) is None
+
+
+def test_refused_node_may_come_when_the_place_is_free() -> None:
+    into = joined()
+    taken = replace(OTHER, arrays={"north": 16000.0})
+    assert refusal(into, taken) is not None
+    assert refusal(into, taken, now_ns=NOW + GONE_NS) is None
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"rubbish",
+        wire.encode(frame())[:-1],
+        wire.encode(Ack("run-1", {"north": 1})),
+        wire.encode(frame(array="west")),
+        wire.encode(replace(frame(), sample_rate_hz=8000.0)),
+    ],
+    ids=["nothing", "rubbish", "truncated", "acknowledgement", "array not announced", "rate not announced"],
+)
+def test_malformed_is_counted_and_changes_nothing(data: bytes) -> None:
+    into = joined()
+    assert into.receive(b"p1", data, NOW) == Arrival()
+    assert into.malformed == 1
+    assert tell(into, frame(1)).message is not None
+
+
+def test_rubbish_is_noticed_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+    into = ingest()
+    for k in range(100):
+        into.receive(b"p1", b"rubbish", NOW + k)
+    assert into.malformed == 100
+    assert len(caplog.records) == 1
+    into.receive(b"p1", b"rubbish", NOW + NOTICE_NS)
+    assert len(caplog.records) == 2
+    assert "message refused (101 so far): " in caplog.text
+
+
+def test_problem_of_a_device_is_told_until_it_is_over() -> None:
+    into = joined()
+    assert into.problem_of("north") is None
+    tell(into, replace(HELLO, problem="unplugged"))
+    assert (into.problem_of("north"), into.problem_of("west")) == ("unplugged", None)
+    tell(into, HELLO)
+    assert into.problem_of("north") is None
+    tell(into, replace(HELLO, problem="unplugged"))
+    tell(into, Bye("lab-pc", "run-1"))
+    assert into.problem_of("north") is None

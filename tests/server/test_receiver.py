@@ -1,0 +1,156 @@
+"""The nodes' socket: whatever a stranger throws at it, a good node carries on."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zmq
+
+from livessl import wire
+from livessl.capture.link import Link
+from livessl.clock import SystemClock
+from livessl.core.types import Frame
+from livessl.server.receiver import QUEUE_MESSAGES, BindError, Joined, Left, Receiver
+from small_site import frame, mark, site_of, wait_until
+
+CLOCK = SystemClock()
+HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
+
+
+@contextmanager
+def receiving() -> Iterator[Receiver]:
+    receiver = Receiver(site_of(), CLOCK)
+    receiver.start()
+    try:
+        yield receiver
+    finally:
+        receiver.stop()
+
+
+@contextmanager
+def stranger(receiver: Receiver) -> Iterator[zmq.Socket[bytes]]:
+    """Someone who sends what he likes."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(receiver.endpoint)
+        yield socket
+
+
+@contextmanager
+def node(receiver: Receiver) -> Iterator[Link]:
+    link = Link(receiver.endpoint, HELLO, CLOCK)
+    try:
+        link.wait_connected(lambda: False)
+        yield link
+    finally:
+        link.close(bye=False)
+
+
+def assert_works(receiver: Receiver, link: Link, first: int) -> None:
+    """Ten frames of the good node arrive and are acknowledged."""
+    numbers = list(range(first, first + 10))
+    got: list[int] = []
+    link.send([frame(k) for k in numbers])
+
+    def arrived() -> bool:
+        link.service()
+        got.extend(item.sequence for item in receiver.take(100, 0.001) if isinstance(item, Frame))
+        return got == numbers and link.pending == 0
+
+    wait_until(arrived, "the good node's frames")
+
+
+def test_malformed_messages_hinder_nobody() -> None:
+    rng = random.Random(2)
+    good = [wire.encode(message) for message in (frame(), mark(), HELLO)]
+    with receiving() as receiver, node(receiver) as link, stranger(receiver) as socket:
+        sent = 0
+        for turn in range(4):
+            for data in 10 * good:
+                mutated = bytearray(data)
+                mutated[rng.randrange(6)] ^= 1 << rng.randrange(8)  # in the head: surely no message any more
+                socket.send(bytes(mutated))
+                socket.send(rng.randbytes(rng.randrange(50)))
+                socket.send_multipart([b"LSSL", b"", data[6:20]])
+                sent += 3
+            assert_works(receiver, link, 10 * turn + 1)
+        wait_until(lambda: receiver.ingest.malformed >= 0.9 * sent, "the count of what was refused")
+        assert receiver.failure is None
+
+
+def test_oversized_message_cuts_only_its_sender_off() -> None:
+    with receiving() as receiver, node(receiver) as link, stranger(receiver) as socket:
+        assert_works(receiver, link, 1)
+        with socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:
+            socket.send(bytes(wire.MAX_MESSAGE_BYTES + 1))
+            assert monitor.poll(5000), "the sender is not cut off"
+            socket.disable_monitor()
+        assert_works(receiver, link, 11)
+        assert receiver.failure is None
+
+
+def test_many_small_parts_are_no_way_around_the_limit() -> None:
+    with receiving() as receiver, node(receiver) as link, stranger(receiver) as socket:
+        socket.send_multipart([bytes(wire.MAX_MESSAGE_BYTES // 4)] * 5)
+        wait_until(lambda: receiver.ingest.malformed == 1, "the refusal")
+        assert_works(receiver, link, 1)
+
+
+def test_message_in_parts_is_the_same_message() -> None:
+    with receiving() as receiver, stranger(receiver) as socket:
+        data = wire.encode(HELLO)
+        socket.send_multipart([data[:4], data[4:9], data[9:]])
+        wait_until(lambda: receiver.take(1, 0.001) == [Joined(HELLO)], "the greeting")
+
+
+def test_items_come_in_order() -> None:
+    with receiving() as receiver:
+        with node(receiver) as link:
+            link.send([frame(1), mark(2), frame(3)])
+            link.close(bye=True)
+        items: list[object] = []
+        wait_until(lambda: items.extend(receiver.take(100, 0.001)) or len(items) == 5, "five items")  # type: ignore[func-returns-value]
+        assert items[0] == Joined(HELLO)
+        assert [getattr(item, "sequence", None) for item in items[1:4]] == [1, 2, 3]
+        assert items[4] == Left(HELLO)
+
+
+def test_full_queue_leaves_the_sound_with_the_node() -> None:
+    """Nobody takes anything; the node is still acknowledged what was taken in, and loses nothing."""
+    total = QUEUE_MESSAGES + 300
+    with receiving() as receiver, node(receiver) as link:
+        link.send([frame(k) for k in range(1, total + 1)])
+        wait_until(lambda: link.service() or receiver._queue.full(), "a full queue")  # type: ignore[func-returns-value]
+        got: list[int] = []
+
+        def all_arrived() -> bool:
+            link.service()
+            got.extend(item.sequence for item in receiver.take(50, 0.001) if isinstance(item, Frame))
+            return len(got) >= total and link.pending == 0
+
+        wait_until(all_arrived, "all frames")
+        assert got == list(range(1, total + 1))
+        assert link.dropped == 0
+
+
+def test_address_that_is_taken() -> None:
+    with receiving() as receiver:
+        with pytest.raises(BindError) as caught:
+            Receiver(site_of({"server.bind": receiver.endpoint}), CLOCK)
+        assert str(caught.value) == (
+            f"server.bind: cannot listen on {receiver.endpoint}: Address already in use; is another server running? "
+            "Stop it or choose another port"
+        )
+        endpoint = receiver.endpoint
+    again = Receiver(site_of({"server.bind": endpoint}), CLOCK)  # given back when it ended
+    again.stop()
+
+
+def test_take_waits_no_longer_than_told() -> None:
+    with receiving() as receiver:
+        began_ns = CLOCK.now_ns()
+        assert receiver.take(10, 0.05) == []
+        assert 0.04e9 < CLOCK.now_ns() - began_ns < 2e9

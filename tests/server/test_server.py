@@ -1,0 +1,282 @@
+"""The whole server: sound in at one socket, answers out at the other."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from contextlib import ExitStack
+from itertools import count
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import Close
+from websockets.sync.client import connect
+
+from livessl import replay, wire
+from livessl.capture.link import Link
+from livessl.capture.node import send_session
+from livessl.clock import PacedClock, SystemClock, UnpacedClock
+from livessl.core.types import Event
+from livessl.messages import Messages
+from livessl.server.app import Server
+from livessl.server.receiver import BindError
+from livessl.server.store import StoreError
+from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+
+CLOCK = SystemClock()
+START_NS = 1_767_225_600_000_000_000
+RUNS = count()
+NEAR_M = 0.25 * math.sqrt(3) / 2
+"""Half the diagonal of a grid cell."""
+
+
+class Subscriber:
+    """Reads the WebSocket until the server ends."""
+
+    def __init__(self, server: Server, query: str = "") -> None:
+        self.messages: list[dict[str, Any]] = []
+        self.ended: Close | None = None
+        self._connected = ExitStack()
+        url = f"ws{server.url.removeprefix('http')}/api/v1/live{query}"
+        self._socket = self._connected.enter_context(connect(url, open_timeout=5))
+        self._thread = Thread(target=self._read)
+        self._thread.start()
+        wait_until(lambda: self.of("hello"), "the greeting")
+
+    def _read(self) -> None:
+        try:
+            for text in self._socket:
+                self.messages.append(json.loads(text))
+        except ConnectionClosed as error:
+            self.ended = error.rcvd
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        return [message for message in self.messages if message["kind"] == kind]
+
+    def close(self) -> None:
+        self._connected.close()
+        self._thread.join(timeout=5)
+
+
+def play(server: Server, speed: float | None = None) -> None:
+    """Send the scene as a replay, as fast as it goes or at a speed."""
+    pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
+    send_session(
+        site_of(), server.engine.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
+    server.engine.wait_idle()
+
+
+def offline() -> list[dict[str, Any]]:
+    """The events of the scene without any server."""
+    site = site_of()
+    told = Messages(site, START_NS, utc=True)
+    outputs = replay.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
+    return [told.event(output) for output in outputs if isinstance(output, Event)]
+
+
+def without_delays(event: dict[str, Any]) -> dict[str, Any]:
+    """An event but for what depends on how fast it was played, and on its place among the messages."""
+    return {name: value for name, value in event.items() if name not in ("latency_s", "start_s", "seq", "v")}
+
+
+def test_replay_reaches_subscribers_and_rest_as_it_would_be_offline() -> None:
+    with running_server(site_of()) as server:
+        subscriber, events_only = Subscriber(server), Subscriber(server, "?kinds=event")
+        play(server)
+        wait_until(lambda: len(subscriber.of("event")) == 2, "both events")
+        wait_until(lambda: len(events_only.of("event")) == 2, "both events")
+        rest = httpx.get(f"{server.url}/api/v1/events").json()["events"]
+        subscriber.close()
+        events_only.close()
+    events = subscriber.of("event")
+    assert [without_delays(event) for event in events] == [without_delays(event) for event in offline()]
+    assert [without_delays(event) for event in reversed(rest)] == [without_delays(event) for event in events]
+    for event, source in zip(events, scene().sources, strict=True):
+        assert math.dist(event["position_m"], source.position_m) < NEAR_M
+        updates = [m for m in subscriber.of("update") if m["event_id"] == event["id"]]
+        assert updates
+        assert all(math.dist(update["position_m"], source.position_m) < 2 * NEAR_M for update in updates)
+        assert all(m["seq"] < event["seq"] for m in updates)
+    numbers = [message["seq"] for message in subscriber.messages[1:]]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert {message["kind"] for message in subscriber.messages} == {"hello", "arrays", "update", "track", "event"}
+    assert {message["kind"] for message in events_only.messages} == {"hello", "event"}
+    states = [message["state"] for message in subscriber.of("track")]
+    assert states[0] == "new"
+    assert states[-1] == "end"
+
+
+def test_replay_twice_gives_the_same() -> None:
+    with running_server(site_of()) as server:
+        subscriber = Subscriber(server, "?kinds=event")
+        play(server)
+        play(server)
+        wait_until(lambda: len(subscriber.of("event")) == 4, "both events, twice")
+        stored = httpx.get(f"{server.url}/api/v1/events").json()["events"]
+        subscriber.close()
+    told = [without_delays(event) for event in subscriber.of("event")]
+    assert told[:2] == told[2:]
+    assert told[0] != told[1]
+    assert len(stored) == 2  # the same events, not four
+
+
+def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> None:
+    with running_server(site_of()) as server:
+        playing = Thread(target=play, args=(server, 2.0))
+        playing.start()
+        url = f"{server.url}/api/v1"
+        wait_until(lambda: httpx.get(f"{url}/map").status_code == 200, "a map")
+        picture, numbers = httpx.get(f"{url}/map"), httpx.get(f"{url}/map?format=float32&array=north&view=volume")
+        [track] = httpx.get(f"{url}/tracks").json()["tracks"]
+        site, arrays = httpx.get(f"{url}/site").json(), httpx.get(f"{url}/arrays").json()
+        playing.join()
+        after = httpx.get(f"{url}/site").json(), httpx.get(f"{url}/tracks").json(), httpx.get(f"{url}/map")
+    assert picture.headers["Content-Type"] == "image/png"
+    assert len(numbers.content) == 4 * 16 * 20 * 12
+    assert math.dist(track["position_m"], scene().sources[0].position_m) < 2 * NEAR_M
+    assert site["mode"] == "replay"
+    assert arrays["now_utc"].startswith("2026-01-01T00:00:0")
+    assert {array["state"] for array in arrays["arrays"]} == {"healthy"}
+    assert after[0]["mode"] == "live"
+    assert after[1]["tracks"] == []
+    assert after[2].status_code == 204
+
+
+def connected(server: Server, hello: wire.Hello) -> Link:
+    link = Link(server.engine.endpoint, hello, CLOCK)
+    link.wait_connected(lambda: False)
+    return link
+
+
+LIVE = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
+REPLAY = wire.Hello("replay", "run-2", {"south": 16000.0}, replay=True)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "reason"),
+    [(LIVE, REPLAY, "live nodes are connected; stop them first"), (REPLAY, LIVE, "a replay is running")],
+    ids=["live first", "replay first"],
+)
+def test_live_and_replay_do_not_mix(first: wire.Hello, second: wire.Hello, reason: str) -> None:
+    with running_server(site_of()) as server:
+        there, other = connected(server, first), connected(server, second)
+        assert there.connected
+        assert other.refused == reason
+        there.close(bye=True)
+
+        def let_in() -> bool:
+            other.service()
+            return other.connected
+
+        wait_until(let_in, "the place that has become free")
+        other.close(bye=True)
+        server.engine.wait_idle()
+
+
+def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
+    with running_server(site_of()) as server:
+        link = connected(server, LIVE)
+        link.send([frame(1, raster=1000)])
+
+        def state() -> dict[str, Any]:
+            link.service()
+            found: dict[str, Any] = httpx.get(f"{server.url}/api/v1/arrays").json()["arrays"][0]
+            return found
+
+        wait_until(lambda: state()["counters"]["rejected"] == 1, "the rejection")
+        assert state()["state"] == "degraded"
+        assert "behind the server's; set both by NTP" in state()["reason"]
+        link.close(bye=True)
+
+
+def test_trouble_of_a_device_is_seen_by_everyone() -> None:
+    with running_server(site_of()) as server:
+        subscriber = Subscriber(server, "?kinds=arrays")
+        link = connected(server, LIVE)
+        link.tell("input device 'UMC1820' is not connected")
+
+        def told() -> bool:
+            link.service()
+            return any(
+                m["arrays"][0]["reason"] == "input device 'UMC1820' is not connected" for m in subscriber.of("arrays")
+            )
+
+        wait_until(told, "the trouble")
+        subscriber.close()
+        link.close(bye=True)
+
+
+@pytest.mark.parametrize("query", ["", "?kinds=event"])
+def test_server_ends_while_someone_listens(query: str) -> None:
+    began_ns = CLOCK.now_ns()
+    with running_server(site_of()) as server:
+        subscriber = Subscriber(server, query)
+    assert CLOCK.now_ns() - began_ns < 5e9
+    subscriber.close()
+    assert subscriber.ended is not None
+    assert subscriber.ended.code == 1012  # service restart: come again
+
+
+def refused(changes: Changes) -> str:
+    with pytest.raises(BindError) as caught:
+        Server(site_of(changes), CLOCK)
+    return str(caught.value)
+
+
+def test_addresses_that_are_taken() -> None:
+    with running_server(site_of()) as server:
+        port = int(server.url.rpartition(":")[2])
+        assert refused({"server.http.port": port}) == (
+            f"server.http: cannot listen on 127.0.0.1:{port}: Address already in use; is another server running? "
+            "Stop it or choose another port"
+        )
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            free = int(probe.getsockname()[1])
+        said = refused({"server.bind": server.engine.endpoint, "server.http.port": free})
+        assert said.startswith(f"server.bind: cannot listen on {server.engine.endpoint}: Address already in use")
+    with running_server(site_of({"server.http.port": free})):
+        pass  # the failed start has given its port back
+
+
+def test_host_that_is_not_ours() -> None:
+    assert "cannot listen on 192.0.2.1:0" in refused({"server.http.host": "192.0.2.1"})
+
+
+def test_address_of_version_six() -> None:
+    with running_server(site_of({"server.http.host": "::1"})) as server:
+        assert server.url.startswith("http://[::1]:")
+        assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
+
+
+def test_database_outlives_the_server(tmp_path: Path) -> None:
+    site = site_of({"server.events_db": str(tmp_path / "events.db")})
+    with running_server(site) as server:
+        play(server)
+        wait_until(lambda: server.engine.events == 2, "both events")
+    with running_server(site) as server:
+        stored = httpx.get(f"{server.url}/api/v1/events").json()["events"]
+        assert len(stored) == 2
+        assert server.engine.events == 0
+
+
+def test_database_that_cannot_be_used(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"server\.events_db: cannot use"):
+        Server(site_of({"server.events_db": str(tmp_path)}), CLOCK)
+
+
+def test_events_are_handed_on_too() -> None:
+    taken: list[dict[str, Any]] = []
+    server = Server(site_of(), CLOCK, on_event=taken.append)
+    thread = Thread(target=server.run)
+    thread.start()
+    play(server)
+    server.stop()
+    thread.join(timeout=10)
+    assert [event["id"] for event in taken] == [event["id"] for event in offline()]
