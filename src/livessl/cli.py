@@ -456,7 +456,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     try:
-        with _bar(f"evaluating {arguments.experiment}", "position") as bar:
+        with progress.counted(f"evaluating {arguments.experiment}", "position") as bar:
             written = evaluation.run(arguments, arguments.jobs or os.cpu_count() or 1, bar)
     except ValueError as error:
         _complain(str(error))
