@@ -130,9 +130,8 @@ def tetrahedron_in_cube(edge_m: float) -> FloatArray:
 
     Mirrored in any axis it takes the other vertices, so that two at 0 m are the cube's eight.
     """
-    return np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) * (
-        edge_m / np.sqrt(8.0)
-    )
+    vertices = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+    return np.asarray(vertices * (edge_m / np.sqrt(8.0)))
 
 
 def pair(centre_m: FloatArray, axis: int, separation_m: float) -> tuple[ArraySpec, ArraySpec]:
