@@ -15,6 +15,15 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("experiment", choices=sorted(EXPERIMENTS))
     parser.add_argument("--events", type=Path, required=True, metavar="DIR", help="clips named like doorslam001.wav")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; a run that was cut resumes")
+    parser.add_argument(
+        "--with",
+        dest="others",
+        action="append",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="another experiment's --out, to be reported together; may be given more than once",
+    )
     parser.add_argument("--positions", type=_whole, metavar="N", help="of the source (default: as many as the paper)")
     parser.add_argument("--rt", metavar="S,S,…", help="reverberation times, seconds; 0:2:0.2 is a range")
     parser.add_argument("--seed", type=int, default=0, help="same seed, same results (default 0)")
@@ -80,7 +89,11 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
     results = run_campaign(
         Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress
     )
-    return [results]
+    try:
+        from livessl.evaluate.report import write_report
+    except ImportError as error:
+        raise ValueError(f"the report needs more packages: pip install 'livessl[evaluate]' ({error})") from error
+    return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
 
 
 def reverberation_times_s(text: str) -> tuple[float, ...]:
