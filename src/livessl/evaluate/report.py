@@ -1,4 +1,4 @@
-"""The report: what was run, what the claims came to, the medians, the figures. Markdown, HTML and CSV of one content."""
+"""The report: what was run, what the claims came to, medians and figures. Markdown, HTML and CSV of one content."""
 
 from __future__ import annotations
 
