@@ -9,8 +9,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,15 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import soundfile
 
 from livessl import __version__
+from livessl.capture.link import Link
 from livessl.cli import main
 from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.server.receiver import Receiver
 from livessl.session import read_session
+from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
 COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices")
@@ -241,8 +244,6 @@ def test_locate_for_people(run: Run, recorded: Recorded) -> None:
 
 def test_locate_by_chosen_channels(run: Run, recorded: Recorded, tmp_path: Path) -> None:
     """Eight channels of another order, told which: the answers do not change."""
-    import soundfile
-
     samples = soundfile.read(recorded.directory / "north.wav", dtype="float32")[0].T
     shuffled = np.vstack([hiss(samples.shape[1] / RATE_HZ, 4), samples[[3, 2, 1, 0]]])
     path = write_wav(tmp_path / "n.wav", shuffled)
@@ -259,8 +260,7 @@ def test_silence_is_no_failure_and_no_riddle(run: Run, recorded: Recorded, tmp_p
     assert done.err.startswith("livessl: note: no sound found: ")
 
 
-@contextmanager
-def bad_file(path: Path, name: str) -> Iterator[Path]:
+def bad_file(path: Path, name: str) -> Path:
     good = hiss(0.5)
     if name == "too few channels":
         write_wav(path, good[:3])
@@ -275,7 +275,7 @@ def bad_file(path: Path, name: str) -> Iterator[Path]:
         write_wav(path, 0 * good)
     elif name == "no sound file":
         path.write_text("dear diary", encoding="utf-8")
-    yield path
+    return path
 
 
 BAD_FILES = {
@@ -297,8 +297,8 @@ def test_file_that_does_not_fit(run: Run, recorded: Recorded, tmp_path: Path, na
         "capture": ["--node", "lab-pc"],
         "record": ["--node", "lab-pc", "--out", tmp_path / "out"],
     }
-    with bad_file(tmp_path / "n.wav", name) as path:
-        done = run(command, "--site", recorded.site, *options[command], "--wav", f"north={path}")
+    path = bad_file(tmp_path / "n.wav", name)
+    done = run(command, "--site", recorded.site, *options[command], "--wav", f"north={path}")
     assert done.code == 2
     assert done.out == ""
     [line] = done.err.splitlines()
@@ -384,9 +384,6 @@ def test_replay_of_no_session(run: Run, tmp_path: Path) -> None:
 
 
 def test_replay_into_a_server_that_is_live(run: Run, recorded: Recorded) -> None:
-    from livessl.capture.link import Link
-    from livessl.wire import Hello
-
     with running_server(site_of()) as server:
         link = Link(server.engine.endpoint, Hello("lab-pc", "run", {"north": float(RATE_HZ)}), SystemClock())
         link.wait_connected(lambda: False)
@@ -546,14 +543,17 @@ def test_signals_end_everything_cleanly(recorded: Recorded, tmp_path: Path) -> N
     )
     other = tmp_path / "other"
     other.mkdir()
-    start = ["--start-at", utc_text(SystemClock().now_ns())]
+    starts = {"north": SystemClock().now_ns(), "south": SystemClock().now_ns() + 3_600_000_000_000}
     with ExitStack() as stack:
 
         def command(*arguments: object) -> Process:
             return stack.enter_context(Process(tmp_path, *arguments))
 
         servers = [command("serve", "--site", site), command("serve", "--site", write_site(other))]
-        nodes = [command("capture", "--site", site, "--node", f"{name}-pc", *start) for name in ("north", "south")]
+        nodes = [
+            command("capture", "--site", site, "--node", f"{name}-pc", "--start-at", utc_text(start_ns))
+            for name, start_ns in starts.items()  # one plays, the other waits
+        ]
         urls = [server.wait_for(r"dashboard on (http://\S+)")[1] for server in servers]
         for node in nodes:
             node.wait_for("connected to the server")

@@ -7,10 +7,10 @@ import time
 from datetime import UTC, datetime, timedelta
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from livessl.clock import PacedClock, SystemClock, UnpacedClock, utc_ns, utc_text
+from livessl.clock import LONGEST_SLEEP_S, PacedClock, SystemClock, UnpacedClock, utc_ns, utc_text
 
 NS = 1_000_000_000
 
@@ -42,12 +42,14 @@ def test_text_that_is_no_instant(text: str) -> None:
 
 
 @given(st.text())
+@settings(deadline=None)
 def test_any_text_is_an_instant_or_a_value_error(text: str) -> None:
     with contextlib.suppress(ValueError):
         utc_ns(text)
 
 
 @given(st.datetimes(min_value=datetime(1970, 1, 1), max_value=datetime(2262, 1, 1)))  # noqa: DTZ001 - bounds are naive
+@settings(deadline=None)
 def test_text_and_back_to_the_microsecond(moment: datetime) -> None:
     microseconds = (moment.replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
     assert utc_ns(utc_text(microseconds * 1000)) == microseconds * 1000
@@ -58,21 +60,21 @@ def test_system_clock_is_utc_and_waits() -> None:
     clock = SystemClock()
     assert abs(clock.now_ns() - datetime.now(UTC).timestamp() * 1e9) < 1e9
     until_ns = clock.now_ns() + 20_000_000
-    clock.sleep_until_ns(until_ns)
+    assert clock.sleep_until_ns(until_ns)
     assert clock.now_ns() >= until_ns
 
 
 @pytest.mark.parametrize("clock", [SystemClock(), PacedClock(100 * NS), UnpacedClock(100 * NS)])
 def test_what_is_past_is_not_waited_for(clock: SystemClock | PacedClock | UnpacedClock) -> None:
     began = time.monotonic()
-    clock.sleep_until_ns(clock.now_ns() - NS)
+    assert clock.sleep_until_ns(clock.now_ns() - NS)
     assert time.monotonic() - began < 0.5
 
 
 def test_paced_clock_runs_at_its_speed() -> None:
     began = time.monotonic_ns()
     clock = PacedClock(100 * NS, speed=50.0)
-    clock.sleep_until_ns(102 * NS)
+    assert clock.sleep_until_ns(102 * NS)
     assert clock.now_ns() >= 102 * NS
     took_ns = time.monotonic_ns() - began
     # 2 s at fifty times the speed are 40 ms; it may oversleep, never wake too early
@@ -88,6 +90,14 @@ def test_paced_clock_needs_a_speed(speed: float) -> None:
 def test_unpaced_clock_jumps_and_never_goes_back() -> None:
     clock = UnpacedClock(5)
     assert clock.now_ns() == 5
-    clock.sleep_until_ns(10 * NS)
-    clock.sleep_until_ns(9 * NS)
+    assert clock.sleep_until_ns(10 * NS)
+    assert clock.sleep_until_ns(9 * NS)
     assert clock.now_ns() == 10 * NS
+
+
+@pytest.mark.parametrize("clock", [SystemClock(), PacedClock(0, speed=3600.0)])
+def test_long_waits_are_waited_for_in_pieces(clock: SystemClock | PacedClock) -> None:
+    """So that who waits for an hour can be stopped within a moment."""
+    began = time.monotonic()
+    assert not clock.sleep_until_ns(clock.now_ns() + 3600 * NS)
+    assert LONGEST_SLEEP_S <= time.monotonic() - began < 5 * LONGEST_SLEEP_S

@@ -462,7 +462,7 @@ WHOLE = small(
 
 
 @given(DATA)
-@settings(max_examples=100)
+@settings(max_examples=100, deadline=None)
 def test_any_data_is_a_site_or_a_config_error(data: Any) -> None:
     with suppress(ConfigError):
         parse_site(yaml.safe_dump(data, allow_unicode=False))
@@ -485,6 +485,7 @@ def test_any_value_anywhere_is_fine_or_a_config_error(
 
 
 @given(st.text())
+@settings(deadline=None)
 def test_any_text_is_a_site_or_a_config_error(text: str) -> None:
     with suppress(ConfigError):
         parse_site(text)

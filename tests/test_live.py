@@ -138,8 +138,8 @@ def live(session: Session) -> LiveRun:
             command = [*LIVESSL, "capture", "--site", str(session.site), "--node", node, "--wav", wav]
             nodes.append(subprocess.Popen(command))
         watch_in_browser(session, seen, nodes)
-        for node in nodes:
-            assert node.wait(timeout=20) == 0
+        for process in nodes:
+            assert process.wait(timeout=20) == 0
         listener_deadline = time.monotonic() + 5
         while len(seen.events) < COUNT and time.monotonic() < listener_deadline:
             time.sleep(0.1)
@@ -147,9 +147,9 @@ def live(session: Session) -> LiveRun:
             seen.site = json.load(answer)
         seen.curl_clients = curl_examples(session)
     finally:
-        for process in [*nodes, server]:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
+        for service in [*nodes, server]:
+            if service.poll() is None:
+                service.send_signal(signal.SIGTERM)
         assert server.wait(timeout=5) == 0
         for client in clients:
             client.send_signal(signal.SIGTERM)

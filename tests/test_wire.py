@@ -99,6 +99,7 @@ def refusal(data: bytes) -> str:
 
 
 @given(FRAMES | MARKS | HELLOS | ACKS | BYES)
+@settings(deadline=None)
 def test_round_trip(message: WireMessage) -> None:
     data = encode(message)
     assert len(data) <= wire.MAX_MESSAGE_BYTES
@@ -139,7 +140,7 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
 
 
 @given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
-@settings(max_examples=500)
+@settings(max_examples=500, deadline=None)
 def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
     for data in (body, struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + body):
         with contextlib.suppress(WireError):
@@ -162,7 +163,7 @@ JSON_VALUES = st.recursive(
 @given(
     st.sampled_from([(3, "node run_id arrays replay problem"), (4, "run_id sequences who_are_you refused")]), st.data()
 )
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
     kind, names = form
     fields = {name: data.draw(JSON_VALUES) for name in names.split()}

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime, timedelta
-from typing import Protocol
+from typing import Final, Protocol
+
+LONGEST_SLEEP_S: Final = 0.1
+"""Whoever waits looks up so often: to keep a connection alive, or because he was told to stop."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -16,8 +19,8 @@ class Clock(Protocol):
         """Nanoseconds since the epoch, UTC."""
         ...
 
-    def sleep_until_ns(self, time_ns: int) -> None:
-        """Return at that site time, or at once if it is past."""
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        """Return at that site time, or after `LONGEST_SLEEP_S`; whether it has come."""
         ...
 
 
@@ -28,11 +31,9 @@ class SystemClock:
         """Nanoseconds since the epoch, UTC."""
         return time.time_ns()
 
-    def sleep_until_ns(self, time_ns: int) -> None:
+    def sleep_until_ns(self, time_ns: int) -> bool:
         """Sleep the difference, so that a schedule's errors never add up."""
-        difference = time_ns - time.time_ns()
-        if difference > 0:
-            time.sleep(difference / 1e9)
+        return _sleep((time_ns - time.time_ns()) / 1e9)
 
 
 class PacedClock:
@@ -49,11 +50,9 @@ class PacedClock:
         """Nanoseconds since the epoch, in the replayed time."""
         return self._start_ns + round((time.monotonic_ns() - self._began_ns) * self._speed)
 
-    def sleep_until_ns(self, time_ns: int) -> None:
+    def sleep_until_ns(self, time_ns: int) -> bool:
         """Sleep until the replayed time gets there."""
-        difference = (time_ns - self.now_ns()) / self._speed
-        if difference > 0:
-            time.sleep(difference / 1e9)
+        return _sleep((time_ns - self.now_ns()) / self._speed / 1e9)
 
 
 class UnpacedClock:
@@ -66,9 +65,10 @@ class UnpacedClock:
         """The latest time waited for, nanoseconds."""
         return self._now_ns
 
-    def sleep_until_ns(self, time_ns: int) -> None:
+    def sleep_until_ns(self, time_ns: int) -> bool:
         """Be there at once."""
         self._now_ns = max(self._now_ns, time_ns)
+        return True
 
 
 def utc_text(time_ns: int) -> str:
@@ -92,3 +92,9 @@ def utc_ns(text: str) -> int:
     if instant is None or instant.tzinfo is None:
         raise ValueError(f"time: expected RFC 3339 with an offset such as 2026-01-31T12:00:00Z, got {text!r}")
     return (instant - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def _sleep(seconds: float) -> bool:
+    if seconds > 0:
+        time.sleep(min(seconds, LONGEST_SLEEP_S))
+    return seconds <= LONGEST_SLEEP_S

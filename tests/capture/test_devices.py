@@ -162,6 +162,26 @@ def test_no_block_is_played_before_it_is_complete() -> None:
     assert len(seen) == 20
 
 
+class Sleeper(UnpacedClock):
+    """It never sleeps longer than 70 ms at a time."""
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        return super().sleep_until_ns(min(time_ns, self.now_ns() + 70_000_000)) and self.now_ns() >= time_ns
+
+
+def test_whoever_waits_for_sound_hears_of_it() -> None:
+    """Before the beginning and in a gap come empty blocks, so that a listener can look up."""
+    spliced = Spliced((Placed(recording(0.04), START_NS), Placed(recording(0.04), START_NS + NS)))
+    clock = Sleeper(START_NS - NS)
+    last_ns, heard = START_NS - NS, []
+    for now_ns, _, block in played([Placed(spliced, START_NS)], clock):
+        assert now_ns - last_ns <= 70_000_000
+        last_ns = now_ns
+        heard.append(block.samples.shape[1])
+    assert [n for n in heard if n] == [320] * 4
+    assert heard.count(0) == 14 + 13  # a second and 20 ms; then a second less 20 ms
+
+
 def test_looped_goes_on_without_a_gap() -> None:
     once = recording(0.05)  # not a whole number of blocks
     looped = Looped(once)

@@ -6,6 +6,7 @@ import json
 import math
 import socket
 from contextlib import ExitStack
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from threading import Thread
@@ -18,11 +19,13 @@ from websockets.frames import Close
 from websockets.sync.client import connect
 
 from livessl import replay, wire
+from livessl.capture.devices import Placed, Spliced
 from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
-from livessl.core.types import Event
+from livessl.core.types import FRAME_NS, Event
 from livessl.messages import Messages
+from livessl.server import engine
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
@@ -146,6 +149,55 @@ def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> Non
     assert after[0]["mode"] == "live"
     assert after[1]["tracks"] == []
     assert after[2].status_code == 204
+
+
+def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine seconds without sound at six times the speed, and a server that soon loses its patience."""
+    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
+    twice = [
+        replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
+        for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
+    ]
+    with running_server(site_of()) as server:
+        send_session(site_of(), server.engine.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
+        server.engine.wait_idle()
+        stored = httpx.get(f"{server.url}/api/v1/events").json()["events"][::-1]
+    assert len(stored) == 4
+    assert stored[0]["position_m"] == stored[2]["position_m"]
+    assert stored[2]["start_s"] - stored[0]["start_s"] == pytest.approx(gap_ns / 1e9)
+
+
+def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    with running_server(site_of()) as server:
+        link = connected(server, REPLAY)
+        wait_until(lambda: server.engine.mode == "replay", "the replay")
+        link.close(bye=False)
+        wait_until(lambda: server.engine.mode == "live", "its end")
+        live = connected(server, LIVE)
+        assert live.connected
+        live.close(bye=True)
+
+
+def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
+    """An open file or database would be a ResourceWarning here."""
+    changes: Changes = {
+        "server.sinks": [{"type": "jsonl", "path": str(tmp_path / "events.jsonl")}],
+        "server.events_db": str(tmp_path / "events.db"),
+    }
+    with running_server(site_of()) as server:
+        refused(changes | {"server.bind": server.engine.endpoint})
+    with pytest.raises(StoreError):
+        Server(site_of(changes | {"server.events_db": str(tmp_path)}), CLOCK)
+
+
+def test_events_are_written_as_lines(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    with running_server(site_of({"server.sinks": [{"type": "jsonl", "path": str(path)}]})) as server:
+        play(server)
+        stored = httpx.get(f"{server.url}/api/v1/events").json()["events"][::-1]
+    assert [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] == stored
 
 
 def connected(server: Server, hello: wire.Hello) -> Link:

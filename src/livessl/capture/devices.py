@@ -186,9 +186,13 @@ def merged(placed: Sequence[Placed]) -> Iterator[tuple[int, int, Block]]:
 
 
 def played(placed: Sequence[Placed], clock: Clock) -> Iterator[tuple[int, int, Block]]:
-    """`merged`, each block not before it would be complete: an ideal schedule, so that lateness never adds up."""
+    """`merged`, each block not before it would be complete: an ideal schedule, so that lateness never adds up.
+
+    As long as there is nothing to hear, empty blocks come instead.
+    """
     for end_ns, line, block in merged(placed):
-        clock.sleep_until_ns(end_ns)
+        while not clock.sleep_until_ns(end_ns):
+            yield clock.now_ns(), line, Block(block.first_index, block.samples[:, :0], block.stamp_ns)
         yield end_ns, line, block
 
 

@@ -18,7 +18,7 @@ SPOOL_BYTES: Final = 64 * 1024 * 1024
 """Sound kept for a server that is away: half a minute of six arrays. Oldest first out, counted."""
 
 HELLO_NS: Final = 1_000_000_000
-"""How often a node introduces itself while nobody answers."""
+"""How often a node introduces itself while nobody answers, or while it has nothing else to say."""
 
 SILENT_NS: Final = 2_000_000_000
 """The server acknowledges at least twice a second; so long without a word means that it is gone."""
@@ -65,7 +65,7 @@ class Link:
         self._unsent: deque[_Kept] = deque()
         self._unacknowledged: deque[_Kept] = deque()
         self._bytes = 0
-        self._heard_ns = self._hello_ns = -SILENT_NS
+        self._heard_ns = self._hello_ns = self._sent_ns = -SILENT_NS
         self._greeted = False
         self._complaint: str | None = None
         self.dropped = 0
@@ -116,6 +116,8 @@ class Link:
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()
             return
+        if not self._unsent and now_ns - self._sent_ns >= HELLO_NS:
+            self._say_hello()  # no sound for a while, but we are there
         while self._unsent:
             kept = self._unsent[0]
             if not self._try_send(kept.data):
@@ -199,4 +201,5 @@ class Link:
             self._socket.send(data, zmq.NOBLOCK)
         except zmq.Again:
             return False
+        self._sent_ns = self._clock.now_ns()
         return True

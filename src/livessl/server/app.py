@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -58,14 +59,15 @@ class Server:
         self._on_event = on_event
         self._hub = Hub()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._http = _listen(site.server.http.host, site.server.http.port)
-        try:
+        with ExitStack() as undo:  # what is open when a later step fails
+            self._http = _listen(site.server.http.host, site.server.http.port)
+            undo.callback(self._http.close)
             self._sinks = Sinks(site.server.sinks)
+            undo.callback(self._sinks.close)
             self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
+            undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish, method)
-        except BaseException:
-            self._http.close()
-            raise
+            undo.pop_all()
         app = create_app(site, self.engine, self._hub, self._store)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(

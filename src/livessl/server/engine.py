@@ -26,7 +26,7 @@ STATUS_NS: Final = 500_000_000
 """Between two reports on the arrays."""
 
 REPLAY_SILENT_NS: Final = 5_000_000_000
-"""A replay that sends nothing for so long is over."""
+"""A replay that sends nothing for so long is over, unless its node still says that it is there."""
 
 _log = logging.getLogger(__name__)
 
@@ -174,7 +174,10 @@ class Engine:
         if batch:
             self._replay_heard_ns = now_ns
         elif self._replay_now_ns is not None and now_ns - self._replay_heard_ns > REPLAY_SILENT_NS:
-            self._end_replay()
+            if any(hello.replay for hello in self._receiver.ingest.live_nodes(now_ns)):
+                self._replay_heard_ns = now_ns  # a gap in the recording
+            else:
+                self._end_replay()
         if now_ns - self._status_ns >= STATUS_NS:
             self._status_ns = now_ns
             self._publish({"kind": "arrays", "now_utc": utc_text(self.now_ns()), "arrays": self.arrays()})
