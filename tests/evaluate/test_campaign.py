@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -96,6 +97,18 @@ def test_more_positions_go_on_where_fewer_ended(tmp_path: Path) -> None:
     assert table.num_rows == 2 * first.num_rows
     one, other = (set(table.column("x_m").to_pylist()[part]) for part in (slice(0, 24), slice(24, 48)))
     assert one.isdisjoint(other)  # two places
+
+
+def test_joined_results_alone_are_enough_to_go_on(tmp_path: Path) -> None:
+    run_campaign(small_job(tmp_path / "sounds", 2), tmp_path / "moved", jobs=1)
+    shutil.rmtree(tmp_path / "moved" / "parts")
+    seen: list[tuple[int, int]] = []
+    moved = run_campaign(
+        small_job(tmp_path / "sounds", 3), tmp_path / "moved", jobs=1, progress=lambda *done: seen.append(done)
+    )
+    assert seen[0] == (2, 3)
+    whole = run_campaign(small_job(tmp_path / "sounds", 3), tmp_path / "whole", jobs=1)
+    assert moved.read_bytes() == whole.read_bytes()
 
 
 def test_another_campaign_is_not_mixed_in(tmp_path: Path) -> None:

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluate.small_campaign import small_job
+from evaluate.small_campaign import CLASSES, small_job, write_sounds
 from livessl.core.activity import band_bins
 from livessl.core.frontends import whole_segment
 from livessl.core.gcc import CrossSpectra, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.srp import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.evaluate.campaign import read_clips
 from livessl.evaluate.maps import PairMatrices, PairTables, reach_samples
-from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, pair, tetrahedron_in_cube
+from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, pair, tetrahedron_in_cube
 from livessl.evaluate.unit import Position, active_segment, t30_s
 from livessl.simulate.room import impulse_responses
 
@@ -99,6 +100,18 @@ def test_dry_and_small_it_finds_the_direction(tmp_path: Path) -> None:
     dry = [row for row in rows if row["rt60_s"] == 0.0 and row["system"] == "small" and row["method"] == "srp-phat"]
     # a cell of 1 m is 1/3 rad wide at 3 m: half of it is 10 degrees; one in four may be nearer
     assert np.median([abs(row["azimuth_deg"]) for row in dry]) < 10.0
+
+
+def test_sampling_faster_changes_hardly_anything(tmp_path: Path) -> None:
+    found = []
+    for rate_hz in (16000.0, 44100.0):
+        settings = Settings("one-array", 6, (0.0,), seed=5, spacing_m=1.0, sample_rate_hz=rate_hz)
+        position = Position(settings, read_clips(write_sounds(tmp_path), CLASSES, rate_hz))
+        rows = [row for number in range(6) for row in position.rows(number) if row["method"] == "srp-phat"]
+        found.append(np.array([[row[f"found_{axis}_m"] for axis in "xyz"] for row in rows]))
+    # the same nodes, but for places between two where rounding to another raster of 50 ms decides
+    assert (found[0] == found[1]).all(axis=1).mean() > 0.8
+    assert len(np.unique(found[0], axis=0)) > 3
 
 
 def test_eight_microphones_are_the_vertices_of_a_cube() -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import resource
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -114,6 +115,8 @@ def run_campaign(
 ) -> Path:
     """Compute the positions that `out` does not hold yet, then join all of them in `results.parquet`.
 
+    Positions are held in `parts/`; where that is gone, `results.parquet` with `campaign.json` is as good.
+
     Whoever computes them, in whatever order, after however many interruptions: the bytes are the same.
 
     Parameters
@@ -136,6 +139,7 @@ def run_campaign(
     parts = out / "parts"
     _claim(out, job)
     parts.mkdir(exist_ok=True)
+    _unpack(out / "results.parquet", parts)
     total = job.settings.positions
     wanted = [number for number in range(total) if not _part(parts, number).exists()]
     finished = total - len(wanted)
@@ -205,6 +209,7 @@ def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
 
 
 def _begin(job: Job) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
     _sent[:] = [job]
     parent = parent_process()
     assert parent is not None
@@ -246,6 +251,20 @@ def _claim(out: Path, job: Job) -> None:
     sounds = {name: [clip for clip, _ in clips] for name, clips in job.clips.items()}
     text = json.dumps({"digest": job.digest, "settings": asdict(job.settings), "sounds": sounds}, indent=1)
     _write(path, text.encode())
+
+
+def _unpack(results: Path, parts: Path) -> None:
+    """Make the parts that results were joined from, where they are not there."""
+    if not results.exists():
+        return
+    table = pq.read_table(results, schema=SCHEMA)
+    numbers, first, counts = np.unique(table.column("position").to_numpy(), return_index=True, return_counts=True)
+    for number, start, count in zip(numbers, first, counts, strict=True):
+        path = _part(parts, int(number))
+        if not path.exists():
+            buffer = BytesIO()
+            pq.write_table(table.slice(int(start), int(count)), buffer, compression="zstd")
+            _write(path, buffer.getvalue())
 
 
 def _joined(out: Path, parts: list[Path]) -> Path:

@@ -30,6 +30,9 @@ FRONT_ENDS: Final[Mapping[str, FrontEnd]] = {
 PEAK: Final = 0.5
 """Largest sample of a system's recording before it is rounded to 16 bits: 6 dB of headroom."""
 
+LAG_RATE_HZ: Final = 14000.0
+"""Least rate of the lags kept: correlations that end at 6 kHz need 12 kHz, however fast the sound was sampled."""
+
 Clips = Mapping[str, tuple[tuple[str, Float32Array], ...]]
 """Class of sound -> its clips: name and samples (n,), at the campaign's sample rate."""
 
@@ -59,6 +62,7 @@ class Position:
     settings: Settings
     clips: Clips
     grid: Grid = field(init=False)
+    _every: int = field(init=False)
     _mapper: Mapper = field(init=False)
     _microphones_m: FloatArray = field(init=False)
     _channels: list[list[int]] = field(init=False)
@@ -66,9 +70,10 @@ class Position:
     def __post_init__(self) -> None:
         experiment = EXPERIMENTS[self.settings.experiment]
         self.grid = experiment.grid(self.settings.spacing_m)
-        rate_hz, band_limit = self.settings.sample_rate_hz, self.settings.band_limit
+        self._every = max(1, int(self.settings.sample_rate_hz // LAG_RATE_HZ))
+        lag_rate_hz, band_limit = self.settings.sample_rate_hz / self._every, self.settings.band_limit
         make = PairMatrices if self.grid.size <= MATRIX_NODES else PairTables
-        self._mapper = make(self.grid, rate_hz, C_M_S, band_limit=band_limit)
+        self._mapper = make(self.grid, lag_rate_hz, C_M_S, band_limit=band_limit)
         every = np.round(np.vstack([system.microphones_m for system in experiment.systems]), 9)
         self._microphones_m, inverse = np.unique(every, axis=0, return_inverse=True)
         ends = np.cumsum([len(system.microphones_m) for system in experiment.systems])
@@ -129,10 +134,10 @@ class Position:
             first = 0
             for spec in system.arrays:
                 count = len(spec.microphones_m)
-                reach = reach_samples(spec.aperture_m, rate_hz, C_M_S)
+                reach = self._every * reach_samples(spec.aperture_m, rate_hz / self._every, C_M_S)
                 spectra = FRONT_ENDS[method](segment[first : first + count], rate_hz, reach)
                 cross = CrossSpectra(spectra, microphone_pairs(count), rate_hz, spec.band_hz)
-                lags.append(np.ascontiguousarray(cross.correlations(reach).real))
+                lags.append(np.ascontiguousarray(cross.correlations(reach).real[:, :: self._every]))
                 first += count
             kept.append(_Heard(method, (stop - start) / rate_hz, lags))
         return tuple(kept)
