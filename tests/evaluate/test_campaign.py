@@ -111,6 +111,19 @@ def test_joined_results_alone_are_enough_to_go_on(tmp_path: Path) -> None:
     assert moved.read_bytes() == whole.read_bytes()
 
 
+def test_report_alone_joins_what_was_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "one", jobs=1)
+    assert main(["evaluate", "report", "--with", str(tmp_path / "one"), "--out", str(tmp_path / "docs")]) == 0
+    written = [Path(line) for line in capsys.readouterr().out.split()]
+    assert {path.name for path in written} == {"summary.csv", "claims.csv", "claims.md", "report.md", "report.html"}
+    figures = {path.name for path in (tmp_path / "docs" / "figures").iterdir()}
+    assert {"one-array.png", "one-array.svg", "gcc.png", "topology.svg", "maps-pair.png"} <= figures
+    assert "office.png" not in figures
+    assert main(["evaluate", "report", "--out", str(tmp_path / "docs")]) == 2
+    assert main(["evaluate", "one-array", "--out", str(tmp_path / "docs")]) == 2
+    assert capsys.readouterr().err.count("livessl: error") == 2
+
+
 def test_another_campaign_is_not_mixed_in(tmp_path: Path) -> None:
     run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "out", jobs=1)
     with pytest.raises(ValueError, match="expected an empty folder or the same campaign"):

@@ -5,15 +5,22 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings
+
+REPORT: Final = "report"
+"""Runs nothing: reports campaigns that were run."""
 
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments to an argparse parser."""
-    parser.add_argument("experiment", choices=sorted(EXPERIMENTS))
-    parser.add_argument("--events", type=Path, required=True, metavar="DIR", help="clips named like doorslam001.wav")
+    parser.add_argument(
+        "experiment",
+        choices=[*sorted(EXPERIMENTS), REPORT],
+        help=f"{REPORT}: only what --with names, reported together",
+    )
+    parser.add_argument("--events", type=Path, metavar="DIR", help="clips named like doorslam001.wav")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; a run that was cut resumes")
     parser.add_argument(
         "--with",
@@ -78,21 +85,26 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
     ValueError
         Where an argument, a sound or the folder is not as it must be, or an extra is not installed.
     """
-    settings = settings_of(arguments)
     try:
         from livessl.evaluate.campaign import Job, read_clips, run_campaign
+        from livessl.evaluate.report import write_report
     except ImportError as error:
         raise ValueError(f"evaluate needs more packages: pip install 'livessl[evaluate]' ({error})") from error
 
+    if arguments.experiment == REPORT:
+        if not arguments.others:
+            raise ValueError(
+                "evaluate report: expected one or more folders of campaigns, got none; name them by --with"
+            )
+        return write_report(arguments.out, arguments.others)
+    if arguments.events is None:
+        raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
+    settings = settings_of(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     results = run_campaign(
         Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress
     )
-    try:
-        from livessl.evaluate.report import write_report
-    except ImportError as error:
-        raise ValueError(f"the report needs more packages: pip install 'livessl[evaluate]' ({error})") from error
     return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
 
 
