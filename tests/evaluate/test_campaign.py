@@ -16,9 +16,18 @@ import pytest
 
 from evaluate.small_campaign import CLASSES, small_job, write_sounds
 from livessl.cli import main
+from livessl.evaluate import campaign
 from livessl.evaluate.campaign import read_clips, run_campaign
 
 POSITIONS = 16
+
+
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute here, for tests of what is kept: a worker takes seconds to begin."""
+    monkeypatch.setattr(
+        campaign, "_by_processes", lambda job, wanted, jobs: (campaign.compute(job, number) for number in wanted)
+    )
 
 
 def arguments(sounds: Path, out: Path, jobs: int = 1) -> list[str]:
@@ -84,7 +93,7 @@ def test_a_dask_cluster_gives_the_same_rows(tmp_path: Path) -> None:
     assert there.read_bytes() == here.read_bytes()
 
 
-def test_more_positions_go_on_where_fewer_ended(tmp_path: Path) -> None:
+def test_more_positions_go_on_where_fewer_ended(one_process: None, tmp_path: Path) -> None:
     few = run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "out", jobs=1)
     first = pq.read_table(few)
     seen: list[tuple[int, int]] = []
@@ -99,7 +108,7 @@ def test_more_positions_go_on_where_fewer_ended(tmp_path: Path) -> None:
     assert one.isdisjoint(other)  # two places
 
 
-def test_joined_results_alone_are_enough_to_go_on(tmp_path: Path) -> None:
+def test_joined_results_alone_are_enough_to_go_on(one_process: None, tmp_path: Path) -> None:
     run_campaign(small_job(tmp_path / "sounds", 2), tmp_path / "moved", jobs=1)
     shutil.rmtree(tmp_path / "moved" / "parts")
     seen: list[tuple[int, int]] = []
@@ -111,7 +120,7 @@ def test_joined_results_alone_are_enough_to_go_on(tmp_path: Path) -> None:
     assert moved.read_bytes() == whole.read_bytes()
 
 
-def test_report_alone_joins_what_was_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_alone_joins_what_was_run(one_process: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "one", jobs=1)
     assert main(["evaluate", "report", "--with", str(tmp_path / "one"), "--out", str(tmp_path / "docs")]) == 0
     written = [Path(line) for line in capsys.readouterr().out.split()]
@@ -124,7 +133,7 @@ def test_report_alone_joins_what_was_run(tmp_path: Path, capsys: pytest.CaptureF
     assert capsys.readouterr().err.count("livessl: error") == 2
 
 
-def test_another_campaign_is_not_mixed_in(tmp_path: Path) -> None:
+def test_another_campaign_is_not_mixed_in(one_process: None, tmp_path: Path) -> None:
     run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "out", jobs=1)
     with pytest.raises(ValueError, match="expected an empty folder or the same campaign"):
         run_campaign(small_job(tmp_path / "sounds", 1, seed=6), tmp_path / "out", jobs=1)

@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
     """
     try:
         from livessl.evaluate.campaign import Job, read_clips, run_campaign
-        from livessl.evaluate.report import write_report
+        from livessl.evaluate.report import require_campaign, write_report
     except ImportError as error:
         raise ValueError(f"evaluate needs more packages: pip install 'livessl[evaluate]' ({error})") from error
 
@@ -99,6 +99,8 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
         return write_report(arguments.out, arguments.others)
     if arguments.events is None:
         raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
+    for folder in arguments.others:
+        require_campaign(folder)  # now, not when hours are over
     settings = settings_of(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)

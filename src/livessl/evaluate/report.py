@@ -75,10 +75,8 @@ def write_report(out: Path, folders: Sequence[Path]) -> list[Path]:
     campaigns: dict[str, Results] = {}
     about: dict[str, dict[str, Any]] = {}
     for folder in folders:
-        path = folder / "campaign.json"
-        if not (path.exists() and (folder / "results.parquet").exists()):
-            raise ValueError(f"{folder}: expected a finished campaign (campaign.json, results.parquet), got none")
-        settings = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        require_campaign(folder)
+        settings = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))["settings"]
         experiment = settings["experiment"]
         if experiment in campaigns:
             raise ValueError(f"{folder}: expected each experiment once, got {experiment} again")
@@ -100,6 +98,18 @@ def write_report(out: Path, folders: Sequence[Path]) -> list[Path]:
     for name, text in written.items():
         (out / name).write_text(text, encoding="utf-8")
     return [out / name for name in ("summary.csv", "claims.csv", *written)]
+
+
+def require_campaign(folder: Path) -> None:
+    """Refuse a folder that holds no finished campaign.
+
+    Raises
+    ------
+    ValueError
+        Then.
+    """
+    if not all((folder / name).exists() for name in ("campaign.json", "results.parquet")):
+        raise ValueError(f"{folder}: expected a finished campaign (campaign.json, results.parquet), got none")
 
 
 def as_markdown(blocks: Sequence[Block]) -> str:
