@@ -144,8 +144,11 @@ def test_t30_is_that_of_an_exponential_decay() -> None:
     decay = np.exp(-time_s * 3.0 * np.log(10.0) / 0.6)  # 60 dB in 0.6 s
     response = (np.random.default_rng(1).standard_normal(16000) * decay).astype(np.float32)
     # the level between -5 and -35 dB scatters by less than 1 dB of 30
-    assert t30_s(response, RATE_HZ) == pytest.approx(0.6, rel=0.03)
-    assert t30_s(np.eye(1, 500, 20, dtype=np.float32)[0], RATE_HZ) == 0.0
+    assert t30_s(response, RATE_HZ, BAND_HZ) == pytest.approx(0.6, rel=0.03)
+    rumble = np.cos(2.0 * np.pi * 20.0 * time_s) * 0.5 * np.exp(-time_s)  # rings for seconds below the band
+    assert t30_s((response + rumble).astype(np.float32), RATE_HZ, BAND_HZ) == pytest.approx(0.6, rel=0.05)
+    assert t30_s((response + rumble).astype(np.float32), RATE_HZ, (5.0, 6000.0)) > 1.0
+    assert t30_s(np.eye(1, 1600, 20, dtype=np.float32)[0], RATE_HZ, BAND_HZ) == 0.0
 
 
 def test_compiled_rooms_are_the_same_rooms() -> None:

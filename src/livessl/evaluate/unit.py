@@ -8,6 +8,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import scipy.fft
+from scipy.signal import butter, sosfilt
 
 from livessl.core.activity import exact_mask, runs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
@@ -15,7 +16,7 @@ from livessl.core.gcc import CrossSpectra, microphone_pairs
 from livessl.core.geometry import Grid, direction_deg
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, IntArray
 from livessl.evaluate.maps import PairMatrices, PairTables, reach_samples
-from livessl.evaluate.paper import C_M_S, EXPERIMENTS, Settings, System
+from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, System
 from livessl.simulate.room import impulse_responses
 
 Row = dict[str, Any]
@@ -96,7 +97,7 @@ class Position:
             own_lengths=True,
             compiled=True,
         )
-        decay_s = [t30_s(response[0], settings.sample_rate_hz) for response in responses]
+        decay_s = [t30_s(response[0], settings.sample_rate_hz, BAND_HZ) for response in responses]
         heads: list[Row] = []
         found: list[list[tuple[_Heard, ...]]] = [[] for _ in experiment.systems]
         for name, (clip, sound) in chosen.items():
@@ -184,14 +185,18 @@ def active_segment(samples: Float32Array, sample_rate_hz: float, which: str) -> 
     return start * frame, min(stop * frame, samples.shape[1])
 
 
-def t30_s(response: Float32Array, sample_rate_hz: float) -> float:
-    """Time of a decay by 60 dB, from the slope of Schroeder's integral, -5 to -35 dB (ISO 3382-1); 0 for none."""
-    left = np.cumsum(np.square(response[::-1], dtype=np.float64))[::-1]
+def t30_s(response: Float32Array, sample_rate_hz: float, band_hz: tuple[float, float]) -> float:
+    """Time of a decay by 60 dB, from Schroeder's integral, -5 to -35 dB (ISO 3382-1); 0 for none.
+
+    Inside the band: below it, where images only ever add, rooms of images ring longer.
+    """
+    inside = sosfilt(butter(4, band_hz, "bandpass", fs=sample_rate_hz, output="sos"), response.astype(np.float64))
+    left = np.cumsum(np.square(inside[::-1]))[::-1]
     with np.errstate(divide="ignore"):
         level_db = 10.0 * np.log10(left / left[0])
     used = np.flatnonzero((level_db <= -5.0) & (level_db >= -35.0))
-    if len(used) < 0.01 * sample_rate_hz:
-        return 0.0
+    if len(used) < 0.03 * sample_rate_hz:
+        return 0.0  # the filter's own ringing
     slope = np.polyfit(used / sample_rate_hz, level_db[used], 1)[0]
     return float(-60.0 / slope)
 
