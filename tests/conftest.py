@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("livessl", deadline=None)  # a busy machine is no fault of the code
+settings.load_profile("livessl")
 
 
 def require(condition: bool, reason: str) -> None:

@@ -14,7 +14,7 @@ import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from livessl import __version__, demo, progress, replay
 from livessl.capture.devices import DeviceError
@@ -35,6 +35,7 @@ from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
+from livessl.plan import design, figure, words
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
@@ -42,6 +43,8 @@ from livessl.server.store import StoreError
 from livessl.session import SESSION_FILE, read_session
 from livessl.simulate.export import write_scene
 from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
+
+T = TypeVar("T")
 
 OK: Final = 0
 FAILED: Final = 1
@@ -65,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, OSError) as error:
+    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -160,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--node", required=True, help="name of the node in the site file")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must not hold a session")
     sub.add_argument("--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV")
-    sub.add_argument("--duration", type=_seconds, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
+    sub.add_argument("--duration", type=_above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
     _add_wav(sub, "record FILE at real speed instead of the device: a rehearsal")
 
     sub = command(
@@ -185,6 +188,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluation.add_arguments(sub)
 
+    _add_plan(command)
+
     sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
     sub.add_argument("site", type=Path)
     sub.add_argument("--json", action="store_true", help="print the result as JSON")
@@ -192,6 +197,27 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("devices", _devices, "list audio devices", "livessl devices")
     sub.add_argument("--json", action="store_true", help="print the list as JSON")
     return parser
+
+
+def _add_plan(command: Callable[..., Any]) -> None:
+    sub = command(
+        "plan",
+        _plan,
+        "tell what error to expect where, and where arrays should go",
+        "livessl plan --site site.yaml --rt60 0.7 --out plan/",
+    )
+    _add_site(sub)
+    sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
+    sub.add_argument("--height", type=_not_negative, metavar="M", help="of the sounds (default 1.5, if searched)")
+    sub.add_argument(
+        "--calibration",
+        type=_above_zero,
+        default=design.CALIBRATION_M,
+        metavar="M",
+        help=f"how well the microphones' places are known (default {design.CALIBRATION_M:g})",
+    )
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
 
 
 def _add_site(parser: Any) -> None:
@@ -315,18 +341,19 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
         with progress.counted("simulating the room", "source") as bar:
             parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:
-        wavs = dict(arguments.wav)
+        wavs = _once_each(arguments.wav, "--wav")
         strangers = sorted(set(wavs) - set(site.nodes[arguments.node].arrays))
         if strangers:
             known = ", ".join(site.nodes[arguments.node].arrays)
             raise DeviceError(f"--wav {strangers[0]}=…: node {arguments.node!r} has the arrays {known}")
-        parts = parts_from_wavs(site, wavs, dict(arguments.channels), start_ns)
+        parts = parts_from_wavs(site, wavs, _once_each(arguments.channels, "--channels"), start_ns)
     return repeated(parts) if getattr(arguments, "loop", False) else parts
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
-    parts = parts_from_wavs(site, dict(arguments.wav), dict(arguments.channels))
+    wavs, channels = _once_each(arguments.wav, "--wav"), _once_each(arguments.channels, "--channels")
+    parts = parts_from_wavs(site, wavs, channels)
     messages = Messages(site, 0, utc=False)
     found = 0
     with progress.timed("listening", *span_ns(parts)) as bar:
@@ -466,6 +493,25 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def _plan(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    if arguments.out is not None:
+        figure.require_matplotlib()
+    try:
+        with progress.counted("trying places", "array") as bar:
+            plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
+    except ValueError as error:
+        _complain(str(error))
+        return WRONG_USE
+    result = words.as_json(plan)
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
+        figure.draw(plan, arguments.out / "plan.png")
+    print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))
+    return OK
+
+
 def _check(arguments: argparse.Namespace) -> int:
     try:
         site = load_site(arguments.site)
@@ -527,6 +573,14 @@ def _xyz(position: Sequence[float] | None) -> str:
     return "-" if position is None else "(" + ", ".join(f"{x:5.2f}" for x in position) + ")"
 
 
+def _once_each(pairs: Sequence[tuple[str, T]], option: str) -> dict[str, T]:
+    names = [name for name, _ in pairs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; take one away")])
+    return dict(pairs)
+
+
 def _assignment(text: str) -> tuple[str, Path]:
     name, equals, path = text.partition("=")
     if not (name and equals and path):
@@ -562,7 +616,7 @@ def _not_negative(text: str) -> float:
     return _number(text, lambda value: value >= 0, "a number >= 0")
 
 
-def _seconds(text: str) -> float:
+def _above_zero(text: str) -> float:
     return _number(text, lambda value: value > 0, "a number > 0")
 
 

@@ -87,6 +87,18 @@ def test_gaps_in_the_sequence_are_counted() -> None:
     assert into.sequence_gaps == {"north": 3, "south": 0, "west": 0}
 
 
+def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
+    into = joined()
+    for message in (mark(4, 1000), mark(4, 1005), frame(5, 1006), mark(5, 1007)):  # four marks were never sent
+        assert tell(into, message).message is not None
+    assert into.sequence_gaps["north"] == 0
+    assert tell(into, mark(8, 1011)).message is not None  # frames 6 to 8 never came
+    assert into.sequence_gaps["north"] == 3
+    assert tell(into, frame(9, 1012)).message is not None
+    assert into.sequence_gaps["north"] == 3
+    assert into.duplicates["north"] == 0
+
+
 def test_good_bye_ends_a_run() -> None:
     into = joined()
     assert tell(into, Bye("lab-pc", "run-1")) == Arrival(left=HELLO)

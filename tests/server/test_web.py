@@ -340,7 +340,7 @@ def test_live_begins_with_a_greeting(server: Server) -> None:
     ("query", "said"),
     [
         ("?kinds=events", "kinds: expected some of arrays, event, track, update"),
-        ("?zone=hall", "no such zone; zones are door, room"),
+        ("?zone=hall", "zone: none of that name; zones are door, room"),
     ],
 )
 def test_live_with_a_wrong_filter_says_why(server: Server, query: str, said: str) -> None:

@@ -39,16 +39,18 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
     line = Line(site, config.arrays, device.sample_rate_hz)
     link = _link(name, config.server, [line], clock, run_id)
     problem = None
-    with device:
-        for block in device:
-            if stop():
-                break
-            if device.problem != problem:
-                problem = device.problem
-                _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
-                link.tell(problem)
-            link.send(line.push(block))
-    link.close(bye=True)
+    try:
+        with device:
+            for block in device:
+                if stop():
+                    break
+                if device.problem != problem:
+                    problem = device.problem
+                    _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
+                    link.tell(problem)
+                link.send(line.push(block))
+    finally:
+        link.close(bye=True)
 
 
 def capture_recordings(

@@ -167,7 +167,14 @@ def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping
         except DeviceError as error:
             faults.append(str(error))
             continue
-        stretches.setdefault(array, []).append(Placed(recording, start_ns))
+        first = stretches.setdefault(array, [Placed(recording, start_ns)])[0].recording
+        if recording.sample_rate_hz != first.sample_rate_hz:
+            faults.append(
+                f"{path}: expected {first.sample_rate_hz:g} Hz as in {first.name}, of array {array!r}, too; "
+                f"got {recording.sample_rate_hz:g} Hz; resample one of them"
+            )
+        elif recording is not first:
+            stretches[array].append(Placed(recording, start_ns))
     if faults:
         raise DeviceError("\n".join(faults))
     return [Part(array, _spliced(placed), chosen[array]) for array, placed in stretches.items()]

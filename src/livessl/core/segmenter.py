@@ -87,14 +87,13 @@ class Segmenter:
 
     def _frame(self, cut: Cut, power: float, active: bool) -> Frame:
         samples = np.ascontiguousarray(self._selected(cut))
-        return Frame(
-            self._spec.name, self._next_sequence(), cut.raster, cut.time_ns, self._rate_hz, samples, power, active
-        )
+        self._sequence += 1
+        return Frame(self._spec.name, self._sequence, cut.raster, cut.time_ns, self._rate_hz, samples, power, active)
 
     def _mark(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> Mark:
         return Mark(
             array=self._spec.name,
-            sequence=self._next_sequence(),
+            sequence=self._sequence,
             raster=cut.raster,
             power=float(channel_power.mean()),
             noise_power=self._activity.floor_power,
@@ -104,7 +103,3 @@ class Segmenter:
             drift_ppm=framer.timeline.drift_ppm,
             clock=framer.timeline.state,
         )
-
-    def _next_sequence(self) -> int:
-        self._sequence += 1
-        return self._sequence

@@ -93,7 +93,7 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Counts the array's messages (frames and marks alike) since its node started.
+        Counts the array's frames since its node started, from 1.
     raster : int
         Index on the site-time raster: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
@@ -137,8 +137,11 @@ class Mark:
 
     Parameters
     ----------
-    array, sequence, raster
+    array, raster
         As in `Frame`.
+    sequence : int
+        Of the array's last frame; 0 before the first. Marks have no number of their own: one that is not sent is no
+        loss.
     power : float
         In-band mean power over the channels in the interval, full scale squared.
     noise_power : float

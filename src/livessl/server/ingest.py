@@ -96,13 +96,22 @@ class Ingest:
                 ),
                 now_ns,
             )
-        last = peer.sequences.get(message.array, 0)
-        if message.sequence <= last:
-            self.duplicates[message.array] += 1
+        if self._is_duplicate(peer, message):
             return Arrival()
-        self.sequence_gaps[message.array] += message.sequence - last - 1 if last else 0
-        peer.sequences[message.array] = message.sequence
         return Arrival(message=message)
+
+    def _is_duplicate(self, peer: Peer, message: Message) -> bool:
+        """Whether the frame was here before; counts it, and the frames that are missing before a new message."""
+        array, number = message.array, message.sequence
+        last = peer.sequences.get(array)
+        is_frame = isinstance(message, Frame)
+        if is_frame and last is not None and number <= last:
+            self.duplicates[array] += 1
+            return True
+        if last is not None:
+            self.sequence_gaps[array] += max(0, number - last - is_frame)
+        peer.sequences[array] = number if last is None else max(last, number)
+        return False
 
     def acknowledgements(self, now_ns: int) -> list[tuple[bytes, wire.Ack]]:
         """Replies due by now; also forgets nodes that have been silent for long."""

@@ -32,6 +32,9 @@ STATIC: Final = Path(__file__).parent / "static"
 SEND_TIMEOUT_S: Final = 30.0
 """A client that takes no byte for so long is gone."""
 
+MAX_REASON: Final = 120
+"""A closing frame's reason holds 123 bytes (RFC 6455)."""
+
 KINDS: Final = frozenset({"update", "event", "track", "arrays"})
 VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
 """A view and the axis that its projection takes the maximum over."""
@@ -227,17 +230,15 @@ def _power(snapshot: MapSnapshot, array: str) -> Float32Array | None:
 def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
     @app.websocket("/api/v1/live")
     async def live(
-        socket: WebSocket, kinds: str | None = None, min_confidence: float = 0.0, zone: str | None = None
+        socket: WebSocket, kinds: str | None = None, min_confidence: str = "0", zone: str | None = None
     ) -> None:
-        chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
-        await socket.accept()
-        if chosen is not None and not chosen <= KINDS:
-            await socket.close(1008, f"kinds: expected some of {', '.join(sorted(KINDS))}")
+        await socket.accept()  # a reason can only be told to a client that is connected
+        try:
+            wanted = _filter(site, kinds, min_confidence, zone)
+        except ValueError as error:
+            await socket.close(1008, str(error)[:MAX_REASON])
             return
-        if zone is not None and zone not in site.zones:
-            await socket.close(1008, f"no such zone; zones are {', '.join(site.zones) or 'none'}"[:120])
-            return
-        subscription = hub.subscribe(Filter(chosen, min_confidence, zone))
+        subscription = hub.subscribe(wanted)
         hello = {
             "v": API_VERSION,
             "seq": hub.last_seq,
@@ -257,6 +258,21 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
             for task in (sending, listening):
                 task.cancel()
             await asyncio.gather(sending, listening, return_exceptions=True)
+
+
+def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
+    chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
+    if chosen is not None and not chosen <= KINDS:
+        raise ValueError(f"kinds: expected some of {', '.join(sorted(KINDS))}")
+    try:
+        least = float(min_confidence)
+    except ValueError:
+        least = float("nan")
+    if not 0.0 <= least <= 1.0:
+        raise ValueError("min_confidence: expected a number from 0 to 1")
+    if zone is not None and zone not in site.zones:
+        raise ValueError(f"zone: none of that name; zones are {', '.join(site.zones) or 'none'}")
+    return Filter(chosen, least, zone)
 
 
 async def _send_all(socket: WebSocket, subscription: Subscription, first: JsonObject) -> None:
