@@ -81,6 +81,24 @@ def test_killed_and_resumed_it_gives_the_same_bytes(tmp_path: Path) -> None:
     )  # RTs, sounds, sizes, methods
 
 
+@pytest.mark.processes
+def test_interrupted_it_ends_soon(tmp_path: Path) -> None:
+    sounds, out = write_sounds(tmp_path / "sounds"), tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "livessl", *arguments(sounds, out), "--positions", "5000"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.monotonic() + 60.0
+    while not list((out / "parts").glob("*.parquet")):
+        assert process.poll() is None, "it ended before it could be interrupted"
+        assert time.monotonic() < deadline, "no position was finished in a minute"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30.0) == 130  # thousands of positions are minutes
+    assert len(list((out / "parts").glob("*.parquet"))) < 1000
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed", "ignore::ResourceWarning")
 def test_a_dask_cluster_gives_the_same_rows(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")

@@ -197,15 +197,14 @@ def _worker(job: Job) -> Position:
 
 
 def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
-    with ProcessPoolExecutor(
+    pool = ProcessPoolExecutor(
         min(jobs, len(wanted)), mp_context=get_context("spawn"), initializer=_begin, initargs=(job,)
-    ) as pool:
-        futures = [pool.submit(_compute_sent, number) for number in wanted]
-        try:
-            for future in completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    )
+    try:  # not `with`: on Ctrl-C that would wait for every position still to come
+        for future in completed([pool.submit(_compute_sent, number) for number in wanted]):
+            yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin(job: Job) -> None:
