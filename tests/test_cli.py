@@ -19,8 +19,9 @@ import httpx
 import numpy as np
 import pytest
 import soundfile
+import yaml
 
-from livessl import __version__
+from livessl import __version__, demo
 from livessl.capture.link import Link
 from livessl.cli import main
 from livessl.clock import SystemClock, utc_ns, utc_text
@@ -129,11 +130,13 @@ def test_version(run: Run) -> None:
         ("replay d --speed fast", "expected a number > 0 or 'max', got 'fast'"),
         ("replay d --speed inf", "expected a number > 0 or 'max', got 'inf'"),
         ("replay d --speed nan", "expected a number > 0 or 'max', got 'nan'"),
+        ("replay d --server foo", "expected tcp://HOST:PORT or ipc://PATH, got 'foo'"),
+        ("replay d --server tcp://127.0.0.1:*", "expected tcp://HOST:PORT or ipc://PATH, got 'tcp://127.0.0.1:*'"),
         ("capture --site s.yaml --node n --start-at noon", "expected RFC 3339 with an offset"),
         ("capture --site s.yaml --node n --start-at 2026-01-01T00:00:00", "expected RFC 3339 with an offset"),
         ("record --site s.yaml --node n --out d --duration 0", "expected a number > 0, got '0'"),
         ("record --site s.yaml --node n --out d --format mp3", "invalid choice: 'mp3'"),
-        ("simulate --site s.yaml --out d --rt60 -1", "expected a number >= 0, got '-1'"),
+        ("simulate --site s.yaml --out d --rt60 -1", "expected seconds from 0 to 5, got '-1'"),
         ("simulate --site s.yaml --out d --count 0", "expected a whole number from 1 on, got '0'"),
     ],
 )
@@ -152,10 +155,27 @@ def test_check_of_a_good_site(run: Run, recorded: Recorded) -> None:
     assert done.code == 0
     assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid nodes" in done.out
     [told] = run("check", recorded.site, "--json").objects
-    assert told == {"valid": True, "faults": [], "site": "small", "arrays": ["north", "south"], "nodes": 3840}
+    expected = {"valid": True, "faults": [], "warnings": [], "site": "small", "arrays": ["north", "south"]}
+    assert told == {**expected, "nodes": 3840}
 
 
 FAULTY = {"fusion.method": "music", "colour": "red", "arrays.north.position_m": [9, 9, 9], "grid.spacing_m": 0.001}
+
+
+WIDE = [[0.1, 0.1, 2.5], [3.9, 0.1, 2.5], [3.9, 4.9, 2.5], [0.1, 4.9, 2.5]]
+
+
+def test_warnings_are_told(run: Run, recorded: Recorded, tmp_path: Path) -> None:
+    site = write_site(tmp_path, {"arrays.north": {"microphones_m": WIDE}})
+    note = "livessl: note: grid.spacing_m: array 'north' is 6.1 m wide: "
+    checked = run("check", site)
+    assert checked.code == 0
+    assert checked.err.startswith(note)
+    [warning] = run("check", site, "--json").objects[0]["warnings"]
+    assert checked.err == f"livessl: note: {warning}\n"
+    assert note in run("locate", "--site", site, *recorded.wavs()).err
+    taken = write_site(tmp_path, {"arrays.north": {"microphones_m": WIDE}, "server.events_db": str(tmp_path)})
+    assert note in run("serve", "--site", taken).err
 
 
 def test_check_tells_all_faults_at_once(run: Run, tmp_path: Path) -> None:
@@ -298,7 +318,7 @@ def test_file_that_does_not_fit(run: Run, recorded: Recorded, tmp_path: Path, na
         "record": ["--node", "lab-pc", "--out", tmp_path / "out"],
     }
     path = bad_file(tmp_path / "n.wav", name)
-    done = run(command, "--site", recorded.site, *options[command], "--wav", f"north={path}")
+    done = run(command, "--site", recorded.site, *options[command], *recorded.wavs(north=path))
     assert done.code == 2
     assert done.out == ""
     [line] = done.err.splitlines()
@@ -404,7 +424,17 @@ def test_record_a_rehearsal(run: Run, recorded: Recorded, tmp_path: Path) -> Non
         assert 0 <= piece.start_ns - begun_ns < 2e9
     again = run(*arguments, *recorded.wavs())
     assert again.code == 2
-    assert "already holds a session; choose another folder" in again.err
+    assert "already holds a session or recordings (north-000.flac); choose another folder" in again.err
+
+
+@pytest.mark.parametrize("name", ["session.yaml", "old.wav", "OLD.FLAC"])
+def test_record_overwrites_nothing(run: Run, recorded: Recorded, tmp_path: Path, name: str) -> None:
+    """It is told before the device is opened: this one's name fits none."""
+    (tmp_path / name).write_bytes(b"precious")
+    done = run("record", "--site", recorded.site, "--node", "lab-pc", "--out", tmp_path)
+    assert done.code == 2
+    assert f"--out {tmp_path}: already holds a session or recordings ({name}); choose another folder" in done.err
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 # capture and serve
@@ -422,6 +452,44 @@ def test_file_for_an_array_of_another_node(run: Run, recorded: Recorded) -> None
     done = run("capture", "--site", recorded.site, "--node", "lab-pc", "--wav", "west=w.wav")
     assert done.code == 2
     assert "node 'lab-pc' has the arrays north, south" in done.err
+
+
+@pytest.mark.parametrize("command", ["capture", "record"])
+def test_file_for_some_arrays_only(run: Run, recorded: Recorded, tmp_path: Path, command: str) -> None:
+    out = ["--out", tmp_path / "out"] if command == "record" else []
+    done = run(command, "--site", recorded.site, "--node", "lab-pc", *recorded.wavs()[:2], *out)
+    assert done.code == 2
+    assert done.err == "livessl: error: --wav: expected a file for each of north, south; add --wav south=FILE\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("options", [("--start-at", "2026-01-01T00:00:00Z"), ("--loop",), ("--channels", "north=1,2")])
+def test_what_is_for_files_is_not_for_an_audio_interface(
+    run: Run, recorded: Recorded, options: tuple[str, ...]
+) -> None:
+    done = run("capture", "--site", recorded.site, "--node", "lab-pc", *options)
+    assert done.code == 2
+    assert done.err == (
+        f"livessl: error: {options[0]}: applies to files, and none is given; take it away or add --wav\n"
+    )
+
+
+@pytest.mark.parametrize(("options", "code"), [((), 0), (("--once",), 130)])
+def test_interrupted_demo(run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], code: int) -> None:
+    """It runs until Ctrl-C, which is then no failure; once, it is cut short."""
+    monkeypatch.setattr("livessl.cli.demo.prepare", interrupted)
+    assert run("demo", *options).code == code
+
+
+def test_interrupted_simulation_is_cut_short(
+    run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("livessl.cli.write_scene", interrupted)
+    assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
+
+
+def interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_scene_that_cannot_be(run: Run, tmp_path: Path) -> None:
@@ -568,3 +636,49 @@ def test_signals_end_everything_cleanly(recorded: Recorded, tmp_path: Path) -> N
             assert seconds < STOP_S
             assert "Traceback" not in process.said
         assert "node 'north-pc' has ended" in servers[0].said
+
+
+def test_sessions_of_two_nodes_are_replayed_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, sites = tmp_path / "whole", tmp_path / "site.yaml"
+    sites.write_text(
+        demo.SITE_FILE.read_text(encoding="utf-8").replace("0.1}", "0.25}").replace("port: 8000", "port: 0"),
+        encoding="utf-8",
+    )
+    assert main(["simulate", "--site", str(sites), "--rt60", "0", "--count", "1", "--out", str(whole)]) == 0
+    for number, array in enumerate(("north", "south")):
+        part = tmp_path / f"part{number}"
+        part.mkdir()
+        (part / "site.yaml").write_bytes((whole / "site.yaml").read_bytes())
+        (part / f"{array}.wav").write_bytes((whole / f"{array}.wav").read_bytes())
+        described = yaml.safe_load((whole / "session.yaml").read_text(encoding="utf-8"))
+        described["pieces"] = [piece for piece in described["pieces"] if piece["array"] == array]
+        (part / "session.yaml").write_text(yaml.safe_dump(described), encoding="utf-8")
+    capsys.readouterr()
+    replayed = []
+    for folders in ([whole], [tmp_path / "part0", tmp_path / "part1"]):
+        options = ["--site", str(sites), "--once", "--json", "--speed", "max"]
+        done = subprocess.run(
+            [sys.executable, "-m", "livessl", "replay", *map(str, folders), *options],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
+        replayed.append([json.loads(line)["position_m"] for line in done.stdout.splitlines()])
+    assert len(replayed[0]) == 1
+    assert replayed[1] == replayed[0]
+
+
+def test_simulate_never_overwrites_a_recorded_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "session.yaml").write_text("version: 1\n", encoding="utf-8")
+    assert main(["simulate", "--site", str(demo.SITE_FILE), "--out", str(tmp_path)]) == 2
+    assert "holds a recorded session; choose another folder" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["session.yaml"]
+
+
+def test_demo_on_a_port_in_use_says_so_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["demo", "--once", "--port", str(taken.getsockname()[1])]) == 1
+    assert "cannot be used: Address already in use" in capsys.readouterr().err

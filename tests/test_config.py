@@ -162,6 +162,32 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "band upside down": ({"band_hz": [6000, 100]}, "band_hz", r"expected \[low, high\] with low < high, got"),
     "array's band upside down": ({f"{ARRAY}.band_hz": [900, 900]}, f"{ARRAY}.band_hz", "with low < high"),
     "bad endpoint of a node": ({f"{NODE}.server": "localhost:5570"}, f"{NODE}.server", "expected tcp://HOST:PORT"),
+    "zone inside out": (
+        {"zones.door.bounds_m": [[0, 1], [1, 0], [0, 2]]},
+        "zones.door.bounds_m",
+        r"expected lower <= upper on y, got \[1, 0\]; swap them",
+    ),
+    "zone outside the room": (
+        {"zones.door.bounds_m": [[0, 1], [5.1, 6], [0, 2]]},
+        "zones.door.bounds_m",
+        r"reaches into the room, on y from 0 to 5 m, got \[5.1, 6\]; correct it or room.size_m",
+    ),
+    "search volume outside the room": (
+        {"grid.bounds_m": [[-2, -1], [0, 5], [0, 3]]},
+        "grid.bounds_m",
+        r"reaches into the room, on x from 0 to 4 m, got \[-2, -1\]",
+    ),
+    "array that is called as the map of all": (
+        {"arrays.fused": {"microphones_m": [[1, 1, 1], [1, 2, 1]]}},
+        "arrays.fused",
+        "'fused' is the map of all arrays together; rename it",
+    ),
+    "warnings of one's own": ({"warnings": ["beware"]}, "warnings", "unknown key; take it away"),
+    "port of a node that is any": (
+        {f"{NODE}.server": "tcp://127.0.0.1:*"},
+        f"{NODE}.server",
+        r"expected tcp://HOST:PORT or ipc://PATH, got 'tcp://127.0.0.1:\*'",
+    ),
     "bad endpoint of the server": (
         {"server.bind": "tcp://127.0.0.1:99999"},
         "server.bind",
@@ -404,6 +430,42 @@ def test_zones() -> None:
     assert site.zones_of([1.01, 1.0, 2.5]) == ["all"]
     assert site.zones_of([-0.1, 1.0, 2.5]) == []
     assert site.zones_of(None) == []
+
+
+CEILING = [[x, y, 2.9] for x, y in [(0.1, 0.1), (5, 0.1), (9.9, 0.1), (9.9, 4), (9.9, 7.9), (0.1, 7.9)]]
+HALL: Changes = {
+    "room.size_m": [10.0, 8.0, 3.0],
+    "grid.spacing_m": 0.1,
+    "arrays": {"ceiling": {"microphones_m": CEILING}},
+    "nodes": {},
+    "zones": {},
+}
+"""Six microphones around a whole ceiling as one array: a tenth of a metre is many periods of 6 kHz."""
+
+
+def test_array_too_wide_for_the_grid_is_warned_of() -> None:
+    [said] = site_of(HALL).warnings
+    found = re.fullmatch(
+        r"grid.spacing_m: array 'ceiling' is 12.5 m wide: up to 6000 Hz needs a spacing of about (\S+) m, got 0.1; "
+        "positions may be wrong: lower the array's band_hz, or make arrays smaller",
+        said,
+    )
+    assert found is not None
+    # 1 / (2 f |grad tau|) over a cell's half diagonal; |grad tau| = 2 sin(angle / 2) / c, and most pairs are seen
+    # under more than 60 and less than 180 degrees: from c / (sqrt(3) f) = 0.033 to half of that, 0.016 m
+    assert 0.016 < float(found[1]) < 0.033
+    assert "warnings" not in site_of(HALL).model_dump()
+
+
+def test_what_is_suggested_against_wide_arrays_helps() -> None:
+    assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [100, 1500]}}}).warnings == ()
+    assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [4000, 16000]}}}).warnings == ()
+
+
+def test_usual_arrays_are_not_warned_of() -> None:
+    half_a_metre = {"geometry": {"tetrahedron": {"edge_m": 0.5}}}
+    assert site_of({"grid.spacing_m": 0.1, f"{ARRAY}.geometry": half_a_metre["geometry"]}).warnings == ()
+    assert site_of().warnings == ()
 
 
 def test_node_of_an_array() -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_allclose
+from pydantic import BaseModel
 
-from livessl.config import GeometryFile, SoundDeviceConfig, load_site
+from livessl.config import GeometryFile, Site, SoundDeviceConfig, load_site
 from livessl.core.geometry import circle, tetrahedron
 from livessl.core.types import FloatArray
 
@@ -30,6 +33,7 @@ def test_there_are_configs() -> None:
 def test_config_loads_and_every_array_has_a_node(path: Path) -> None:
     site = load_site(path)
     assert site.site == path.stem
+    assert site.warnings == ()
     assert {name for node in site.nodes.values() for name in node.arrays} == set(site.arrays)
 
 
@@ -61,3 +65,26 @@ def test_one_array_takes_its_shape_from_the_file() -> None:
     file_m = geometry("tetrahedron-0.5m.yaml")
     assert_allclose(distances, np.linalg.norm(file_m[:, None] - file_m[None], axis=2), rtol=0, atol=1e-9)
     assert spec.microphones_m[1, 1] > spec.centre_m[1] + 0.28, "yaw 90: microphone 2 towards +y"
+
+
+def documented_keys(model: type[BaseModel]) -> set[str]:
+    """Every key that a model of the site file takes, with those of the models inside it."""
+    keys: set[str] = set()
+    for name, field in model.model_fields.items():
+        if field.exclude:
+            continue
+        keys.add(name)
+        keys |= {key for inner in _models_in(field.annotation) for key in documented_keys(inner)}
+    return keys
+
+
+def _models_in(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
+
+def test_every_key_of_the_site_file_is_explained() -> None:
+    text = (ROOT / "docs" / "site-file.md").read_text(encoding="utf-8")
+    missing = sorted(key for key in documented_keys(Site) if not re.search(rf"\b{key}\b", text))
+    assert missing == []

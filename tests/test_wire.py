@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
 from livessl import wire
-from livessl.core.types import ClockState, Frame, Mark
+from livessl.core.types import MAX_SAMPLE, ClockState, Frame, Mark
 from livessl.wire import Ack, Bye, Hello, WireError, WireMessage, decode, encode
 from small_site import frame, mark
 
@@ -29,7 +29,7 @@ RATES = st.floats(min_value=1.0, max_value=wire.MAX_RATE_HZ)
 SAMPLES = hnp.arrays(
     np.float32,
     st.tuples(st.integers(2, 16), st.integers(1, 40)),
-    elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+    elements=st.floats(-MAX_SAMPLE, MAX_SAMPLE, width=32),
 )
 FRAMES = st.builds(
     Frame,
@@ -245,6 +245,15 @@ def test_samples_must_be_finite(bad: float) -> None:
     said = refusal(encode(Frame("north", 1, 1, 1, 16000.0, samples, 0.0, False)))
     assert "array 'north'" in said
     assert "NaN or infinity" in said
+
+
+def test_samples_must_be_such_as_a_converter_gives() -> None:
+    samples = np.zeros((4, 10), dtype=np.float32)
+    samples[2, 3] = -MAX_SAMPLE
+    decode(encode(Frame("north", 1, 1, 1, 16000.0, samples, 0.0, False)))
+    loud = samples * np.float32(1.001)
+    said = refusal(encode(Frame("north", 1, 1, 1, 16000.0, loud, 0.0, False)))
+    assert said.endswith("frame of array 'north': expected samples up to 1e+06, got 1.001e+06")
 
 
 @pytest.mark.parametrize(

@@ -24,13 +24,13 @@ from livessl.capture.recorded import (
     Part,
     common_start_ns,
     parts_from_node,
-    parts_from_session,
+    parts_from_sessions,
     parts_from_wavs,
     repeated,
     span_ns,
 )
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
-from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig, load_site
+from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig, check_endpoint, load_site
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
@@ -41,7 +41,7 @@ from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
 from livessl.server.store import StoreError
 from livessl.session import SESSION_FILE, read_session
-from livessl.simulate.export import write_scene
+from livessl.simulate.export import TRUTH_FILE, write_scene
 from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
 
 T = TypeVar("T")
@@ -51,12 +51,19 @@ FAILED: Final = 1
 WRONG_USE: Final = 2
 INTERRUPTED: Final = 130
 
+MAX_RT60_S: Final = 5.0
+"""Images grow with the cube of the reverberation time: more would take hours, and few rooms ring longer."""
+
 WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit code: 0 success, 1 failure at run time, 2 wrong use or configuration."""
+    """Run a command; returns its exit code.
+
+    0 success, also of what runs until Ctrl-C or SIGTERM; 1 failure at run time; 2 wrong use or configuration; 130 for a
+    command that Ctrl-C or SIGTERM cut short before its own end.
+    """
     parsed = _parser().parse_args(arguments)
     logging.basicConfig(
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
@@ -68,6 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
+    except BrokenPipeError:  # whoever read our output has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
     except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
         _complain(str(error))
         return FAILED
@@ -148,10 +158,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
 
     sub = command("replay", _replay, "play a recorded session through a server", "livessl replay session/ --speed 2")
-    sub.add_argument("directory", type=Path, metavar="DIR", help="made by record or simulate")
+    sub.add_argument(
+        "directories", type=Path, metavar="DIR", nargs="+", help="made by record or simulate; one for each node"
+    )
     sub.add_argument("--site", type=Path, help="site file (default: the session's own)")
     sub.add_argument("--speed", type=_speed, default=1.0, help="times real time, or 'max' (default 1)")
-    sub.add_argument("--server", metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570")
+    sub.add_argument(
+        "--server", type=_endpoint, metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570"
+    )
     sub.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
     _add_method(sub)
@@ -174,8 +188,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_site(sub)
     sub.add_argument("--events", type=Path, metavar="DIR", help="WAV or FLAC files to play (default: our own sounds)")
-    sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to")
+    sub.add_argument("--rt60", type=_rt60, default=0.7, metavar="S", help="reverberation time, 0 to 5 (default 0.7)")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must hold no recording")
     sub.add_argument("--count", type=_positive, default=8, help="sounds in the scene (default 8)")
     sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
     sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
@@ -243,6 +257,16 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
+    try:
+        return _show_demo(arguments)
+    except KeyboardInterrupt:
+        if arguments.once:
+            raise
+        logging.info("stopped")
+        return OK
+
+
+def _show_demo(arguments: argparse.Namespace) -> int:
     clock = SystemClock()
     with (
         tempfile.TemporaryDirectory(prefix="livessl-demo-") as name,
@@ -294,6 +318,7 @@ def _demo_json(outcome: demo.Outcome) -> str:
 
 def _serve(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
+    _tell_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
     logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
     _run_server(server)
@@ -310,6 +335,7 @@ def _run_server(server: Server) -> None:
 def _capture(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     config = _node(site, arguments.node, arguments.site)
+    _check_played(arguments, config)
     clock = SystemClock()
     run_id = _run_id(arguments.node, clock)
     if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
@@ -321,6 +347,30 @@ def _capture(arguments: argparse.Namespace) -> int:
     with _polite_stop() as stop, progress.timed("playing", *span_ns(parts)) as bar:
         capture_recordings(site, arguments.node, parts, clock, run_id, stop.is_set, bar)
     return OK
+
+
+def _check_played(arguments: argparse.Namespace, config: NodeConfig) -> None:
+    """What a node plays instead of its device must be all of it; what only files can do needs files."""
+    wavs, _ = _wavs(arguments)
+    known, faults = ", ".join(config.arrays), []
+    if wavs:
+        strangers = [name for name in wavs if name not in config.arrays]
+        missing = [name for name in config.arrays if name not in wavs]
+        faults += [Fault(f"--wav {name}=…", f"node {arguments.node!r} has the arrays {known}") for name in strangers]
+        faults += [Fault("--wav", f"expected a file for each of {known}; add --wav {name}=FILE") for name in missing]
+    else:
+        given = {"--channels": arguments.channels}
+        if isinstance(config.device, SoundDeviceConfig):
+            given |= {"--start-at": getattr(arguments, "start_at", None), "--loop": getattr(arguments, "loop", None)}
+        what = "applies to files, and none is given; take it away or add --wav"
+        faults += [Fault(option, what) for option, value in given.items() if value]
+    if faults:
+        raise ConfigError(faults)
+
+
+def _wavs(arguments: argparse.Namespace) -> tuple[dict[str, Path], dict[str, list[int]]]:
+    """Files and chosen channels by array."""
+    return _once_each(arguments.wav, "--wav"), _once_each(arguments.channels, "--channels")
 
 
 def _sound_device(config: NodeConfig, device: SoundDeviceConfig, clock: Clock) -> Any:
@@ -341,19 +391,14 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
         with progress.counted("simulating the room", "source") as bar:
             parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
     else:
-        wavs = _once_each(arguments.wav, "--wav")
-        strangers = sorted(set(wavs) - set(site.nodes[arguments.node].arrays))
-        if strangers:
-            known = ", ".join(site.nodes[arguments.node].arrays)
-            raise DeviceError(f"--wav {strangers[0]}=…: node {arguments.node!r} has the arrays {known}")
-        parts = parts_from_wavs(site, wavs, _once_each(arguments.channels, "--channels"), start_ns)
+        parts = parts_from_wavs(site, *_wavs(arguments), start_ns)
     return repeated(parts) if getattr(arguments, "loop", False) else parts
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
-    wavs, channels = _once_each(arguments.wav, "--wav"), _once_each(arguments.channels, "--channels")
-    parts = parts_from_wavs(site, wavs, channels)
+    _tell_warnings(site)
+    parts = parts_from_wavs(site, *_wavs(arguments))
     messages = Messages(site, 0, utc=False)
     found = 0
     with progress.timed("listening", *span_ns(parts)) as bar:
@@ -385,9 +430,9 @@ def _print_event(event: JsonObject, *, as_json: bool) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    session = read_session(arguments.directory)
-    site = load_site(arguments.site) if arguments.site else session.site()
-    parts = parts_from_session(site, session)
+    sessions = [read_session(directory) for directory in arguments.directories]
+    site = load_site(arguments.site) if arguments.site else sessions[0].site()
+    parts = parts_from_sessions(site, sessions)
     if arguments.server is not None:
         with _polite_stop() as stop:
             _send(site, arguments.server, parts, arguments.speed, stop)
@@ -432,15 +477,18 @@ def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: 
 def _record(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     config = _node(site, arguments.node, arguments.site)
-    if (arguments.out / SESSION_FILE).exists():
-        raise ConfigError([Fault(f"--out {arguments.out}", "already holds a session; choose another folder")])
+    _check_played(arguments, config)
+    _refuse_recordings(arguments.out)
     clock = SystemClock()
-    begun_ns = clock.now_ns()
-    with _polite_stop() as stop:
+    begun_ns, begun = clock.now_ns(), clock.monotonic_ns()
+    length_ns = None if arguments.duration is None else round(arguments.duration * 1e9)
+    end_ns = None if length_ns is None else begun_ns + length_ns
+    with _polite_stop() as stop, progress.timed("recording", begun_ns, end_ns) as bar:
 
         def over() -> bool:
-            spent_s = (clock.now_ns() - begun_ns) / 1e9
-            return stop.is_set() or (arguments.duration is not None and spent_s >= arguments.duration)
+            spent_ns = clock.monotonic_ns() - begun
+            bar(begun_ns + spent_ns)
+            return stop.is_set() or (length_ns is not None and spent_ns >= length_ns)
 
         if isinstance(config.device, SoundDeviceConfig) and not arguments.wav:
             device = _sound_device(config, config.device, clock)
@@ -457,8 +505,20 @@ def _record(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def _refuse_recordings(directory: Path) -> None:
+    """Nothing that was recorded is ever overwritten, nor mixed with anything."""
+    held = directory.iterdir() if directory.is_dir() else ()
+    names = sorted(path.name for path in held if path.name == SESSION_FILE or path.suffix.lower() in (".wav", ".flac"))
+    if names:
+        raise ConfigError(
+            [Fault(f"--out {directory}", f"already holds a session or recordings ({names[0]}); choose another folder")]
+        )
+
+
 def _simulate(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
+    if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
+        raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
     rate = float(arguments.sample_rate)
     try:
         sounds = read_sounds(arguments.events, rate) if arguments.events else synthesised_sounds(rate, arguments.seed)
@@ -523,12 +583,10 @@ def _check(arguments: argparse.Namespace) -> int:
         raise
     grid = site.search_grid()
     if arguments.json:
-        print(
-            json.dumps(
-                {"valid": True, "faults": [], "site": site.site, "arrays": list(site.arrays), "nodes": grid.size}
-            )
-        )
+        checked = {"valid": True, "faults": [], "warnings": list(site.warnings), "site": site.site}
+        print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
     else:
+        _tell_warnings(site)
         arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.specs)
         print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid nodes")
     return OK
@@ -565,6 +623,11 @@ def _node(site: Site, name: str, path: Path) -> NodeConfig:
     return site.nodes[name]
 
 
+def _tell_warnings(site: Site) -> None:
+    for warning in site.warnings:
+        _complain(warning, kind="note")
+
+
 def _complain(text: str, kind: str = "error") -> None:
     print(f"livessl: {kind}: {text}", file=sys.stderr)
 
@@ -599,6 +662,13 @@ def _channels(text: str) -> tuple[str, list[int]]:
     return name, channels
 
 
+def _endpoint(text: str) -> str:
+    try:
+        return check_endpoint(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _time(text: str) -> int:
     try:
         return utc_ns(text)
@@ -610,6 +680,10 @@ def _positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
     return int(text)
+
+
+def _rt60(text: str) -> float:
+    return _number(text, lambda value: 0 <= value <= MAX_RT60_S, f"seconds from 0 to {MAX_RT60_S:g}")
 
 
 def _not_negative(text: str) -> float:

@@ -13,10 +13,14 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Clock(Protocol):
-    """Site time, and the means to wait for it."""
+    """Site time, and the means to wait for it; and a time for deadlines, which nobody sets."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch, UTC."""
+        """Nanoseconds since the epoch, UTC: for stamps, never for intervals, for it can be set."""
+        ...
+
+    def monotonic_ns(self) -> int:
+        """Nanoseconds since some fixed moment, at the machine's own pace: for intervals."""
         ...
 
     def sleep_until_ns(self, time_ns: int) -> bool:
@@ -30,6 +34,10 @@ class SystemClock:
     def now_ns(self) -> int:
         """Nanoseconds since the epoch, UTC."""
         return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        """Nanoseconds since some fixed moment."""
+        return time.monotonic_ns()
 
     def sleep_until_ns(self, time_ns: int) -> bool:
         """Sleep the difference, so that a schedule's errors never add up."""
@@ -50,6 +58,10 @@ class PacedClock:
         """Nanoseconds since the epoch, in the replayed time."""
         return self._start_ns + round((time.monotonic_ns() - self._began_ns) * self._speed)
 
+    def monotonic_ns(self) -> int:
+        """Nanoseconds since some fixed moment."""
+        return time.monotonic_ns()
+
     def sleep_until_ns(self, time_ns: int) -> bool:
         """Sleep until the replayed time gets there."""
         return _sleep((time_ns - self.now_ns()) / self._speed / 1e9)
@@ -64,6 +76,10 @@ class UnpacedClock:
     def now_ns(self) -> int:
         """The latest time waited for, nanoseconds."""
         return self._now_ns
+
+    def monotonic_ns(self) -> int:
+        """Nanoseconds since some fixed moment."""
+        return time.monotonic_ns()
 
     def sleep_until_ns(self, time_ns: int) -> bool:
         """Be there at once."""

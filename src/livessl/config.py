@@ -16,7 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from livessl.core.activity import ActivityParameters
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.fusion import Fusion, FusionParameters
+from livessl.core.gcc import microphone_pairs, uses_envelope
 from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
+from livessl.core.planning import alias_free_hz
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
@@ -28,6 +30,9 @@ MAP_BYTES_PER_PAIR_AND_NODE: Final = 8
 
 MAP_BYTES_PER_NODE: Final = 64
 """Coordinates, delays while they are worked out, and the maps themselves."""
+
+SAMPLED_NODES: Final = 500
+"""Nodes, about, at which the grid is held against an array: enough for a median."""
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -60,6 +65,13 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def _ordered(bounds: Bounds) -> Bounds:
+    for axis, (low, high) in zip("xyz", bounds, strict=True):
+        if low > high:
+            raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
+    return bounds
+
+
 class Room(_Model):
     """The room: a box from the origin."""
 
@@ -76,10 +88,7 @@ class GridConfig(_Model):
     @field_validator("bounds_m")
     @classmethod
     def _ordered(cls, bounds: Bounds | None) -> Bounds | None:
-        for axis, (low, high) in zip("xyz", bounds or (), strict=False):
-            if low > high:
-                raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
-        return bounds
+        return None if bounds is None else _ordered(bounds)
 
 
 class Tetrahedron(_Model):
@@ -270,7 +279,7 @@ class ServerConfig(_Model):
     @field_validator("bind")
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
-        return check_endpoint(endpoint)
+        return check_endpoint(endpoint, wildcards=True)
 
 
 class ActivityConfig(_Model):
@@ -301,6 +310,11 @@ class Zone(_Model):
 
     bounds_m: Bounds
 
+    @field_validator("bounds_m")
+    @classmethod
+    def _ordered(cls, bounds: Bounds) -> Bounds:
+        return _ordered(bounds)
+
     def contains(self, position_m: Sequence[float]) -> bool:
         """Whether a position lies in it."""
         return all(low <= x <= high for x, (low, high) in zip(position_m, self.bounds_m, strict=True))
@@ -322,6 +336,8 @@ class Site(_Model):
     fusion: FusionConfig = FusionConfig()
     zones: dict[str, Zone] = {}
     specs: Annotated[tuple[ArraySpec, ...], Field(exclude=True, default=())]
+    warnings: Annotated[tuple[str, ...], Field(exclude=True, default=())]
+    """What is valid and yet unlikely to work, in words."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
@@ -381,8 +397,8 @@ class Site(_Model):
         return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
 
 
-def check_endpoint(endpoint: str) -> str:
-    """Return `endpoint` if it is a ZeroMQ TCP or IPC address.
+def check_endpoint(endpoint: str, *, wildcards: bool = False) -> str:
+    """Return `endpoint` if it is a ZeroMQ TCP or IPC address; `*` for host or port is none that one can connect to.
 
     Raises
     ------
@@ -391,11 +407,8 @@ def check_endpoint(endpoint: str) -> str:
     """
     scheme, _, rest = endpoint.partition("://")
     host, _, port = rest.rpartition(":")
-    tcp = (
-        scheme == "tcp"
-        and host != ""
-        and (port == "*" or (re.fullmatch("[0-9]{1,5}", port) is not None and int(port) <= 65535))
-    )
+    numbered = re.fullmatch("[0-9]{1,5}", port) is not None and int(port) <= 65535
+    tcp = scheme == "tcp" and host != "" and (numbered or port == "*") and (wildcards or "*" not in (host, port))
     if not (tcp or (scheme == "ipc" and rest)):
         raise ValueError(f"expected tcp://HOST:PORT or ipc://PATH, got {endpoint!r}")
     return endpoint
@@ -437,9 +450,10 @@ def parse_site(text: str, source: str = "site file", directory: Path | None = No
     if not isinstance(data, dict):
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
     findings = [*_duplicate_keys(root)]
-    if "specs" in data:
-        findings.append((("specs",), "unknown key; take it away"))
-        del data["specs"]
+    for key in ("specs", "warnings"):
+        if key in data:
+            findings.append(((key,), "unknown key; take it away"))
+            del data[key]
     site, wrong = _valid_part(data)
     findings += wrong
     if site is not None:
@@ -450,7 +464,7 @@ def parse_site(text: str, source: str = "site file", directory: Path | None = No
         findings += [finding for finding in _cross_faults(site) if not _follows(finding[0], lost)]
     if findings or site is None:
         raise ConfigError([at.fault(path, what) for path, what in findings])
-    return site
+    return site.model_copy(update={"warnings": tuple(_wide_arrays(site))})
 
 
 def read_yaml(text: str) -> Any:
@@ -643,10 +657,24 @@ def _cross_faults(site: Site) -> Iterator[_Finding]:
             ("fusion", "min_arrays"),
             f"expected at most the number of arrays, {len(site.arrays)}, got {site.fusion.min_arrays}",
         )
+    if "fused" in site.arrays:
+        yield ("arrays", "fused"), "expected another name: 'fused' is the map of all arrays together; rename it"
+    boxes = {("zones", name, "bounds_m"): zone.bounds_m for name, zone in site.zones.items()}
+    for place, bounds in ((("grid", "bounds_m"), site.grid.bounds_m), *boxes.items()):
+        yield from ((place, what) for what in _outside(site, bounds))
     for spec in site.specs:
         yield from _array_faults(site, spec)
     yield from _grid_faults(site)
     yield from _node_faults(site)
+
+
+def _outside(site: Site, bounds: Bounds | None) -> Iterator[str]:
+    for axis, (low, high), size in zip("xyz", bounds or (), site.room.size_m, strict=False):
+        if high < 0 or low > size:
+            yield (
+                f"expected a box that reaches into the room, on {axis} from 0 to {size:g} m, got [{low:g}, {high:g}]; "
+                "correct it or room.size_m"
+            )
 
 
 def _array_faults(site: Site, spec: ArraySpec) -> Iterator[_Finding]:
@@ -681,6 +709,28 @@ def _grid_faults(site: Site) -> Iterator[_Finding]:
             f"{site.grid.max_memory_mb:,.0f} MB; use a spacing of {np.ceil(fits * 1000) / 1000:g} m or more, "
             "smaller bounds_m, or raise grid.max_memory_mb",
         )
+
+
+def _wide_arrays(site: Site) -> Iterator[str]:
+    """What is said of arrays whose peaks the grid steps over.
+
+    That is where, at half of all nodes and pairs or more, the delay changes by over half a period from a node to a
+    corner of its cell.
+    """
+    grid = site.search_grid()
+    nodes = grid.nodes_m(slice(0, grid.size, grid.size // SAMPLED_NODES | 1))
+    reach_m = grid.spacing_m * len(grid.free_axes) ** 0.5 / 2.0
+    for spec in site.specs:
+        if reach_m == 0.0 or uses_envelope(spec.band_hz):
+            continue
+        pairs, high = microphone_pairs(len(spec.microphones_m)), spec.band_hz[1]
+        kept = float(np.median(alias_free_hz(nodes, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        if kept < high:
+            yield (
+                f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high:g} Hz needs a "
+                f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
+                "wrong: lower the array's band_hz, or make arrays smaller"
+            )
 
 
 def _node_faults(site: Site) -> Iterator[_Finding]:

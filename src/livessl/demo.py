@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,7 +27,7 @@ from livessl.simulate.scene import Scene, make_scene, synthesised_sounds
 
 SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
 
-LEAD_NS: Final = 2_500_000_000
+LEAD_NS: Final = 5_000_000_000
 """From the command to the scene's first sample: the nodes must be up by then."""
 
 READY_NS: Final = 20_000_000_000
@@ -70,6 +69,7 @@ class Outcome:
 
 def prepare(directory: Path, http_port: int, events: int, progress: Callable[[int, int], None]) -> tuple[Site, Scene]:
     """Simulate the demo's scene into a folder, with a site file on free ports."""
+    _need_free("127.0.0.1", http_port)
     data = yaml.safe_load(SITE_FILE.read_text(encoding="utf-8"))
     endpoint = f"tcp://127.0.0.1:{_free_port()}"
     data["server"] = {"bind": endpoint, "http": {"host": "127.0.0.1", "port": http_port}}
@@ -171,12 +171,18 @@ def _wait_until_ready(url: str, processes: Sequence[subprocess.Popen[bytes]], cl
     while clock.now_ns() < deadline_ns:
         if any(process.poll() is not None for process in processes):
             raise DemoError("the server did not start; it says why above")
-        try:
-            with urllib.request.urlopen(f"{url}/api/v1/health", timeout=1.0):  # noqa: S310 - our own http address
-                return
-        except (urllib.error.URLError, OSError):
-            clock.sleep_until_ns(clock.now_ns() + POLL_NS)
+        if _answers(url):
+            return
+        clock.sleep_until_ns(clock.now_ns() + POLL_NS)
     raise DemoError(f"the server at {url} did not answer within {READY_NS / 1e9:.0f} s")
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(f"{url}/api/v1/health", timeout=1.0):  # noqa: S310 - our own http address
+            return True
+    except OSError:
+        return False
 
 
 def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
@@ -189,6 +195,19 @@ def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+def _need_free(host: str, port: int) -> None:
+    """Fail before anything is simulated; and never take another server's answers for the demo's."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise DemoError(
+                f"--port {port}: cannot be used: {reason}; stop what listens there or choose another"
+            ) from error
 
 
 def _free_port() -> int:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MIN_MICROPHONES, ClockState, Frame, Mark
+from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROPHONES, ClockState, Frame, Mark
 
 VERSION: Final = 1
 
@@ -173,8 +173,11 @@ def _decode_frame(body: bytes) -> Frame:
     if len(body) - start != 4 * channels * n:
         raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
     samples = np.frombuffer(body, dtype="<f4", offset=start).reshape(channels, n).astype(np.float32, copy=False)
-    if not np.isfinite(samples).all():
+    largest = float(np.abs(samples).max())  # NaN where there is any
+    if not math.isfinite(largest):
         raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
+    if largest > MAX_SAMPLE:
+        raise WireError(f"frame of array {name!r}: expected samples up to {MAX_SAMPLE:g}, got {largest:g}")
     return Frame(name, sequence, raster, time_ns, rate, samples, power, active)
 
 

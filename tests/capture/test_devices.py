@@ -100,6 +100,15 @@ def test_samples_that_are_not_finite(tmp_path: Path, subtype: str, bad: float) -
     assert "got NaN or infinity at sample 300000 of channel 3; export it again" in said
 
 
+def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
+    samples = hiss(20.0)
+    samples[2, 300_000] = -1e6  # the largest that is taken
+    WavRecording(write_wav(tmp_path / "loud.wav", samples))
+    samples[2, 300_000] = -1.001e6
+    said = refusal(write_wav(tmp_path / "broken.wav", samples))
+    assert "samples around 1 at full scale, got -1.001e+06 at sample 300000 of channel 3; export it again" in said
+
+
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT"])
 def test_silence(tmp_path: Path, subtype: str) -> None:
     samples = np.zeros((4, 300_001), dtype=np.float32)

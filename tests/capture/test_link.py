@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import groupby, islice
 from types import TracebackType
 from typing import Self
@@ -30,6 +31,9 @@ class HandClock:
         self.time_ns = 1_767_225_600_000_000_000
 
     def now_ns(self) -> int:
+        return self.time_ns
+
+    def monotonic_ns(self) -> int:
         return self.time_ns
 
     def sleep_until_ns(self, time_ns: int) -> bool:
@@ -370,3 +374,29 @@ def test_restart_of_the_real_server_loses_nothing_and_doubles_nothing() -> None:
     for got in (first, second):
         assert got == sorted(set(got))
     assert set(first) | set(second) == set(range(1, 61))
+
+
+def greeted(link: Link) -> bool:
+    """Let the link work; whether it has greeted."""
+    link.service()
+    return link._hello_ns > 0
+
+
+def test_a_clock_set_back_an_hour_stops_nothing() -> None:
+    """Stamps may jump; intervals are counted by a time that nobody sets."""
+
+    class SetBack(HandClock):
+        def now_ns(self) -> int:
+            return self.time_ns - 3_600_000_000_000
+
+    for clock in (HandClock(), SetBack()):
+        with Router() as router:
+            link = Link(router.endpoint, HELLO, clock)
+            try:
+                wait_until(partial(greeted, link), "the first greeting to go out")
+                before = link._hello_ns
+                clock.time_ns += 1_000_000_000
+                link.service()
+                assert link._hello_ns > before
+            finally:
+                link.close(bye=False)

@@ -134,7 +134,7 @@ def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
     with server() as there:
         played = Thread(target=replay, args=(there, parts(samples=knocking())))
         played.start()
-        wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.now_ns()), "the node")
+        wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.monotonic_ns()), "the node")
         wait_until(there.receiver._queue.full, "a full queue")  # nobody takes anything
         assert played.is_alive()
         wait_until(lambda: there.of(Left), "the end", 30)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 import pytest
@@ -11,11 +13,11 @@ import soundfile
 from numpy.testing import assert_allclose, assert_array_equal
 
 from livessl.capture.devices import ArrayRecording, DeviceError, Placed, WavRecording
-from livessl.capture.record import Recorder, record_parts
-from livessl.capture.recorded import Part, parts_from_session, parts_from_wavs
+from livessl.capture.record import Recorder, record_device, record_parts
+from livessl.capture.recorded import Part, parts_from_sessions, parts_from_wavs
 from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
-from livessl.session import SESSION_FILE, read_session
+from livessl.session import read_session
 from small_site import RATE_HZ, Changes, hiss, site_of, write_wav
 
 START_NS = 1_767_225_600_000_000_000
@@ -54,7 +56,7 @@ def test_wav_part_becomes_a_session_without_loss(tmp_path: Path, kind: Literal["
     for piece in session.pieces:
         assert soundfile.info(session.path(piece)).subtype == subtype
         assert_array_equal(read(session.path(piece)), heard[piece.array])
-    replayed = parts_from_session(session.site(), session)
+    replayed = parts_from_sessions(session.site(), [session])
     assert {part.array: (part.placed.start_ns, part.channels) for part in replayed} == dict.fromkeys(
         BOTH, (START_NS, (1, 2, 3, 4))
     )
@@ -105,7 +107,7 @@ def test_gap_begins_a_new_file(tmp_path: Path) -> None:
     for piece, first, stop in zip(north, (0, 24000, 32000), (16000, 32000, 40000), strict=True):
         assert piece.start_ns == START_NS + round(first / RATE_HZ * 1e9)
         assert_array_equal(read(session.path(piece)), samples[:4, first:stop])
-    [part] = [part for part in parts_from_session(SITE, session) if part.array == "north"]
+    [part] = [part for part in parts_from_sessions(SITE, [session]) if part.array == "north"]
     blocks = list(part.placed.recording.blocks(part.placed.start_ns))
     starts = [b.first_index for b, before in zip(blocks[1:], blocks, strict=False) if follows_a_gap(b, before)]
     assert starts == [24000]
@@ -119,12 +121,23 @@ def test_what_is_complete_survives_a_crash(tmp_path: Path) -> None:
     samples = hiss(2.0, 8)
     recorder = Recorder(tmp_path, SITE, BOTH, float(RATE_HZ))
     recorder.push(block(samples, 0, 8000))
-    assert not (tmp_path / SESSION_FILE).exists()
-    recorder.push(block(samples, 9000, 12000))
-    session = read_session(tmp_path)  # the recorder still runs
-    assert [piece.file for piece in session.pieces] == ["north-000.flac", "south-000.flac"]
-    assert len(parts_from_session(SITE, session)) == 2
+    names = ["north-000.flac", "south-000.flac", "north-001.flac", "south-001.flac"]
+    assert starts(tmp_path) == dict.fromkeys(names[:2], 0)
+    recorder.push(block(samples, 8000, 9000, jitter_ns=20_000_000))
+    assert starts(tmp_path) == dict.fromkeys(names[:2], 0)
+    recorder.push(block(samples, 10000, 12000))
+    second = round(10000 / RATE_HZ * 1e9)
+    told = starts(tmp_path)  # the recorder still runs
+    assert list(told) == names
+    assert told[names[0]] == told[names[1]] > 0  # all stamps of a stretch tell its start, once it is whole
+    assert told[names[2]] == told[names[3]] == second
+    assert WavRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
     recorder.__exit__(None, None, None)
+    assert len(parts_from_sessions(SITE, [read_session(tmp_path)])) == 2
+
+
+def starts(directory: Path) -> dict[str, int]:
+    return {piece.file: piece.start_ns - START_NS for piece in read_session(directory).pieces}
 
 
 def test_nothing_recorded_leaves_no_session(tmp_path: Path) -> None:
@@ -132,6 +145,39 @@ def test_nothing_recorded_leaves_no_session(tmp_path: Path) -> None:
         recorder.push(Block(0, np.zeros((8, 0), dtype=np.float32), START_NS))
     assert not recorder.recorded
     assert list(tmp_path.iterdir()) == []
+
+
+class Ailing:
+    """A device that stops for a while and says so."""
+
+    name = "UMC1820"
+    sample_rate_hz = float(RATE_HZ)
+    channels = 8
+    problem: str | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __iter__(self) -> Iterator[Block]:
+        samples = hiss(1.0, 8)
+        for first, self.problem in ((0, None), (1600, "unplugged"), (1600, "unplugged"), (3200, None)):
+            yield block(samples, first, first if self.problem else first + 1600)
+
+
+def test_trouble_of_the_device_is_told_when_it_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        record_device(Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)), Ailing(), never)
+    assert caplog.messages == ["unplugged", "device 'UMC1820' delivers sound again"]
+
+
+def test_wav_has_no_limit_of_4_gib(tmp_path: Path) -> None:
+    """Only the container can tell: a file that long is none for a test."""
+    with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ), "wav") as recorder:
+        recorder.push(block(hiss(0.5, 8), 0, 8000))
+    assert soundfile.info(tmp_path / "north-000.wav").format == "RF64"
 
 
 def test_more_than_eight_microphones_are_wav(tmp_path: Path) -> None:

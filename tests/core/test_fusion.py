@@ -218,7 +218,7 @@ def test_one_small_array_tells_the_direction_only() -> None:
     # uncertain by s / sqrt(kappa) = 0.1 / 22 kHz = 5 us.
     assert event.status is Status.DIRECTION_ONLY
     assert event.reason is not None
-    assert event.reason.startswith("one array cannot tell how far away it is: +-")
+    assert event.reason.startswith("one array cannot tell how far away it is: ±")
     towards, right = position_of(event) - spec.centre_m, SOURCE_M - spec.centre_m
     # the direction by 5 us of 0.06 m over sqrt(3) independent lags, 0.9 degrees; by far less in truth, at 10 dB
     assert towards @ right / np.linalg.norm(towards) / np.linalg.norm(right) > np.cos(np.radians(0.9))
@@ -408,12 +408,10 @@ def test_flush_tells_what_is_open() -> None:
     assert fusion.flush(now_ns(0)) == []
     said = play(fusion, node("north", range(10, 100), range(20)) + node("south", (), range(15)), 20)
     assert events_of(said) == []
-    assert fusion.event_id == f"site-{(START + 10) * 50}"
     (event,) = fusion.flush(now_ns(21))
     assert isinstance(event, Event)
     assert event.end_ns == now_ns(20)
     assert event.latency_s == pytest.approx(0.05)
-    assert fusion.event_id is None
 
 
 def test_long_pause_is_skipped() -> None:

@@ -47,11 +47,6 @@ def test_frame_is_fifty_milliseconds() -> None:
     assert FRAME_S == 0.05
 
 
-def test_frame_ends_after_its_samples_at_its_rate() -> None:
-    assert frame().end_ns == 7 * FRAME_NS + 11 + 50_000_000
-    assert frame(sample_rate_hz=32000.0).end_ns == 7 * FRAME_NS + 11 + 25_000_000
-
-
 @pytest.mark.parametrize("samples", [SAMPLES[0], SAMPLES.astype(np.float64)], ids=["one axis", "float64"])
 def test_samples_of_another_kind_are_refused(samples: Any) -> None:
     with pytest.raises(ValueError, match=r"array 'north': samples must be \(channels, n\) float32, got"):

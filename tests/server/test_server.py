@@ -146,9 +146,9 @@ def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> Non
     assert site["mode"] == "replay"
     assert arrays["now_utc"].startswith("2026-01-01T00:00:0")
     assert {array["state"] for array in arrays["arrays"]} == {"healthy"}
-    assert after[0]["mode"] == "live"
+    assert after[0]["mode"] == "replay"  # its end stays to be looked at, until a live node comes
     assert after[1]["tracks"] == []
-    assert after[2].status_code == 204
+    assert after[2].status_code == 200
 
 
 def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,9 +174,11 @@ def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> Non
         link = connected(server, REPLAY)
         wait_until(lambda: server.engine.mode == "replay", "the replay")
         link.close(bye=False)
-        wait_until(lambda: server.engine.mode == "live", "its end")
+        server.engine.wait_idle()
+        assert server.engine.mode == "replay"
         live = connected(server, LIVE)
         assert live.connected
+        wait_until(lambda: server.engine.mode == "live", "live again")
         live.close(bye=True)
 
 
@@ -298,7 +300,9 @@ def test_addresses_that_are_taken() -> None:
 
 
 def test_host_that_is_not_ours() -> None:
-    assert "cannot listen on 192.0.2.1:0" in refused({"server.http.host": "192.0.2.1"})
+    said = refused({"server.http.host": "192.0.2.1"})
+    assert said.startswith("server.http: cannot listen on 192.0.2.1:0: ")
+    assert said.endswith("; write an address of this machine")
 
 
 def test_address_of_version_six() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import pytest
 
 from livessl.messages import JsonObject
-from livessl.server.store import MAX_EVENTS_IN_MEMORY, Query, Store, StoreError
+from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 
 START_NS = 1_767_225_600_000_000_000
 NS = 1_000_000_000
@@ -80,7 +82,7 @@ def test_pages_leave_nothing_out_and_repeat_nothing(limit: int, zone: str | None
     store = filled(20)
     expected = ids(store, limit=1000, zone=zone)
     seen: list[int] = []
-    cursor: int | None = None
+    cursor: Cursor | None = None
     for page in range(100):
         events, cursor = store.find(Query(limit=limit, before=cursor, zone=zone))
         assert len(events) <= limit
@@ -108,6 +110,75 @@ def test_event_told_again_replaces_itself() -> None:
     assert found["confidence"] == 0.99
 
 
+def test_event_told_again_keeps_its_place_among_equals() -> None:
+    """A cursor that was told before stays right."""
+    store = Store()
+    for k in range(3):
+        store.add(event(k), START_NS)
+    assert ids(store) == [2, 1, 0]
+    _, cursor = store.find(Query(limit=1))
+    store.add(event(1), START_NS)
+    assert ids(store) == [2, 1, 0]
+    assert ids(store, before=cursor) == [1, 0]
+
+
+def test_time_decides_not_the_order_of_telling() -> None:
+    store = Store()
+    for k in (3, 0, 2, 1):
+        store.add(event(k), START_NS + k * NS)
+    assert ids(store) == [3, 2, 1, 0]
+    events, cursor = store.find(Query(limit=2))
+    assert ids(store, before=cursor) == [1, 0]
+    assert len(events) == 2
+
+
+@pytest.mark.parametrize("cursor", [Cursor(START_NS, 7), Cursor(-5, 1), Cursor(0, 0)])
+def test_cursor_is_told_and_understood(cursor: Cursor) -> None:
+    assert Cursor.parse(str(cursor)) == cursor
+
+
+@pytest.mark.parametrize("text", ["", "7", "7-", "-7", "a-b", "7-7 ", "٧-٧", f"{2**63}-1", f"1-{10**30}"])
+def test_text_that_is_no_cursor(text: str) -> None:
+    with pytest.raises(ValueError, match="expected the next_cursor of the page before"):
+        Cursor.parse(text)
+
+
+def test_file_that_another_program_holds(tmp_path: Path) -> None:
+    path = tmp_path / "events.db"
+    store = filled(1, path)
+    with closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreError) as caught:
+            store.add(event(1), START_NS + NS)
+        other.rollback()
+    said = str(caught.value)
+    assert said.startswith("server.events_db: event 'e-1' was not kept: database is locked;")
+    assert said.endswith("; free space or release the file")
+    store.add(event(2), START_NS + 2 * NS)
+    assert ids(store) == [2, 0]
+    store.close()
+
+
+def test_slow_query_does_not_hold_up_an_event(tmp_path: Path) -> None:
+    """The reader's lock is held throughout, as by a query that takes its time."""
+    store = filled(1, tmp_path / "events.db")
+    adding = Thread(target=lambda: store.add(event(1), START_NS + NS))
+    with store._reading.lock:
+        adding.start()
+        adding.join(timeout=5)
+        assert not adding.is_alive()
+    assert ids(store) == [1, 0]
+    store.close()
+
+
+def test_file_is_read_without_the_right_to_write(tmp_path: Path) -> None:
+    store = filled(1, tmp_path / "odd ?#%20 name.db")
+    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        store._reading.rows("DELETE FROM events")
+    assert ids(store) == [0]
+    store.close()
+
+
 def test_memory_is_bounded() -> None:
     store = filled(MAX_EVENTS_IN_MEMORY + 25)
     assert store.count() == MAX_EVENTS_IN_MEMORY
@@ -122,7 +193,7 @@ def test_file_persists(tmp_path: Path) -> None:
     again = Store(path)
     assert ids(again) == [2, 1, 0]
     again.add(event(3), START_NS)
-    assert ids(again) == [3, 2, 1, 0]
+    assert ids(again) == [2, 1, 3, 0]  # the last one told is among the oldest
     again.close()
 
 

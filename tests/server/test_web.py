@@ -5,24 +5,33 @@ from __future__ import annotations
 import json
 import math
 import re
+import socket
+import sqlite3
+from collections import deque
 from collections.abc import Iterator
+from contextlib import closing
+from itertools import count
+from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
-from livessl.capture.node import capture_recordings
-from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.capture.node import capture_recordings, send_session
+from livessl.clock import SystemClock, UnpacedClock, utc_ns, utc_text
 from livessl.core.types import FRAME_NS
+from livessl.server import app
 from livessl.server.app import Server
 from livessl.server.web import STATIC
 from small_site import SMALL, running_server, scene, scene_parts, site_of, wait_until
 
 CLOCK = SystemClock()
+RUNS = count()
 ROUTES = {
     "/api/v1/site",
     "/api/v1/arrays",
@@ -45,6 +54,14 @@ def server() -> Iterator[Server]:
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events")
         yield server
+
+
+def play(server: Server) -> None:
+    """Let the server hear the scene as a replay."""
+    send_session(
+        site_of(), server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
+    server.engine.wait_idle()
 
 
 @pytest.fixture
@@ -189,8 +206,8 @@ def test_events_of_a_zone_and_confidence(client: httpx.Client) -> None:
         ({"limit": 0}, 422, "greater than or equal to 1"),
         ({"limit": 1001}, 422, "less than or equal to 1000"),
         ({"limit": "many"}, 422, "valid integer"),
-        ({"cursor": 0}, 422, "greater than or equal to 1"),
-        ({"cursor": 10**30}, 422, "less than or equal to|valid integer"),
+        ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of the page before, got 'rubbish'"),
+        ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of the page before"),
     ],
 )
 def test_events_asked_for_wrongly(client: httpx.Client, query: dict[str, Any], status: int, said: str) -> None:
@@ -212,6 +229,25 @@ def test_health(client: httpx.Client, fresh: httpx.Client) -> None:
     assert ended["mode"] == "live"
     assert ended["uptime_s"] > 0
     assert ended["reasons"] == ["north: its node has ended", "south: its node has ended"]
+
+
+def test_database_that_takes_nothing_ends_nothing(tmp_path: Path) -> None:
+    """Events are published all the same, and everyone is told that their history is lost."""
+    path = tmp_path / "events.db"
+    with running_server(site_of({"server.events_db": str(path)})) as server, closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with live(server, "?kinds=event") as socket:
+            play(server)
+            told = [json.loads(socket.recv(timeout=10))["kind"] for _ in range(3)]
+        other.rollback()
+        assert told == ["hello", "event", "event"]
+        with httpx.Client(base_url=server.url) as client:
+            assert get(client, "events")["events"] == []
+            assert "\nlivessl_events_unkept_total 2.0\n" in client.get("/metrics").text
+            lost = "server.events_db: 2 events were not kept; free space or release the file"
+            assert lost in get(client, "health")["reasons"]
+            play(server)
+            wait_until(lambda: len(get(client, "events")["events"]) == 2, "both events, now that the file is free")
 
 
 def floats(response: httpx.Response) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -284,6 +320,8 @@ def test_metrics(client: httpx.Client) -> None:
 
     assert value("livessl_events_total") == 2
     assert value("livessl_events_stored") == 2
+    assert value("livessl_events_unkept_total") == 0
+    assert value("livessl_sink_failures_total") == 0
     assert value("livessl_messages_refused_total") == 0
     assert value("livessl_uptime_seconds") > 0
     for array in ("north", "south"):
@@ -321,8 +359,9 @@ def test_reading_only(client: httpx.Client) -> None:
     assert client.delete("/api/v1/events/x").status_code == 405
 
 
-def live(server: Server, query: str = "") -> Any:
-    return connect(f"ws{server.url.removeprefix('http')}/api/v1/live{query}", open_timeout=5)
+def live(server: Server, query: str = "", origin: str | None = None) -> Any:
+    url = f"ws{server.url.removeprefix('http')}/api/v1/live{query}"
+    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=5)
 
 
 def test_live_begins_with_a_greeting(server: Server) -> None:
@@ -348,6 +387,56 @@ def test_live_with_a_wrong_filter_says_why(server: Server, query: str, said: str
         socket.recv(timeout=5)
     assert caught.value.rcvd is not None
     assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, said)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://evil.example:80", "null", "http://["])
+def test_page_of_another_server_may_not_listen(server: Server, origin: str) -> None:
+    with live(server, origin=origin) as socket, pytest.raises(ConnectionClosed) as caught:
+        socket.recv(timeout=5)
+    assert caught.value.rcvd is not None
+    assert caught.value.rcvd.code == 1008
+    assert caught.value.rcvd.reason.startswith("origin: ")
+
+
+def test_our_own_page_may_listen(server: Server) -> None:
+    with live(server, origin=server.url) as socket:
+        assert json.loads(socket.recv(timeout=5))["kind"] == "hello"
+
+
+def test_name_that_was_made_to_point_here_is_refused(server: Server, client: httpx.Client) -> None:
+    """DNS rebinding: the browser believes that we are its own page's server."""
+    port = server.url.rpartition(":")[2]
+    for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", ""):
+        assert client.get("/api/v1/site", headers={"Host": host}).status_code == 400, host
+    for host in (f"127.0.0.1:{port}", f"localhost:{port}", "LocalHost", f"[::1]:{port}", "[::1]"):
+        assert client.get("/api/v1/site", headers={"Host": host}).status_code == 200, host
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://evil.example:{port}/api/v1/live", sock=socket.create_connection(("127.0.0.1", int(port))))
+
+
+def test_open_to_the_network_it_has_any_name() -> None:
+    with running_server(site_of({"server.http.host": "0.0.0.0"})) as server:
+        url = server.url.replace("0.0.0.0", "127.0.0.1")
+        assert httpx.get(f"{url}/api/v1/health", headers={"Host": "lab-pc.local:8000"}).status_code == 200
+
+
+def test_subscriber_who_says_too_much_is_cut_off(server: Server) -> None:
+    with live(server) as talkative:
+        talkative.send("x" * 4096)
+        assert json.loads(talkative.recv(timeout=5))["kind"] == "hello"
+        talkative.send("x" * 4097)
+        with pytest.raises(ConnectionClosed) as caught:
+            deque(talkative, maxlen=0)
+    assert caught.value.rcvd is not None
+    assert caught.value.rcvd.code == 1009  # message too big
+
+
+def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(app, "MAX_CONNECTIONS", 2)
+    with running_server(site_of()) as server:
+        assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
+        with live(server):
+            assert httpx.get(f"{server.url}/api/v1/health").status_code == 503
 
 
 def test_live_filters_kinds(server: Server) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import soundfile
 
 from livessl.clock import Clock
-from livessl.core.types import Block, Float32Array
+from livessl.core.types import MAX_SAMPLE, Block, Float32Array
 
 BLOCK_S: Final = 0.02
 """Length of the blocks that recordings are read in: as an audio interface would deliver them."""
@@ -83,7 +83,7 @@ class WavRecording:
     Raises
     ------
     DeviceError
-        Where it cannot be read, is empty, silent throughout, or holds NaN.
+        Where it cannot be read, is empty, silent throughout, or holds NaN or samples beyond `MAX_SAMPLE`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -115,7 +115,7 @@ class WavRecording:
     def _check(self, file: soundfile.SoundFile) -> None:
         if file.frames == 0:
             raise DeviceError(f"{self.name}: expected sound, got a file of zero length; record it again")
-        may_hold_nan = file.subtype in ("FLOAT", "DOUBLE")
+        may_hold_anything = file.subtype in ("FLOAT", "DOUBLE")
         silent, position = True, 0
         for samples in file.blocks(_SCAN_SAMPLES, dtype="float32", always_2d=True):
             if not np.isfinite(samples).all():
@@ -124,9 +124,15 @@ class WavRecording:
                     f"{self.name}: expected finite samples, got NaN or infinity at sample {position + bad} of "
                     f"channel {channel + 1}; export it again"
                 )
+            if np.abs(samples).max() > MAX_SAMPLE:
+                bad, channel = np.argwhere(np.abs(samples) > MAX_SAMPLE)[0]
+                raise DeviceError(
+                    f"{self.name}: expected samples around 1 at full scale, got {samples[bad, channel]:g} at sample "
+                    f"{position + bad} of channel {channel + 1}; export it again"
+                )
             silent = silent and not samples.any()
             position += len(samples)
-            if not silent and not may_hold_nan:
+            if not silent and not may_hold_anything:
                 return
         if silent:
             raise DeviceError(f"{self.name}: expected sound, got all-zero samples; was the right input recorded?")

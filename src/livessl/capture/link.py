@@ -23,6 +23,9 @@ HELLO_NS: Final = 1_000_000_000
 SILENT_NS: Final = 2_000_000_000
 """The server acknowledges at least twice a second; so long without a word means that it is gone."""
 
+ANSWER_NS: Final = 10_000_000_000
+"""A replay, which somebody waits for, gives up after so long; a node never does."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -53,6 +56,7 @@ class Link:
         self.endpoint = endpoint
         self._hello = hello
         self._clock = clock
+        self._begun_ns = clock.monotonic_ns()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -66,14 +70,14 @@ class Link:
         self._unacknowledged: deque[_Kept] = deque()
         self._bytes = 0
         self._heard_ns = self._hello_ns = self._sent_ns = -SILENT_NS
-        self._greeted = False
+        self._greeted = self._missed = False
         self._complaint: str | None = None
         self.dropped = 0
 
     @property
     def connected(self) -> bool:
         """Whether the server has answered lately."""
-        return self._greeted and self._clock.now_ns() - self._heard_ns < SILENT_NS
+        return self._greeted and self._clock.monotonic_ns() - self._heard_ns < SILENT_NS
 
     @property
     def refused(self) -> str | None:
@@ -108,11 +112,17 @@ class Link:
     def service(self) -> None:
         """Read acknowledgements, greet if nobody knows us, send what waits."""
         self._receive()
-        now_ns = self._clock.now_ns()
+        now_ns = self._clock.monotonic_ns()
         if not self.connected:
             if self._greeted:
                 _log.warning("no word from the server at %s; keeping sound and trying on", self.endpoint)
                 self._lose()
+            elif not self._missed and now_ns - self._begun_ns >= SILENT_NS:
+                self._missed = True
+                _log.warning(
+                    "no server answers at %s; keeping sound and trying on. Is `livessl serve` running there?",
+                    self.endpoint,
+                )
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()
             return
@@ -129,8 +139,10 @@ class Link:
                 self._unacknowledged.append(kept)
 
     def wait_connected(self, stop: Callable[[], bool]) -> None:
-        """Return when the server has answered, one way or the other, or on `stop`: a replay does not begin before."""
+        """Return when the server has answered, one way or the other, on `stop`, or after `ANSWER_NS`."""
         while not (self.connected or self.refused or stop()):
+            if self._clock.monotonic_ns() - self._begun_ns > ANSWER_NS:
+                return
             self.service()
             self._socket.poll(20)
 
@@ -167,7 +179,7 @@ class Link:
                 _log.error("the server at %s refuses us: %s", self.endpoint, ack.refused)
             self._complaint = ack.refused
             return
-        self._heard_ns = self._clock.now_ns()
+        self._heard_ns = self._clock.monotonic_ns()
         self._complaint = None
         if not self._greeted:
             _log.info("connected to the server at %s", self.endpoint)
@@ -187,7 +199,7 @@ class Link:
 
     def _say_hello(self) -> None:
         if self._try_send(wire.encode(self._hello)):
-            self._hello_ns = self._clock.now_ns()
+            self._hello_ns = self._clock.monotonic_ns()
 
     def _forget_mark(self, array: str) -> None:
         for index, kept in enumerate(self._unsent):
@@ -201,5 +213,5 @@ class Link:
             self._socket.send(data, zmq.NOBLOCK)
         except zmq.Again:
             return False
-        self._sent_ns = self._clock.now_ns()
+        self._sent_ns = self._clock.monotonic_ns()
         return True

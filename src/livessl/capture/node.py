@@ -15,7 +15,7 @@ from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
 
 DRAIN_NS: Final = 3_000_000_000
-"""How long a recording's end waits for the server's last acknowledgement."""
+"""How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""
 
 WAIT_NS: Final = 20_000_000
 
@@ -100,6 +100,9 @@ def send_session(
     lines = [part.line(site) for part in parts]
     link = _link("replay", endpoint, lines, clock, run_id, replay=True)
     link.wait_connected(stop)
+    if not (link.connected or link.refused or stop()):
+        link.close(bye=False)
+        raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
     for end_ns, batch in played_messages(lines, _placed(parts), pace):
         if stop() or link.refused:
             break
@@ -122,8 +125,10 @@ def _placed(parts: Sequence[Part]) -> list[Placed]:
 
 def _finish(link: Link, clock: Clock, stop: Stop) -> None:
     """Wait for the last acknowledgement, then say good-bye."""
-    deadline_ns = clock.now_ns() + DRAIN_NS
-    while link.pending and not (stop() or link.refused) and clock.now_ns() < deadline_ns:
+    heard_ns = clock.monotonic_ns()
+    while link.pending and not (stop() or link.refused) and clock.monotonic_ns() - heard_ns < DRAIN_NS:
+        if link.connected:
+            heard_ns = clock.monotonic_ns()
         _pause(link, clock)
     undelivered, refused = link.pending + link.dropped, link.refused
     link.close(bye=True)

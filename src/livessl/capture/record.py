@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,7 +24,10 @@ from livessl.session import Piece, piece, write_session
 FLAC_MAX_CHANNELS: Final = 8
 
 Format = Literal["flac", "wav"]
-_SUBTYPES: Final[dict[str, str]] = {"flac": "PCM_24", "wav": "FLOAT"}
+_WRITTEN: Final = {"flac": ("FLAC", "PCM_24"), "wav": ("RF64", "FLOAT")}
+"""libsndfile's names. RF64 is WAV without its limit of 4 GiB, which 16 channels reach in 23 minutes at 48 kHz."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -32,6 +36,8 @@ class _Open:
     array: str
     name: str
     first_index: int
+    place: int
+    """In the list of pieces."""
 
 
 class Recorder:
@@ -83,7 +89,7 @@ class Recorder:
     @property
     def recorded(self) -> bool:
         """Whether there is anything to replay."""
-        return bool(self._pieces or self._open)
+        return bool(self._pieces)
 
     def push(self, block: Block) -> None:
         """Write a block."""
@@ -91,41 +97,51 @@ class Recorder:
             return
         if block.overflow or block.first_index != self._next_index:
             self._close_stretch()
-            self._open_stretch(block.first_index)
+            self._open_stretch(block)
         self._timeline.update(block.first_index, block.stamp_ns)
         for item in self._open:
             item.file.write(block.samples[self._channels[item.array]].T)
         self._next_index = block.first_index + int(block.samples.shape[1])
 
-    def _open_stretch(self, first_index: int) -> None:
+    def _open_stretch(self, first: Block) -> None:
+        """Begin new files, and write down when: a crash later loses no start. One stamp must do until they end."""
         self._timeline = Timeline(self._rate_hz)
         for array, channels in self._channels.items():
             kind = "wav" if len(channels) > FLAC_MAX_CHANNELS else self._kind
             name = f"{array}-{self._stretch:03d}.{kind}"
+            container, subtype = _WRITTEN[kind]
             file = soundfile.SoundFile(
                 self._directory / name,
                 "w",
                 samplerate=round(self._rate_hz),
                 channels=len(channels),
-                subtype=_SUBTYPES[kind],
+                format=container,
+                subtype=subtype,
             )
-            self._open.append(_Open(file, array, name, first_index))
+            self._open.append(_Open(file, array, name, first.first_index, len(self._pieces)))
+            self._pieces.append(piece(array, name, first.stamp_ns))
         self._stretch += 1
+        write_session(self._directory, self._site, self._pieces)
 
     def _close_stretch(self) -> None:
-        """Finish the open files, and write down what there is: a crash later loses nothing of it."""
+        """Finish the open files, and write down their start as all of their stamps tell it."""
+        if not self._open:
+            return
         for item in self._open:
             item.file.close()
-            self._pieces.append(piece(item.array, item.name, self._timeline.time_ns(item.first_index)))
+            self._pieces[item.place] = piece(item.array, item.name, self._timeline.time_ns(item.first_index))
         self._open.clear()
-        if self._pieces:
-            write_session(self._directory, self._site, self._pieces)
+        write_session(self._directory, self._site, self._pieces)
 
 
 def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) -> None:
-    """Record a device until `over`."""
+    """Record a device until `over`; what is wrong with it meanwhile is logged."""
+    problem = None
     with device, recorder:
         for block in device:
+            if device.problem != problem:
+                problem = device.problem
+                _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
             recorder.push(block)
             if over():
                 break

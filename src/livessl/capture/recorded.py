@@ -57,15 +57,19 @@ def parts_from_wavs(
     )
 
 
-def parts_from_session(site: Site, session: Session) -> list[Part]:
-    """A session's recordings at their original times.
+def parts_from_sessions(site: Site, sessions: Iterable[Session]) -> list[Part]:
+    """Sessions' recordings at their original times, as one: each node records its own.
 
     Raises
     ------
     DeviceError
         With every file that does not fit, one a line.
     """
-    return _parts(site, [(piece.array, session.path(piece), piece.start_ns) for piece in session.pieces], {})
+    return _parts(
+        site,
+        [(piece.array, session.path(piece), piece.start_ns) for session in sessions for piece in session.pieces],
+        {},
+    )
 
 
 def common_start_ns(now_ns: int, nodes: int) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from livessl.core import peaks
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
-from livessl.core.gcc import GCCPhat
+from livessl.core.gcc import GCCPhat, uses_envelope
 from livessl.core.geometry import Grid
 from livessl.core.srp import HeardBy, SRPFunctional, SRPMapper, alias_free_hz
 from livessl.core.types import ArraySpec, Float32Array, FloatArray, IntArray
@@ -73,7 +73,7 @@ class SrpPhat:
         self._grid = grid
         self._c_m_s = c_m_s
         self._band_limit = band_limit
-        self._tools: dict[tuple[str, float], tuple[GCCPhat, SRPMapper, Sequence[float]]] = {}
+        self._tools: dict[str, tuple[float, GCCPhat, SRPMapper, Sequence[float]]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
@@ -100,16 +100,17 @@ class SrpPhat:
         )
 
     def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper, Sequence[float]]:
-        key = (array, sample_rate_hz)
-        if key not in self._tools:
-            spec = self._arrays[array]
-            correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s, self.front_end)
-            cut_offs_hz: Sequence[float] = ()
-            if not correlate.is_envelope and self._limits_band(spec, correlate.pairs):
-                cut_offs_hz = third_octaves_below_hz(spec.band_hz)
-            mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s, cut_offs_hz)
-            self._tools[key] = (correlate, mapper, cut_offs_hz)
-        return self._tools[key]
+        known = self._tools.get(array)
+        if known is not None and known[0] == sample_rate_hz:
+            return known[1:]
+        spec = self._arrays[array]
+        correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s, self.front_end)
+        cut_offs_hz: Sequence[float] = ()
+        if not uses_envelope(spec.band_hz) and self._limits_band(spec, correlate.pairs):
+            cut_offs_hz = third_octaves_below_hz(spec.band_hz)
+        mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s, cut_offs_hz)
+        self._tools[array] = (sample_rate_hz, correlate, mapper, cut_offs_hz)
+        return correlate, mapper, cut_offs_hz
 
     def _limits_band(self, spec: ArraySpec, pairs: IntArray) -> bool:
         if self._band_limit is not None:

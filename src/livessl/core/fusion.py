@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.activity import THRESHOLD, exact_mask, runs
+from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
 from livessl.core.estimators import Estimator, Localization, Sound
 from livessl.core.geometry import direction_deg
 from livessl.core.tracker import SILENCE_S, Tracker
@@ -56,6 +56,11 @@ JUMP_FRAMES: Final = 1200
 
 RANGE_UNKNOWN: Final = 0.25
 """Where the position's spread exceeds this share of the distance to the nearest array, only the direction is told."""
+
+
+RANGE_APERTURES: Final = 2.0
+"""Further away than so many times its own width, an array alone tells no distance: what reverberation does to its
+delays, which the covariance cannot know, moves the place along the line of sight by metres."""
 
 
 class ArrayState(StrEnum):
@@ -202,11 +207,6 @@ class Fusion:
         self._now_ns = 0
         self.unknown_arrays = 0
 
-    @property
-    def event_id(self) -> str | None:
-        """Id of the event that is going on, if one is."""
-        return None if self._event is None else self._id(self._event.start)
-
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
         outputs = self._start_over() if self._went_back(now_ns) else []
@@ -288,9 +288,11 @@ class Fusion:
             stream.worry(self._now_ns, "its frames come after their deadline")
             if self._event is not None:
                 self._event.late_frames += 1
+        if frame.sample_rate_hz != stream.rate_hz:
+            stream.frames.clear()  # its node came back with another device: the two do not make one sound
+            stream.rate_hz = frame.sample_rate_hz
         stream.frames[frame.raster] = frame
         stream.counters["frames"] += 1
-        stream.rate_hz = frame.sample_rate_hz
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
         return True
@@ -424,12 +426,13 @@ class Fusion:
     def _judge(self, estimate: Estimate) -> tuple[Status, str | None]:
         """Whether the estimate is a place, or only a direction, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
-        centres = [self._streams[name].spec.centre_m for name in estimate.arrays]
-        nearest_m = min(direction_deg(centre, estimate.position_m)[2] for centre in centres)
-        if spread_m <= RANGE_UNKNOWN * nearest_m:
+        specs = [self._streams[name].spec for name in estimate.arrays]
+        nearest_m = min(direction_deg(spec.centre_m, estimate.position_m)[2] for spec in specs)
+        alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
+        if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
             return Status.LOCATED, None
-        who = "one array cannot" if len(centres) == 1 else "these arrays cannot"
-        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: +-{spread_m:.2f} m at {nearest_m:.2f} m"
+        who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
+        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
     def _contributions(self, powers: Mapping[str, FloatArray], estimate: Estimate) -> tuple[Contribution, ...]:
         return tuple(_contribution(self._streams[name].spec, powers[name], estimate) for name in powers)
@@ -490,12 +493,20 @@ def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
         age_s=None if age_ns is None else age_ns / 1e9,
         power=stream.power,
         noise_power=mark.noise_power if mark else None,
-        channel_power=mark.channel_power if mark else (),
+        channel_power=_channel_power(stream),
         sample_rate_hz=stream.rate_hz,
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,
         counters=dict(stream.counters),
     )
+
+
+def _channel_power(stream: _Stream) -> tuple[float, ...]:
+    """Of the newest interval, whether it was a mark or a frame."""
+    newest = stream.frames.get(stream.watermark) if stream.watermark is not None else None
+    if newest is not None:
+        return tuple(float(power) for power in band_power(newest.samples, newest.sample_rate_hz, stream.spec.band_hz))
+    return stream.mark.channel_power if stream.mark else ()
 
 
 def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState, str | None]:
@@ -505,7 +516,8 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
     if stream.left:
         return ArrayState.LOST, "its node has ended"
     if age_ns >= LOST_NS:
-        return ArrayState.LOST, stream.trouble if troubled else f"nothing heard from it for {age_ns / 1e9:.0f} s"
+        silence = f"nothing heard from it for {age_ns / 1e9:.0f} s"
+        return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
     if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
         dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]
         which = "all channels are" if len(dead) == len(stream.mark.channel_power) else f"microphone {dead} is"

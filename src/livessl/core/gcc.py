@@ -66,7 +66,7 @@ class GCCPhat:
     def __init__(
         self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float, front_end: FrontEnd = whole_segment
     ) -> None:
-        low, high = spec.band_hz
+        high = spec.band_hz[1]
         if high >= sample_rate_hz / 2:
             raise ValueError(
                 f"array {spec.name!r}: band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, "
@@ -76,7 +76,7 @@ class GCCPhat:
         self._band_hz = spec.band_hz
         self._rate_hz = sample_rate_hz
         self._front_end = front_end
-        self._envelope = low > ENVELOPE_ABOVE * (high - low)
+        self._envelope = uses_envelope(spec.band_hz)
         largest = spec.aperture_m / c_m_s * sample_rate_hz
         fine = int(np.ceil(largest * OVERSAMPLING)) + 2 * OVERSAMPLING
         self.lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
@@ -102,11 +102,6 @@ class GCCPhat:
                 part += segment.shape[1] * cross.correlations(self._coarse, cut_off_hz, envelope=self._envelope)
         total /= max(1, sum(segment.shape[1] for segment in segments))
         return [self._fine(part) for part in total]
-
-    @property
-    def is_envelope(self) -> bool:
-        """Whether R is a magnitude: an envelope's width is the band's, and no spatial aliasing threatens it."""
-        return self._envelope
 
     def _fine(self, total: ComplexArray) -> GCC:
         correlation = total if self._envelope else total.real
@@ -167,6 +162,12 @@ class CrossSpectra:
             correlation = (scipy.fft.irfft(spectrum, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
         around = np.concatenate([correlation[:, -reach:], correlation[:, : reach + 1]], axis=1)
         return np.asarray(around / self._share, dtype=np.complex64)
+
+
+def uses_envelope(band_hz: tuple[float, float]) -> bool:
+    """Whether R is the magnitude instead of the real part: see `GCCPhat`."""
+    low, high = band_hz
+    return low > ENVELOPE_ABOVE * (high - low)
 
 
 def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:

@@ -49,6 +49,7 @@ class Segmenter:
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=round(parameters.pre_roll_s / FRAME_S))
         self._quiet_frames = self._hang_over + 1
         self._sequence = 0
+        self._raster: int | None = None
 
     @property
     def array(self) -> str:
@@ -57,6 +58,10 @@ class Segmenter:
 
     def push(self, cut: Cut, framer: Framer) -> list[Message]:
         """Take in the next raster interval; `framer` tells how the device is doing."""
+        if self._raster is not None and cut.raster != self._raster + 1:
+            self._pre_roll.clear()  # what came before a gap is no run-up to what comes after it
+            self._quiet_frames = self._hang_over + 1
+        self._raster = cut.raster
         power = band_power(self._selected(cut), self._rate_hz, self._spec.band_hz)
         if self._warm_up is None:
             return self._decide(cut, power, framer)

@@ -25,6 +25,10 @@ FRAME_S: Final = FRAME_NS / 1e9
 MIN_MICROPHONES: Final = 2
 MAX_MICROPHONES: Final = 16
 
+MAX_SAMPLE: Final = 1e6
+"""120 dB above full scale: no converter gives more, and what does is a broken file or sender, whose one sample would
+drown every other array."""
+
 
 class ClockState(StrEnum):
     """How far a node's mapping from sample index to site time can be trusted."""
@@ -124,11 +128,6 @@ class Frame:
                 f"got {self.samples.shape} {self.samples.dtype}"
             )
         read_only(self.samples)
-
-    @property
-    def end_ns(self) -> int:
-        """Site time just after the last sample, in nanoseconds."""
-        return self.time_ns + round(int(self.samples.shape[1]) / self.sample_rate_hz * 1e9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,9 +388,9 @@ class MapSnapshot:
     ----------
     time_ns : int
         Site time at the middle of the window.
-    fused : (nx, ny, nz) float32
-        Sum over the arrays.
-    arrays : mapping of name to (nx, ny, nz) float32
+    fused : (G,) float32
+        Sum over the arrays at every grid node, in the grid's order.
+    arrays : mapping of name to (G,) float32
         One map each.
     """
 

@@ -152,8 +152,7 @@ def make_plan(
     Raises
     ------
     ValueError
-        Where the room cannot have the reverberation time, the height lies outside the search volume, or the search
-        volume outside the room.
+        Where the room cannot have the reverberation time, or the height lies outside the search volume.
     """
     alpha = absorption(rt60_s, site.room.size_m, site.c_m_s)
     conditions = planning.Conditions(
@@ -193,15 +192,10 @@ def make_plan(
 
 
 def _volume(site: Site) -> Grid:
-    """What of the search volume is in the room, with the site's own spacing."""
+    """What of the search volume is in the room (some is: the site was checked), with the site's own spacing."""
     grid = site.search_grid()
     low = np.maximum(grid.lower_m, 0.0)
     high = np.minimum(grid.upper_m, site.room.size_m)
-    if (low > high).any():
-        raise ValueError(
-            f"grid.bounds_m: expected a search volume in the room of {_by(site.room.size_m)} m, got none of it there; "
-            "correct the bounds or room.size_m"
-        )
     x, y, z = ((float(a), float(b)) for a, b in zip(low, high, strict=True))
     return Grid((x, y, z), grid.spacing_m)
 
@@ -267,7 +261,3 @@ def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> Arr
 def _shares(limits_hz: FloatArray) -> tuple[float, ...]:
     """Percentiles; "lower", as an interpolation with an infinite limit would be none."""
     return tuple(float(value) for value in np.percentile(limits_hz, SHARES, method="lower"))
-
-
-def _by(size_m: tuple[float, float, float]) -> str:
-    return " x ".join(f"{length:g}" for length in size_m)

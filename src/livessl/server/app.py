@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import socket
 from collections.abc import Callable
@@ -24,6 +25,12 @@ from livessl.server.web import create_app
 
 SHUTDOWN_S: Final = 2
 """Open connections get this long to end."""
+
+MAX_CONNECTIONS: Final = 1000
+"""More than any site has clients, and fewer than the 1024 open files that most systems allow a process."""
+
+MAX_SAID_BYTES: Final = 4096
+"""Of a subscriber, who has nothing to say."""
 
 _log = logging.getLogger(__name__)
 
@@ -68,12 +75,14 @@ class Server:
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish, method)
             undo.pop_all()
-        app = create_app(site, self.engine, self._hub, self._store)
+        app = create_app(site, self.engine, self._hub, self._store, self._sinks)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
                 log_level="warning",
-                ws_per_message_deflate=False,  # costs thirty times what it saves on small messages
+                limit_concurrency=MAX_CONNECTIONS,
+                ws_max_size=MAX_SAID_BYTES,
+                ws_per_message_deflate=False,  # small messages hardly shrink, and each would cost time and memory
                 timeout_graceful_shutdown=SHUTDOWN_S,
             )
         )
@@ -135,8 +144,12 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.listen(128)
     except OSError as error:
         listener.close()
-        raise BindError(
-            f"server.http: cannot listen on {host}:{port}: {error.strerror}; is another server running? "
-            "Stop it or choose another port"
-        ) from error
+        cure = _CURES.get(error.errno or 0, "write an address of this machine")
+        raise BindError(f"server.http: cannot listen on {host}:{port}: {error.strerror}; {cure}") from error
     return listener
+
+
+_CURES: Final = {
+    errno.EADDRINUSE: "is another server running? Stop it or choose another port",
+    errno.EACCES: "choose a port from 1024 on",
+}

@@ -14,7 +14,7 @@ from livessl.core.fusion import ArrayStatus
 from livessl.core.types import FRAME_NS, Event, MapSnapshot, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, array_status
 from livessl.server.receiver import Joined, Left, Receiver
-from livessl.server.store import Store
+from livessl.server.store import Store, StoreError
 
 WAIT_S: Final = 0.02
 """How long the thread waits for sound before it looks at the clock again."""
@@ -63,12 +63,15 @@ class Engine:
         self._lock = threading.Lock()
         self._map: MapSnapshot | None = None
         self._tracks: dict[int, JsonObject] = {}
+        self._states: dict[str, str] = {}
         self._replay_now_ns: int | None = None
         self._replay_heard_ns = 0
+        self._replaying = False
         self._status_ns = 0
         self._failure: BaseException | None = None
-        self._started_ns = clock.now_ns()
+        self._started_ns, self._began_ns = clock.now_ns(), clock.monotonic_ns()
         self.events = 0
+        self.unkept = 0
         self._begin()
         self._receiver = Receiver(site, clock)
 
@@ -84,7 +87,7 @@ class Engine:
 
     @property
     def mode(self) -> str:
-        """Live, or replay while a recorded session is being played."""
+        """Live; or replay from a recorded session's first sound on, until a live node comes."""
         return "live" if self._replay_now_ns is None else "replay"
 
     @property
@@ -106,7 +109,7 @@ class Engine:
 
     def wait_idle(self) -> None:
         """Return when the replay that is going on has ended and its last event is told."""
-        while self._replay_now_ns is not None and self.failure is None and self._thread.is_alive():
+        while self._replaying and self.failure is None and self._thread.is_alive():
             self._stop.wait(WAIT_S)
 
     def now_ns(self) -> int:
@@ -116,7 +119,7 @@ class Engine:
 
     def uptime_s(self) -> float:
         """Seconds since the start."""
-        return (self._clock.now_ns() - self._started_ns) / 1e9
+        return (self._clock.monotonic_ns() - self._began_ns) / 1e9
 
     def arrays(self) -> list[JsonObject]:
         """How every array is doing; from any thread."""
@@ -170,24 +173,35 @@ class Engine:
             else:
                 batch.append(item)
         self._step(batch)
-        now_ns = self._clock.now_ns()
+        now_ns = self._clock.monotonic_ns()
         if batch:
             self._replay_heard_ns = now_ns
-        elif self._replay_now_ns is not None and now_ns - self._replay_heard_ns > REPLAY_SILENT_NS:
+        elif self._replaying and now_ns - self._replay_heard_ns > REPLAY_SILENT_NS:
             if any(hello.replay for hello in self._receiver.ingest.live_nodes(now_ns)):
                 self._replay_heard_ns = now_ns  # a gap in the recording
             else:
                 self._end_replay()
         if now_ns - self._status_ns >= STATUS_NS:
             self._status_ns = now_ns
-            self._publish({"kind": "arrays", "now_utc": utc_text(self.now_ns()), "arrays": self.arrays()})
+            self._tell_arrays()
+
+    def _tell_arrays(self) -> None:
+        arrays = self.arrays()
+        for array in arrays:
+            before = self._states.get(array["name"])
+            if before not in (None, array["state"]):
+                why = f": {array['reason']}" if array["reason"] else ""
+                _log.info("array %r is %s%s", array["name"], array["state"], why)
+            self._states[array["name"]] = array["state"]
+        self._publish({"kind": "arrays", "now_utc": utc_text(self.now_ns()), "mode": self.mode, "arrays": arrays})
 
     def _join(self, hello: wire.Hello) -> None:
-        if hello.replay:
+        if hello.replay or self._replay_now_ns is not None:
             with self._lock:
                 self._begin()
-                self._replay_now_ns = 0
-                self._replay_heard_ns = self._clock.now_ns()
+                self._replay_now_ns = 0 if hello.replay else None
+                self._replaying = hello.replay
+                self._replay_heard_ns = self._clock.monotonic_ns()
         for array, rate_hz in hello.arrays.items():
             self._fusion.prepare(array, rate_hz)
 
@@ -201,21 +215,22 @@ class Engine:
                 self._fusion.leave(array)
 
     def _end_replay(self) -> None:
+        """Tell what is still open. Map, arrays and time stay as they were at the end, to be looked at."""
         with self._lock:
             outputs = self._fusion.flush(self.now_ns())
         self._tell(outputs)
         with self._lock:
-            self._begin()
-            self._replay_now_ns = None
             ended, self._tracks = list(self._tracks.values()), {}
         for track in ended:
             self._publish({**track, "state": str(TrackState.END)})
+        self._replaying = False
 
     def _step(self, batch: Sequence[Message]) -> None:
         if self._messages is None:
             if not batch:
                 return
-            origin_ns = min(message.raster for message in batch) * FRAME_NS
+            recorded_ns = min(message.raster for message in batch) * FRAME_NS
+            origin_ns = self._started_ns if self._replay_now_ns is None else recorded_ns
             self._messages = Messages(self._site, origin_ns, utc=True)
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
@@ -230,7 +245,11 @@ class Engine:
         for output in outputs:
             if isinstance(output, Event):
                 event = self._messages.event(output)
-                self._store.add(event, output.start_ns)
+                try:
+                    self._store.add(event, output.start_ns)
+                except StoreError as error:  # better to lose the history than the present
+                    self.unkept += 1
+                    _log.error("%s", error)
                 self.events += 1
                 self._publish(event)
             elif isinstance(output, Update):

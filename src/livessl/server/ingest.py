@@ -144,6 +144,11 @@ class Ingest:
         if unknown:
             return f"no array {unknown[0]!r} in the server's site file; it has {', '.join(self._site.arrays)}"
         for name, rate_hz in hello.arrays.items():
+            node = self._site.node_of(name)
+            stated_hz = self._site.nodes[node].device.sample_rate_hz if node else None
+            if stated_hz is not None and rate_hz != stated_hz:
+                where = f"nodes.{node}.device.sample_rate_hz"
+                return f"array {name!r}: the server's site file says {stated_hz:g} Hz ({where}), got {rate_hz:g} Hz"
             high_hz = self._site.array(name).band_hz[1]
             if high_hz >= rate_hz / 2:
                 needed = f"array {name!r} uses up to {high_hz:g} Hz and needs more than {2 * high_hz:g} Hz"

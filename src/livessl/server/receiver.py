@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 from dataclasses import dataclass
@@ -27,6 +28,13 @@ _log = logging.getLogger(__name__)
 
 class BindError(Exception):
     """The server's address cannot be taken."""
+
+
+def address_cure(number: int | None) -> str:
+    """What to do about an address that cannot be taken, by the system's error number."""
+    if number == errno.EADDRINUSE:
+        return "is another server running? Stop it or choose another port"
+    return "write an address of this machine"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +86,7 @@ class Receiver:
             self._context.term()
             raise BindError(
                 f"server.bind: cannot listen on {site.server.bind}: {zmq.strerror(error.errno or 0)}; "
-                "is another server running? Stop it or choose another port"
+                f"{address_cure(error.errno)}"
             ) from error
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
@@ -110,7 +118,7 @@ class Receiver:
             while not self._stop.is_set():
                 if self._socket.poll(POLL_MS):
                     self._drain()
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.now_ns()):
+                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
                     self._reply(routing_id, ack)
         except BaseException as error:
             self.failure = error
@@ -123,7 +131,7 @@ class Receiver:
                 routing_id, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            arrival = self.ingest.receive(routing_id, b"".join(parts), self._clock.now_ns())
+            arrival = self.ingest.receive(routing_id, b"".join(parts), self._clock.monotonic_ns())
             if arrival.joined is not None:
                 self._put(Joined(arrival.joined))
             if arrival.left is not None:
@@ -138,7 +146,7 @@ class Receiver:
             try:
                 self._queue.put(item, timeout=0.1)
             except Full:
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.now_ns()):
+                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
                     self._reply(routing_id, ack)
             else:
                 return

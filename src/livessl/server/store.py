@@ -3,16 +3,45 @@
 from __future__ import annotations
 
 import json
+import re
 import sqlite3
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from livessl.messages import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """About 10 MB. A file has no such limit."""
+
+BUSY_S: Final = 0.2
+"""How long an event waits for a file that another program holds: the engine's thread waits with it."""
+
+
+class Cursor(NamedTuple):
+    """The last event of a page: the next page begins after it."""
+
+    time_ns: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.time_ns}-{self.number}"
+
+    @classmethod
+    def parse(cls, text: str) -> Cursor:
+        """The cursor of a text.
+
+        Raises
+        ------
+        ValueError
+            Where none was ever told so.
+        """
+        parts = re.fullmatch(r"(-?[0-9]{1,19})-([0-9]{1,19})", text, re.ASCII)
+        cursor = None if parts is None else cls(*map(int, parts.groups()))
+        if cursor is None or not all(abs(part) < 2**63 for part in cursor):
+            raise ValueError(f"expected the next_cursor of the page before, got {text!r}")
+        return cursor
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,15 +53,17 @@ class Query:
     zone: str | None = None
     min_confidence: float | None = None
     limit: int = 50
-    before: int | None = None
+    before: Cursor | None = None
 
 
 class StoreError(Exception):
-    """The file cannot be used."""
+    """The file cannot be used, or takes no more."""
 
 
 class Store:
     """Keeps events; safe to call from any thread.
+
+    A file is read over a connection of its own, so that no slow query holds up an event.
 
     Parameters
     ----------
@@ -42,62 +73,89 @@ class Store:
 
     def __init__(self, path: Path | None = None) -> None:
         self._bounded = path is None
-        self._lock = threading.Lock()
         try:
-            self._db = sqlite3.connect(path or ":memory:", check_same_thread=False)
-            with self._db:
-                self._db.execute("PRAGMA journal_mode=WAL")
-                self._db.execute(
+            self._writing = self._reading = _Connection(path or ":memory:")
+            with self._writing.lock, self._writing.db as db:
+                db.execute("PRAGMA journal_mode=WAL")
+                db.execute(
                     "CREATE TABLE IF NOT EXISTS events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, "
                     "time_ns INTEGER, confidence REAL, json TEXT)"
                 )
-                self._db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
+                db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
+            if path is not None:
+                self._reading = _Connection(f"{path.resolve().as_uri()}?mode=ro")
         except sqlite3.Error as error:
             raise StoreError(
                 f"server.events_db: cannot use {path}: {error}; name a file in a writable folder"
             ) from error
 
     def add(self, event: JsonObject, time_ns: int) -> None:
-        """Keep an event; one of the same id is replaced."""
-        with self._lock, self._db:
-            self._db.execute(
-                "INSERT OR REPLACE INTO events (id, time_ns, confidence, json) VALUES (?, ?, ?, ?)",
-                (event["id"], time_ns, event["confidence"], json.dumps(event)),
-            )
-            if self._bounded:
-                self._db.execute(
-                    "DELETE FROM events WHERE number <= (SELECT max(number) FROM events) - ?", (MAX_EVENTS_IN_MEMORY,)
+        """Keep an event; one of the same id is replaced.
+
+        Raises
+        ------
+        StoreError
+            Where the file is locked, or its disk is full.
+        """
+        try:
+            with self._writing.lock, self._writing.db as db:
+                db.execute(
+                    "INSERT INTO events (id, time_ns, confidence, json) VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE "
+                    "SET time_ns = excluded.time_ns, confidence = excluded.confidence, json = excluded.json",
+                    (event["id"], time_ns, event["confidence"], json.dumps(event)),
                 )
+                if self._bounded:
+                    db.execute(
+                        "DELETE FROM events WHERE number <= (SELECT max(number) FROM events) - ?",
+                        (MAX_EVENTS_IN_MEMORY,),
+                    )
+        except sqlite3.Error as error:
+            raise StoreError(
+                f"server.events_db: event {event['id']!r} was not kept: {error}; free space or release the file"
+            ) from error
 
     def get(self, event_id: str) -> JsonObject | None:
         """The event of that id."""
-        with self._lock:
-            row = self._db.execute("SELECT json FROM events WHERE id = ?", (event_id,)).fetchone()
-        return None if row is None else dict(json.loads(row[0]))
+        rows = self._reading.rows("SELECT json FROM events WHERE id = ?", (event_id,))
+        return dict(json.loads(rows[0][0])) if rows else None
 
-    def find(self, query: Query) -> tuple[list[JsonObject], int | None]:
-        """Events newest first, and the cursor of the next page or None."""
-        conditions = {
-            "time_ns >= ?": query.since_ns,
-            "time_ns <= ?": query.until_ns,
-            "confidence >= ?": query.min_confidence,
-            "number < ?": query.before,
-            "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": query.zone,
+    def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
+        """Events newest first by their time, and the cursor of the next page or None."""
+        conditions: dict[str, tuple[Any, ...]] = {
+            "time_ns >= ?": (query.since_ns,),
+            "time_ns <= ?": (query.until_ns,),
+            "confidence >= ?": (query.min_confidence,),
+            "(time_ns, number) < (?, ?)": query.before or (None,),
+            "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": (query.zone,),
         }
-        asked = {text: value for text, value in conditions.items() if value is not None}
+        asked = {text: values for text, values in conditions.items() if values != (None,)}
         where = f"WHERE {' AND '.join(asked)} " if asked else ""
-        sql = f"SELECT number, json FROM events {where}ORDER BY number DESC LIMIT ?"  # noqa: S608 - fixed texts
-        with self._lock:
-            rows = self._db.execute(sql, (*asked.values(), query.limit + 1)).fetchall()
+        sql = f"SELECT time_ns, number, json FROM events {where}ORDER BY time_ns DESC, number DESC LIMIT ?"  # noqa: S608 - fixed texts
+        rows = self._reading.rows(sql, (*(value for values in asked.values() for value in values), query.limit + 1))
         page = rows[: query.limit]
-        return [json.loads(text) for _, text in page], page[-1][0] if len(rows) > query.limit else None
+        following = Cursor(*page[-1][:2]) if len(rows) > query.limit else None
+        return [json.loads(text) for _, _, text in page], following
 
     def count(self) -> int:
         """How many events are kept."""
-        with self._lock:
-            return int(self._db.execute("SELECT count(*) FROM events").fetchone()[0])
+        return int(self._reading.rows("SELECT count(*) FROM events")[0][0])
 
     def close(self) -> None:
         """Release the file."""
-        with self._lock:
-            self._db.close()
+        for connection in (self._reading, self._writing):
+            with connection.lock:
+                connection.db.close()
+
+
+class _Connection:
+    """A connection to the database, and the lock that whoever uses it holds."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.lock = threading.Lock()
+        uri = str(path).startswith("file:")
+        self.db = sqlite3.connect(path, timeout=BUSY_S, check_same_thread=False, uri=uri)
+
+    def rows(self, sql: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """All rows of a query."""
+        with self.lock:
+            return self.db.execute(sql, values).fetchall()

@@ -15,6 +15,7 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
 from livessl.clock import utc_ns, utc_text
@@ -24,8 +25,9 @@ from livessl.messages import API_VERSION, JsonObject
 from livessl.server.engine import Engine
 from livessl.server.hub import Filter, Hub, Subscription
 from livessl.server.png import map_png
+from livessl.server.sinks import Sinks
+from livessl.server.store import Cursor, Store
 from livessl.server.store import Query as EventQuery
-from livessl.server.store import Store
 
 STATIC: Final = Path(__file__).parent / "static"
 
@@ -42,7 +44,7 @@ VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
 _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
 
 
-def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
+def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> FastAPI:
     """The application around a running engine."""
     app = FastAPI(
         title="livessl",
@@ -53,6 +55,10 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
         openapi_url="/api/v1/openapi.json",
     )
 
+    if _is_loopback(site.server.http.host):
+        # else a page from anywhere could have its own name point here, and read as if it were ours
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
+
     @app.middleware("http")
     async def _headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
         response: Response = await proceed(request)
@@ -61,7 +67,7 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store) -> FastAPI:
         response.headers.setdefault("Cache-Control", "no-cache")
         return response
 
-    _add_state_routes(app, site, engine, hub, store)
+    _add_state_routes(app, site, engine, hub, store, sinks)
     _add_event_routes(app, site, store)
     _add_map_route(app, site, engine)
     _add_live_route(app, site, engine, hub)
@@ -101,7 +107,11 @@ def describe_site(site: Site, mode: str) -> JsonObject:
     }
 
 
-def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store) -> None:
+def _is_loopback(host: str) -> bool:
+    return host in ("127.0.0.1", "localhost", "::1")
+
+
+def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
     @app.get("/api/v1/site", tags=["state"])
     def get_site() -> JsonObject:
         """Room, grid, arrays and settings."""
@@ -124,6 +134,9 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
         states = {a["state"] for a in arrays}
         status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
+        if engine.unkept:
+            reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
+            status = "degraded" if status == "ok" else status
         if engine.failure is not None:
             status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
             response.status_code = 503
@@ -138,7 +151,7 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         }
 
     registry = CollectorRegistry()
-    registry.register(_Metrics(engine, hub, store))
+    registry.register(_Metrics(engine, hub, store, sinks))
 
     @app.get("/metrics", tags=["state"], response_class=PlainTextResponse)
     def get_metrics() -> PlainTextResponse:
@@ -154,14 +167,16 @@ def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
         zone: Annotated[str | None, Query(description="only events inside this zone")] = None,
         min_confidence: Annotated[float | None, Query(ge=0, le=1)] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 50,
-        cursor: Annotated[int | None, Query(ge=1, le=2**62, description="next_cursor of the page before")] = None,
+        cursor: Annotated[str | None, Query(description="next_cursor of the page before")] = None,
     ) -> JsonObject:
         """Finished events, newest first."""
         if zone is not None and zone not in site.zones:
             raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
-        query = EventQuery(_instant("since", since), _instant("until", until), zone, min_confidence, limit, cursor)
+        query = EventQuery(
+            _instant("since", since), _instant("until", until), zone, min_confidence, limit, _cursor(cursor)
+        )
         events, following = store.find(query)
-        return {"v": API_VERSION, "events": events, "next_cursor": following}
+        return {"v": API_VERSION, "events": events, "next_cursor": None if following is None else str(following)}
 
     @app.get("/api/v1/events/{event_id}", tags=["estimates"])
     def get_event(event_id: str) -> JsonObject:
@@ -180,6 +195,13 @@ def _instant(name: str, text: str | None) -> int | None:
     except (ValueError, OverflowError) as error:
         raise HTTPException(422, f"{name}: {error}") from error
     return max(-(2**63), min(2**63 - 1, time_ns))
+
+
+def _cursor(text: str | None) -> Cursor | None:
+    try:
+        return None if text is None else Cursor.parse(text)
+    except ValueError as error:
+        raise HTTPException(422, f"cursor: {error}") from error
 
 
 def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
@@ -234,6 +256,7 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
     ) -> None:
         await socket.accept()  # a reason can only be told to a client that is connected
         try:
+            _refuse_strangers(socket)
             wanted = _filter(site, kinds, min_confidence, zone)
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
@@ -258,6 +281,13 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
             for task in (sending, listening):
                 task.cancel()
             await asyncio.gather(sending, listening, return_exceptions=True)
+
+
+def _refuse_strangers(socket: WebSocket) -> None:
+    """A page from elsewhere may not listen: browsers keep it from reading our answers, but not our WebSocket."""
+    origin = socket.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
+        raise ValueError("origin: pages of other servers may not listen")
 
 
 def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
@@ -295,16 +325,19 @@ async def _until_gone(socket: WebSocket) -> None:
 class _Metrics(Collector):
     """Everything countable, read when it is asked for."""
 
-    def __init__(self, engine: Engine, hub: Hub, store: Store) -> None:
+    def __init__(self, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
         self._engine = engine
         self._hub = hub
         self._store = store
+        self._sinks = sinks
 
     def collect(self) -> Iterator[Metric]:
         yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", self._engine.uptime_s())
         yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
+        yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
+        yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
         yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])

@@ -78,6 +78,7 @@ const HEARD = {
     heat.want();
   },
   arrays(message) {
+    if (message.mode && message.mode !== state.mode) changeMode(message.mode);
     const sentMs = utc(message.now_utc);
     const now = Date.now();
     if (sentMs !== null) serverClock.learn(sentMs, now);
@@ -232,6 +233,19 @@ function announce(event) {
   const told = verdict(event);
   const placed = event.status === "located" && event.position_m;
   write(find("announce"), `Event at ${when(event, serverNow())}: ${placed ? position(event.position_m) : told}`);
+}
+
+/** From live to a replay or back: another time, in which nothing that is on the page happened. */
+function changeMode(mode) {
+  const first = state.mode === null;
+  setSite(state.site?.site, mode);
+  if (first) return;
+  serverClock.reset();
+  state.tracks.clear();
+  state.current.clear();
+  state.trail = [];
+  state.last = null;
+  loadEvents();
 }
 
 function setSite(name, mode) {

@@ -67,7 +67,7 @@ export class Readout {
 function instead(message) {
   const bearing = message.contributions?.[0];
   if (message.status === "direction-only" && bearing) {
-    const where = `azimuth ${number(bearing.azimuth_deg, 0)}°, elevation ${number(bearing.elevation_deg, 0)}° from ${bearing.array}`;
+    const where = `azimuth ${number(bearing.azimuth_deg, 0)}°, elevation ${number(bearing.elevation_deg, 0)}° seen from array ${bearing.array}`;
     return message.reason ? `${where} (${message.reason})` : where;
   }
   return message.reason ?? (message.position_m ? position(message.position_m) : "no position");

@@ -128,7 +128,7 @@ function summary(event, nowMs) {
   const where = located
     ? el("span", { className: "where" }, ...coordinate("x", x), ...coordinate("y", y), ...coordinate("z", z), el("i", { text: "m" }))
     : el("span", { className: "where without", text: event.status === "direction-only" && bearing
-      ? `azimuth ${number(bearing.azimuth_deg, 0)}° from ${bearing.array}` : "no position" });
+      ? `azimuth ${number(bearing.azimuth_deg, 0)}° seen from ${bearing.array}` : "no position" });
   const fill = el("span");
   fill.style.width = `${Math.round(100 * Math.min(1, Math.max(0, event.confidence ?? 0)))}%`;
   const told = verdict(event);
