@@ -33,6 +33,7 @@ from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig, check_endpoint, load_site
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
+from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
 from livessl.plan import design, figure, words
 from livessl.server.app import Server
@@ -192,6 +193,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--count", type=_positive, default=8, help="sounds in the scene (default 8)")
     sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
     sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
+
+    sub = command(
+        "evaluate",
+        _evaluate,
+        "repeat the paper's experiments in simulated rooms",
+        "livessl evaluate one-array --events sounds/ --positions 10 --out evaluation/",
+    )
+    evaluation.add_arguments(sub)
 
     _add_plan(command)
 
@@ -529,6 +538,18 @@ def _simulate(arguments: argparse.Namespace) -> int:
         _complain(str(error))
         return WRONG_USE
     logging.info("%d sounds in %.1f s written to %s", len(scene.sources), scene.duration_s, arguments.out)
+    return OK
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    try:
+        with progress.counted(f"evaluating {arguments.experiment}", "position") as bar:
+            written = evaluation.run(arguments, arguments.jobs or os.cpu_count() or 1, bar)
+    except ValueError as error:
+        _complain(str(error))
+        return WRONG_USE
+    for path in written:
+        print(path)
     return OK
 
 

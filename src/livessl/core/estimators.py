@@ -9,10 +9,11 @@ from typing import Final, Protocol
 import numpy as np
 
 from livessl.core import peaks
-from livessl.core.gcc import GCCPhat
+from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
+from livessl.core.gcc import GCCPhat, uses_envelope
 from livessl.core.geometry import Grid
-from livessl.core.srp import HeardBy, SRPFunctional, SRPMapper
-from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.core.srp import HeardBy, SRPFunctional, SRPMapper, alias_free_hz
+from livessl.core.types import ArraySpec, Float32Array, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +57,23 @@ class SrpPhat:
     arrays : sequence of ArraySpec
     grid : Grid
     c_m_s : float
+    band_limit : bool or None
+        Whether the band is limited per pair and node against spatial aliasing. None is "where it matters": for arrays
+        of which more than half of all pairs and nodes would lose part of the band. On a 0.1 m grid an array of 0.5 m
+        is not among them, and its answer would hardly change; on a 0.5 m grid it is.
     """
 
     name = "srp-phat"
+    front_end: FrontEnd = staticmethod(whole_segment)
 
-    def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
+    def __init__(
+        self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float, *, band_limit: bool | None = None
+    ) -> None:
         self._arrays = {spec.name: spec for spec in arrays}
         self._grid = grid
         self._c_m_s = c_m_s
-        self._tools: dict[str, tuple[float, GCCPhat, SRPMapper]] = {}
+        self._band_limit = band_limit
+        self._tools: dict[str, tuple[float, GCCPhat, SRPMapper, Sequence[float]]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
@@ -75,10 +84,10 @@ class SrpPhat:
         evidence: list[HeardBy] = []
         maps: dict[str, Float32Array] = {}
         for name in sorted(sounds):  # float sums depend on the order: the answer must not
-            correlate, to_map = self._tools_for(name, sounds[name].sample_rate_hz)
-            gcc = correlate(sounds[name].segments)
-            evidence.append(HeardBy(self._arrays[name], gcc))
-            maps[name] = to_map(gcc)
+            correlate, to_map, cut_offs_hz = self._tools_for(name, sounds[name].sample_rate_hz)
+            gccs = correlate.below(sounds[name].segments, cut_offs_hz)
+            evidence.append(HeardBy(self._arrays[name], gccs[0]))
+            maps[name] = to_map(*gccs)
         fused: Float32Array = np.asarray(np.sum(list(maps.values()), axis=0, dtype=np.float32))
         functional = SRPFunctional(evidence, self._c_m_s)
         position = peaks.best_peak(functional, fused, self._grid)
@@ -90,16 +99,83 @@ class SrpPhat:
             maps,
         )
 
-    def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper]:
+    def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper, Sequence[float]]:
         known = self._tools.get(array)
         if known is not None and known[0] == sample_rate_hz:
             return known[1:]
         spec = self._arrays[array]
-        correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s)
-        mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s)
-        self._tools[array] = (sample_rate_hz, correlate, mapper)
-        return correlate, mapper
+        correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s, self.front_end)
+        cut_offs_hz: Sequence[float] = ()
+        if not uses_envelope(spec.band_hz) and self._limits_band(spec, correlate.pairs):
+            cut_offs_hz = third_octaves_below_hz(spec.band_hz)
+        mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s, cut_offs_hz)
+        self._tools[array] = (sample_rate_hz, correlate, mapper, cut_offs_hz)
+        return correlate, mapper, cut_offs_hz
+
+    def _limits_band(self, spec: ArraySpec, pairs: IntArray) -> bool:
+        if self._band_limit is not None:
+            return self._band_limit
+        some = self._grid.nodes_m(slice(None, None, max(1, self._grid.size // _NODES_ASKED)))
+        limit_hz = alias_free_hz(some, spec.microphones_m, pairs, self._grid.spacing_m, self._c_m_s)
+        return bool(np.median(limit_hz) < spec.band_hz[1])
 
 
-ESTIMATORS: Final[dict[str, Callable[[Sequence[ArraySpec], Grid, float], Estimator]]] = {SrpPhat.name: SrpPhat}
+class Cepstral(SrpPhat):
+    """SRP-PHAT after the channels' minimum-phase part has been taken out: see `livessl.core.frontends.cepstral`."""
+
+    name = "cepstral"
+    front_end: FrontEnd = staticmethod(cepstral)
+
+
+class Averaged(SrpPhat):
+    """SRP-PHAT of GCCs averaged over frames of 25 ms: see `livessl.core.frontends.averaged`."""
+
+    name = "averaged"
+    front_end: FrontEnd = staticmethod(averaged)
+
+
+def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) -> ArraySpec:
+    """One array of all the microphones of several, to be processed jointly: every pair counts, across arrays too.
+
+    Parameters
+    ----------
+    arrays : sequence of ArraySpec
+    clocks : mapping of array name to clock
+        What samples each array: the same name, the same clock.
+    name : str
+        The new array's.
+
+    Raises
+    ------
+    ValueError
+        Where clocks differ or are unknown: delays across arrays are good only if one clock samples both.
+    """
+    known = {spec.name: clocks.get(spec.name) for spec in arrays}
+    if None in known.values() or len(set(known.values())) != 1:
+        each = ", ".join(f"{array!r} by {clock or 'an unknown clock'}" for array, clock in known.items())
+        raise ValueError(
+            f"array {name!r}: joint processing expects arrays sampled by one clock, got {each}; "
+            "record them through one device, or let their maps be summed instead"
+        )
+    bands_hz = {spec.band_hz for spec in arrays}
+    if len(bands_hz) != 1:
+        raise ValueError(f"array {name!r}: joint processing expects arrays of one band, got {sorted(bands_hz)} Hz")
+    return ArraySpec(name, np.vstack([spec.microphones_m for spec in arrays]), bands_hz.pop())
+
+
+def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
+    """Cut-offs in steps of a third of an octave from a band's upper edge down, as far as some band is left."""
+    low, high = band_hz
+    steps = np.arange(1, int(3.0 * np.log2(high / max(low, _LEAST_CUT_OFF_HZ))) + 1)
+    return tuple(float(cut_off) for cut_off in high * 2.0 ** (-steps / 3.0))
+
+
+_NODES_ASKED: Final = 4096
+"""Nodes looked at to see whether a band limit matters."""
+
+_LEAST_CUT_OFF_HZ: Final = 100.0
+
+ESTIMATORS: Final[dict[str, Callable[[Sequence[ArraySpec], Grid, float], Estimator]]] = {
+    each.name: each for each in (SrpPhat, Cepstral, Averaged)
+}
 """Name in the site file and on the command line, and what makes it."""

@@ -15,6 +15,7 @@ from scipy.signal import upfirdn
 from scipy.special import i0
 
 from livessl.core.activity import band_bins
+from livessl.core.frontends import FrontEnd, Spectra, whole_segment
 from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, IntArray
 
 OVERSAMPLING: Final = 8
@@ -58,9 +59,13 @@ class GCCPhat:
         Must exceed twice the band's upper edge.
     c_m_s : float
         Speed of sound.
+    front_end : FrontEnd
+        What a segment's spectra are: the whole segment's, or those of frames, whose GCCs are averaged.
     """
 
-    def __init__(self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float) -> None:
+    def __init__(
+        self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float, front_end: FrontEnd = whole_segment
+    ) -> None:
         high = spec.band_hz[1]
         if high >= sample_rate_hz / 2:
             raise ValueError(
@@ -70,6 +75,7 @@ class GCCPhat:
         self.pairs = microphone_pairs(len(spec.microphones_m))
         self._band_hz = spec.band_hz
         self._rate_hz = sample_rate_hz
+        self._front_end = front_end
         self._envelope = uses_envelope(spec.band_hz)
         largest = spec.aperture_m / c_m_s * sample_rate_hz
         fine = int(np.ceil(largest * OVERSAMPLING)) + 2 * OVERSAMPLING
@@ -84,10 +90,20 @@ class GCCPhat:
 
         Silence and dead channels give zeros, never NaN.
         """
-        total = np.zeros((len(self.pairs), 2 * self._coarse + 1), dtype=np.complex64)
+        return self.below(segments, ())[0]
+
+    def below(self, segments: Sequence[Float32Array], cut_offs_hz: Sequence[float]) -> list[GCC]:
+        """GCC of the whole band, and then of what of it lies below each cut-off, all over the whole band's B."""
+        total = np.zeros((1 + len(cut_offs_hz), len(self.pairs), 2 * self._coarse + 1), dtype=np.complex64)
         for segment in segments:
-            total += segment.shape[1] * self._around_zero(segment)
+            spectra = self._front_end(segment, self._rate_hz, self._coarse)
+            cross = CrossSpectra(spectra, self.pairs, self._rate_hz, self._band_hz)
+            for part, cut_off_hz in zip(total, (np.inf, *cut_offs_hz), strict=True):
+                part += segment.shape[1] * cross.correlations(self._coarse, cut_off_hz, envelope=self._envelope)
         total /= max(1, sum(segment.shape[1] for segment in segments))
+        return [self._fine(part) for part in total]
+
+    def _fine(self, total: ComplexArray) -> GCC:
         correlation = total if self._envelope else total.real
         fine = upfirdn(self._kernel, correlation, up=OVERSAMPLING, axis=1)
         centre = (self._coarse + _HALF_WIDTH) * OVERSAMPLING
@@ -96,21 +112,56 @@ class GCCPhat:
         values = np.abs(fine) if self._envelope else fine
         return GCC(self.pairs.copy(), self.lags_s.copy(), values.astype(np.float64))
 
-    def _around_zero(self, samples: Float32Array) -> ComplexArray:
-        """Correlation at whole-sample lags around zero, (P, 2 coarse + 1); analytic where the envelope is wanted."""
-        n_fft = scipy.fft.next_fast_len(samples.shape[1] + self._coarse, real=True)
-        spectrum = scipy.fft.rfft(samples, n_fft, axis=1)
-        low, high = band_bins(n_fft, self._rate_hz, self._band_hz)
-        inside = spectrum[:, low:high]
-        first, second = self.pairs.T
-        whitened = np.zeros((len(self.pairs), n_fft if self._envelope else n_fft // 2 + 1), dtype=np.complex64)
-        whitened[:, low:high] = _phase_only(np.conj(inside[first]) * inside[second])
-        if self._envelope:
-            correlation = scipy.fft.ifft(whitened, axis=1) * n_fft
+
+class CrossSpectra:
+    """Whitened cross-spectra of all pairs in the band, averaged over frames.
+
+    Parameters
+    ----------
+    spectra : Spectra
+        With `n_fft` above the frames' length by the lags wanted.
+    pairs : (P, 2) int64
+    sample_rate_hz : float
+    band_hz : (float, float)
+    """
+
+    def __init__(self, spectra: Spectra, pairs: IntArray, sample_rate_hz: float, band_hz: tuple[float, float]) -> None:
+        self._n_fft = spectra.n_fft
+        self._rate_hz = sample_rate_hz
+        self._low, self._high = band_bins(spectra.n_fft, sample_rate_hz, band_hz)
+        inside = spectra.values[:, :, self._low : self._high]
+        first, second = pairs.T
+        self._whitened = np.zeros((len(pairs), self._high - self._low), dtype=np.complex64)
+        for frame in inside:
+            self._whitened += _phase_only(np.conj(frame[first]) * frame[second])
+        self._share = max(1, self._high - self._low) * max(1, len(inside))
+
+    def correlations(self, reach: int, cut_off_hz: float = np.inf, *, envelope: bool = False) -> ComplexArray:
+        """GCC-PHAT at whole-sample lags around zero: the mean over frames and over the bins of the band.
+
+        Parameters
+        ----------
+        reach : int
+            Lags from -reach to reach samples.
+        cut_off_hz : float
+            Bins above it count as zero.
+        envelope : bool
+            Whether the analytic signal of the correlation is wanted; else its imaginary part is zero.
+
+        Returns
+        -------
+        (P, 2 reach + 1) complex64
+        """
+        n_fft = self._n_fft
+        kept = int(np.clip(cut_off_hz * n_fft / self._rate_hz + 1 - self._low, 0, self._whitened.shape[1]))
+        spectrum = np.zeros((len(self._whitened), n_fft if envelope else n_fft // 2 + 1), dtype=np.complex64)
+        spectrum[:, self._low : self._low + kept] = self._whitened[:, :kept]
+        if envelope:
+            correlation = scipy.fft.ifft(spectrum, axis=1) * n_fft
         else:
-            correlation = (scipy.fft.irfft(whitened, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
-        around = np.concatenate([correlation[:, -self._coarse :], correlation[:, : self._coarse + 1]], axis=1)
-        return np.asarray(around / max(1, high - low), dtype=np.complex64)
+            correlation = (scipy.fft.irfft(spectrum, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
+        around = np.concatenate([correlation[:, -reach:], correlation[:, : reach + 1]], axis=1)
+        return np.asarray(around / self._share, dtype=np.complex64)
 
 
 def uses_envelope(band_hz: tuple[float, float]) -> bool:

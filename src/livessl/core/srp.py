@@ -40,8 +40,41 @@ def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: In
     return np.asarray(delays[pairs[:, 1]] - delays[pairs[:, 0]])
 
 
+def alias_free_hz(
+    points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, spacing_m: float, c_m_s: float
+) -> FloatArray:
+    """Frequency up to which a pair's map has no spatial aliasing on a grid: f_max = 1 / (2 D |grad tau|).
+
+    tau_ik's gradient is (u_k - u_i)/c, u the unit vectors from the microphones to the point: with D the grid's
+    spacing, the phase 2 pi f tau of every kept frequency turns by less than pi from node to node (García-Barrios,
+    Gutiérrez-Arriola et al., IEEE Access 2021, arXiv 2402.06586). It is infinite where the delay does not change.
+
+    Parameters
+    ----------
+    points_m : (N, 3) float64
+    microphones_m : (K, 3) float64
+    pairs : (P, 2) int64
+    spacing_m, c_m_s : float
+
+    Returns
+    -------
+    (P, N) float64
+        Hertz.
+    """
+    towards = points_m - microphones_m[:, None]
+    unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=2, keepdims=True)), 1e-9)
+    gradient = np.sqrt(((unit[pairs[:, 1]] - unit[pairs[:, 0]]) ** 2).sum(axis=2)) / c_m_s
+    limit = np.full(gradient.shape, np.inf)
+    np.divide(1.0 / (2.0 * spacing_m), gradient, out=limit, where=gradient > 0.0)
+    return limit
+
+
 class SRPMapper:
     """Maps an array's GCC onto the grid by nearest fine lag: one sparse product.
+
+    With cut-offs, each pair and node looks its lag up in the GCC of the highest band that is free of spatial aliasing
+    there (`alias_free_hz`), or of the lowest where none is. What is left out lowers a node's power: it is not
+    normalised, for noise would be raised with it.
 
     Parameters
     ----------
@@ -53,23 +86,41 @@ class SRPMapper:
     lags_s : (L,) float64
         Of the GCCs to come.
     c_m_s : float
+    cut_offs_hz : sequence of float
+        Descending; a GCC of what lies below each follows that of the whole band.
     """
 
-    def __init__(self, spec: ArraySpec, grid: Grid, pairs: IntArray, lags_s: FloatArray, c_m_s: float) -> None:
+    def __init__(
+        self,
+        spec: ArraySpec,
+        grid: Grid,
+        pairs: IntArray,
+        lags_s: FloatArray,
+        c_m_s: float,
+        cut_offs_hz: Sequence[float] = (),
+    ) -> None:
         step = lags_s[1] - lags_s[0]
         row = np.arange(len(pairs))[:, None] * len(lags_s)
+        band = len(pairs) * len(lags_s)
+        ascending_hz = np.array([spec.band_hz[1], *cut_offs_hz])[::-1]
         columns = np.empty((grid.size, len(pairs)), dtype=np.int32)
         for first in range(0, grid.size, _SLAB_NODES):
             nodes = grid.nodes_m(slice(first, first + _SLAB_NODES))
             lags = steering_delays_s(nodes, spec.microphones_m, pairs, c_m_s)
-            columns[first : first + len(nodes)] = (np.rint((lags - lags_s[0]) / step) + row).T
+            place = np.rint((lags - lags_s[0]) / step) + row
+            if len(cut_offs_hz):
+                limit = alias_free_hz(nodes, spec.microphones_m, pairs, grid.spacing_m, c_m_s)
+                free = np.searchsorted(ascending_hz, limit, side="right")  # bands that are free of aliasing
+                place += band * np.minimum(len(ascending_hz) - free, len(cut_offs_hz))
+            columns[first : first + len(nodes)] = place.T
         weight = np.full(columns.size, pair_weight(len(spec.microphones_m)), dtype=np.float32)
         starts = np.arange(0, columns.size + 1, len(pairs), dtype=np.int32)
-        self._look_up = csr_array((weight, columns.ravel(), starts), shape=(grid.size, len(pairs) * len(lags_s)))
+        self._look_up = csr_array((weight, columns.ravel(), starts), shape=(grid.size, len(ascending_hz) * band))
 
-    def __call__(self, gcc: GCC) -> Float32Array:
-        """Power (G,) at every node, float32."""
-        return np.asarray(self._look_up @ gcc.values.astype(np.float32).ravel())
+    def __call__(self, *gccs: GCC) -> Float32Array:
+        """Power (G,) at every node, float32, from the GCC of the whole band and those below each cut-off."""
+        values = [gcc.values.astype(np.float32).ravel() for gcc in gccs]
+        return np.asarray(self._look_up @ (values[0] if len(values) == 1 else np.concatenate(values)))
 
 
 def pair_weight(microphones: int) -> float:

@@ -77,6 +77,8 @@ def impulse_responses(
     sample_rate_hz: float,
     c_m_s: float = 343.0,
     duration_s: float | None = None,
+    own_lengths: bool = False,
+    compiled: bool = False,
 ) -> Float32Array:
     """Responses from a source to microphones, all omnidirectional, by the image method.
 
@@ -101,6 +103,10 @@ def impulse_responses(
     duration_s : float or None
         Length in seconds; every image that sounds within it is there. None is the longest reverberation time, or the
         way across the room where that is longer.
+    own_lengths : bool
+        Each response is zero after its own reverberation time (or the way across the room), 60 dB down.
+    compiled : bool
+        Sum the images by compiled code: some times as fast, equal but for rounding. Needs numba (the extra `evaluate`).
 
     Returns
     -------
@@ -128,19 +134,64 @@ def impulse_responses(
     if len(rt60s_s) == 0:
         raise ValueError("reverberation times: expected one or more, got none")
     beta = np.sqrt([1.0 - absorption(rt60_s, room_m, c_m_s) for rt60_s in rt60s_s])
+    across_s = float(np.linalg.norm(room_m)) / c_m_s + GUARD / sample_rate_hz
     if duration_s is None:
-        duration_s = max(*rt60s_s, float(np.linalg.norm(room_m)) / c_m_s + GUARD / sample_rate_hz)
+        duration_s = max(*rt60s_s, across_s)
     if not (np.isfinite(duration_s) and duration_s * sample_rate_hz >= 1):
         raise ValueError(f"duration: expected at least one sample, {1 / sample_rate_hz:g} s, got {duration_s} s")
     count = int(np.ceil(duration_s * sample_rate_hz))
+    ends = np.full(len(beta), count, dtype=np.int64)
+    if own_lengths:
+        ends = np.minimum(count, np.ceil(np.maximum(rt60s_s, across_s) * sample_rate_hz).astype(np.int64))
     fft_size = next_fast_len(count + GUARD, real=True)
-    responses = np.empty((len(beta), len(microphones), count), dtype=np.float32)
+    bins_per_m = sample_rate_hz * OVERSAMPLING / c_m_s
+    responses = np.zeros((len(beta), len(microphones), count), dtype=np.float32)
     for k, microphone in enumerate(microphones):
-        fine = np.zeros((fft_size * OVERSAMPLING, len(beta)))
-        for distance_m, order in _shells(room_m, source, microphone, c_m_s * duration_s):
-            _lay_down(fine, distance_m * (sample_rate_hz * OVERSAMPLING / c_m_s), order, distance_m, beta)
-        responses[:, k] = _decimated(fine, fft_size)[:count].T
+        if compiled:
+            fine = _all_compiled(room_m, source, microphone, c_m_s * duration_s, bins_per_m, beta, ends)
+            for r, end in enumerate(ends):
+                size = next_fast_len(int(end) + GUARD, real=True)
+                responses[r, k, :end] = _decimated(fine[r, : end * OVERSAMPLING, None], size)[:end, 0]
+        else:
+            laid = _all(room_m, source, microphone, c_m_s * duration_s, bins_per_m, beta, fft_size * OVERSAMPLING)
+            if own_lengths:
+                laid[np.arange(len(laid))[:, None] >= ends * OVERSAMPLING] = 0.0
+            responses[:, k] = _decimated(laid, fft_size)[:count].T
+    for r, end in enumerate(ends):
+        responses[r, :, end:] = 0.0
     return responses
+
+
+def _all(
+    room_m: FloatArray,
+    source_m: FloatArray,
+    microphone_m: FloatArray,
+    reach_m: float,
+    bins_per_m: float,
+    beta: FloatArray,
+    bins: int,
+) -> FloatArray:
+    """All images within reach on the fine time axis: (bins, R)."""
+    fine = np.zeros((bins, len(beta)))
+    for distance_m, order in _shells(room_m, source_m, microphone_m, reach_m):
+        _lay_down(fine, distance_m * bins_per_m, order, distance_m, beta)
+    return fine
+
+
+def _all_compiled(
+    room_m: FloatArray,
+    source_m: FloatArray,
+    microphone_m: FloatArray,
+    reach_m: float,
+    bins_per_m: float,
+    beta: FloatArray,
+    ends: IntArray,
+) -> Float32Array:
+    """Do the same by compiled code, each up to its own end: (R, bins)."""
+    from livessl.simulate.images import lay_down_all
+
+    x, y, z = (_axis(*each, reach_m) for each in zip(room_m, source_m, microphone_m, strict=True))
+    return lay_down_all((x, y, z), reach_m, bins_per_m, beta, ends * OVERSAMPLING)
 
 
 def _as_room_m(room_size_m: ArrayLike) -> FloatArray:
@@ -213,10 +264,10 @@ def _lay_down(fine: FloatArray, bins: FloatArray, order: IntArray, distance_m: F
     fine[first : first + size] += taps @ (beta ** np.arange(taps.shape[1])[:, None])  # 0^0 = 1: the direct path
 
 
-def _decimated(fine: FloatArray, fft_size: int) -> FloatArray:
+def _decimated(fine: FloatArray | Float32Array, fft_size: int) -> FloatArray:
     """Bring the fine axis (bins, R) to the sample rate and undo the droop sinc^2 of the two-bin taps."""
-    spectrum = np.asarray(rfft(fine, axis=0))[: fft_size // 2 + 1]
+    spectrum = np.asarray(rfft(fine, fft_size * OVERSAMPLING, axis=0))[: fft_size // 2 + 1]
     of_nyquist = 2.0 * np.arange(len(spectrum)) / fft_size
     fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((of_nyquist - ROLL_OFF) / (1.0 - ROLL_OFF), 0.0, 1.0))
-    gain = fade / np.sinc(of_nyquist / (2 * OVERSAMPLING)) ** 2
+    gain = (fade / np.sinc(of_nyquist / (2 * OVERSAMPLING)) ** 2).astype(fine.dtype)
     return np.asarray(irfft(spectrum * gain[:, None], fft_size, axis=0))

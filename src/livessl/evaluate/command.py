@@ -1,0 +1,138 @@
+"""`livessl evaluate`: its arguments, and what they set in motion. Imports what is heavy only when it runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings
+
+REPORT: Final = "report"
+"""Runs nothing: reports campaigns that were run."""
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments to an argparse parser."""
+    parser.add_argument(
+        "experiment",
+        choices=[*sorted(EXPERIMENTS), REPORT],
+        help=f"{REPORT}: only what --with names, reported together",
+    )
+    parser.add_argument("--events", type=Path, metavar="DIR", help="clips named like doorslam001.wav")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; a run that was cut resumes")
+    parser.add_argument(
+        "--with",
+        dest="others",
+        action="append",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="another experiment's --out, to be reported together; may be given more than once",
+    )
+    parser.add_argument("--positions", type=_whole, metavar="N", help="of the source (default: as many as the paper)")
+    parser.add_argument("--rt", metavar="S,S,…", help="reverberation times, seconds; 0:2:0.2 is a range")
+    parser.add_argument("--seed", type=int, default=0, help="same seed, same results (default 0)")
+    parser.add_argument("--jobs", type=_whole, help="processes (default: one a core)")
+    parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of processes here")
+    parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
+    parser.add_argument("--snr", type=float, metavar="DB", help="add white sensor noise (default: none)")
+    parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
+    parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
+    parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
+    parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
+
+
+def settings_of(arguments: argparse.Namespace) -> Settings:
+    """What was asked for.
+
+    Raises
+    ------
+    ValueError
+        Where something cannot be.
+    """
+    experiment = EXPERIMENTS[arguments.experiment]
+    rt60s_s = experiment.rt60s_s if arguments.rt is None else reverberation_times_s(arguments.rt)
+    from livessl.simulate.room import absorption
+
+    for rt60_s in rt60s_s:
+        absorption(rt60_s, experiment.room_m)
+    if arguments.grid is not None and not 0.02 <= arguments.grid <= 2.0:
+        raise ValueError(f"--grid: expected 0.02 to 2 metres, got {arguments.grid:g}")
+    if arguments.sample_rate < 14000:
+        raise ValueError(
+            f"--sample-rate: the band ends at 6000 Hz, expected 14000 Hz or more, got {arguments.sample_rate}"
+        )
+    return Settings(
+        experiment=arguments.experiment,
+        positions=arguments.positions or experiment.positions,
+        rt60s_s=rt60s_s,
+        seed=arguments.seed,
+        sample_rate_hz=float(arguments.sample_rate),
+        spacing_m=arguments.grid or experiment.spacing_m,
+        snr_db=arguments.snr,
+        segment=arguments.segment,
+        band_limit=not arguments.no_band_limit,
+    )
+
+
+def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
+    """Run the campaign and write what it found; returns the files.
+
+    Raises
+    ------
+    ValueError
+        Where an argument, a sound or the folder is not as it must be, or an extra is not installed.
+    """
+    try:
+        from livessl.evaluate.campaign import Job, read_clips, run_campaign
+        from livessl.evaluate.report import require_campaign, write_report
+    except ImportError as error:
+        raise ValueError(f"evaluate needs more packages: pip install 'livessl[evaluate]' ({error})") from error
+
+    if arguments.experiment == REPORT:
+        if not arguments.others:
+            raise ValueError(
+                "evaluate report: expected one or more folders of campaigns, got none; name them by --with"
+            )
+        return write_report(arguments.out, arguments.others)
+    if arguments.events is None:
+        raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
+    for folder in arguments.others:
+        require_campaign(folder)  # now, not when hours are over
+    settings = settings_of(arguments)
+    classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
+    clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
+    results = run_campaign(
+        Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress
+    )
+    return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
+
+
+def reverberation_times_s(text: str) -> tuple[float, ...]:
+    """Reverberation times from `0,0.4` or `0:2:0.2` (both ends included), seconds, ascending.
+
+    Raises
+    ------
+    ValueError
+        Where the text is neither.
+    """
+    try:
+        if ":" in text:
+            first, last, step = (float(part) for part in text.split(":"))
+            count = round((last - first) / step) + 1
+            times = [round(first + index * step, 6) for index in range(count)]
+        else:
+            times = [float(part) for part in text.split(",")]
+        if not times or not all(0.0 <= time < 60.0 for time in times):
+            raise ValueError
+    except (ValueError, ZeroDivisionError, OverflowError):
+        raise ValueError(f"--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got {text!r}") from None
+    return tuple(sorted(set(times)))
+
+
+def _whole(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
+    return int(text)

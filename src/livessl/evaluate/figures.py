@@ -1,0 +1,241 @@
+"""The paper's figures, drawn from our own results and rooms: PNG and SVG. It computes no statistics of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.signal import oaconvolve
+
+from livessl.core.frontends import whole_segment
+from livessl.core.gcc import CrossSpectra, microphone_pairs
+from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.evaluate.maps import PairMatrices, reach_samples
+from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, OFFICE_M, ROOM_M, System, pair, tetrahedron_in_cube
+from livessl.evaluate.statistics import Interval, Results
+from livessl.simulate.room import impulse_responses
+
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Distinct for colour-blind readers (Okabe and Ito)."""
+
+SOURCE_M: Final = np.array([6.1, 7.3, 1.4])
+"""Where the sound of the explaining figures is: off the grid and off symmetry."""
+
+RATE_HZ: Final = 16000.0
+LONGER_S: Final = 0.8
+"""The reverberation of the explaining figures."""
+
+TITLES: Final[Mapping[str, str]] = {
+    "gcc": "GCC-PHAT of one pair 0.5 m and 3 m apart, anechoic and at RT 0.8 s; dashed: the true delay",
+    "angle-error": "Angular error of one sample's rounding against the spacing of a pair",
+    "maps-size": "SRP maps of a small and a large array at RT 0.8 s, at the source's height; cross: the source",
+    "maps-pair": "SRP maps of two arrays 5 m apart and their sum, at RT 0.8 s, at the source's height",
+    "topology": "Rooms and arrays",
+    "one-array": "Median error against reverberation time: one array, three methods, two sizes",
+    "diversity": "Median error against reverberation time: two arrays 0 to 5 m apart, 8 microphones, and one array",
+    "office": "Errors in the simulated office, RT 0.7 s; the notch is the median's 99 % interval",
+}
+"""Every figure, and what it shows."""
+
+
+def draw_all(directory: Path, campaigns: Mapping[str, Results]) -> list[str]:
+    """Draw what the campaigns at hand allow; returns the names of the figures."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mpl.rcParams["svg.hashsalt"] = "livessl"  # the same figure, the same bytes
+    drawings: dict[str, Callable[[], Figure]] = {
+        "gcc": _gcc,
+        "angle-error": _angle_error,
+        "maps-size": _maps_of_sizes,
+        "maps-pair": _maps_of_a_pair,
+        "topology": _topology,
+    }
+    if "one-array" in campaigns:
+        drawings["one-array"] = lambda: _one_array(campaigns["one-array"])
+    if "diversity" in campaigns:
+        drawings["diversity"] = lambda: _diversity(campaigns["diversity"])
+    if "office" in campaigns:
+        drawings["office"] = lambda: _office(campaigns["office"])
+    for name, draw in drawings.items():
+        figure = draw()
+        figure.savefig(directory / f"{name}.png", dpi=130, metadata={"Software": None})
+        figure.savefig(directory / f"{name}.svg", metadata={"Date": None})
+    return list(drawings)
+
+
+def sigma_theta_deg(theta_deg: FloatArray, spacing_m: FloatArray | float, sample_rate_hz: float) -> FloatArray:
+    """Angular error of a delay rounded to samples: arcsin(sin theta + c/(fs d sqrt 12)) - theta, from broadside.
+
+    NaN where the delay leaves the range that a pair can see.
+    """
+    theta = np.radians(theta_deg)
+    sine = np.sin(theta) + C_M_S / (sample_rate_hz * np.asarray(spacing_m) * np.sqrt(12.0))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.degrees(np.arcsin(sine) - theta))
+
+
+def _figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.0, 4.5)) -> tuple[Figure, Any]:
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _heard(microphones_m: FloatArray, rt60_s: float) -> Float32Array:
+    """Half a second of noise from `SOURCE_M`, as the microphones hear it."""
+    responses = impulse_responses(
+        ROOM_M, SOURCE_M, microphones_m, [rt60_s], sample_rate_hz=RATE_HZ, c_m_s=C_M_S, compiled=True
+    )[0]
+    sound = np.random.default_rng(0).standard_normal((1, int(RATE_HZ / 2)))
+    return np.asarray(oaconvolve(responses, sound, axes=1), dtype=np.float32)
+
+
+def _gcc() -> Figure:
+    figure, axes = _figure(2, 2, (8.0, 5.0))
+    for row, spacing_m in zip(axes, (0.5, 3.0), strict=True):
+        ends = np.array([[0.0, -spacing_m / 2.0, 0.0], [0.0, spacing_m / 2.0, 0.0]]) + np.array(ROOM_M) / 2.0
+        distance_m = np.linalg.norm(ends - SOURCE_M, axis=1)
+        for axis, rt60_s in zip(row, (0.0, LONGER_S), strict=True):
+            reach = int(spacing_m / C_M_S * RATE_HZ) + 8
+            spectra = whole_segment(_heard(ends, rt60_s), RATE_HZ, reach)
+            values = CrossSpectra(spectra, microphone_pairs(2), RATE_HZ, BAND_HZ).correlations(reach).real[0]
+            axis.plot(np.arange(-reach, reach + 1) / RATE_HZ * 1e3, values, color=COLOURS[0], linewidth=1.0)
+            axis.axvline((distance_m[1] - distance_m[0]) / C_M_S * 1e3, color=COLOURS[1], linestyle="--", linewidth=1.0)
+            axis.set(title=f"{spacing_m:g} m, RT {rt60_s:g} s", xlabel="lag (ms)", ylabel="GCC-PHAT")
+    return figure
+
+
+def _angle_error() -> Figure:
+    figure, axes = _figure()
+    spacing_m = np.geomspace(0.05, 5.0, 200)
+    for colour, theta_deg in zip(COLOURS, (0.0, 30.0, 60.0, 80.0), strict=False):
+        error_deg = sigma_theta_deg(np.array(theta_deg), spacing_m, 44100.0)
+        axes[0, 0].loglog(spacing_m, error_deg, color=colour, label=f"{theta_deg:g}° from broadside")
+    axes[0, 0].set(xlabel="spacing (m)", ylabel="angular error (°), 44.1 kHz")
+    axes[0, 0].legend()
+    axes[0, 0].grid(visible=True, which="both", alpha=0.3)
+    return figure
+
+
+def _power(specs: tuple[ArraySpec, ...]) -> list[FloatArray]:
+    """Maps of arrays on the paper's grid at `LONGER_S`, at the source's height: (x, y) each."""
+    experiment = EXPERIMENTS["one-array"]
+    grid = experiment.grid(experiment.spacing_m)
+    mapper = PairMatrices(grid, RATE_HZ, C_M_S, band_limit=True)
+    level = int(np.abs(grid.axis_m(2) - SOURCE_M[2]).argmin())
+    maps = []
+    for spec in specs:
+        reach = reach_samples(spec.aperture_m, RATE_HZ, C_M_S)
+        pairs = microphone_pairs(len(spec.microphones_m))
+        spectra = whole_segment(_heard(spec.microphones_m, LONGER_S), RATE_HZ, reach)
+        lags = CrossSpectra(spectra, pairs, RATE_HZ, spec.band_hz).correlations(reach).real[None]
+        maps.append(mapper.power(spec, pairs, lags.astype(np.float32))[:, 0].reshape(grid.shape)[:, :, level])
+    return [np.asarray(each, dtype=np.float64) for each in maps]
+
+
+def _show_maps(maps: list[tuple[str, FloatArray]], microphones_m: list[FloatArray]) -> Figure:
+    figure, axes = _figure(1, len(maps), (3.4 * len(maps), 4.2))
+    for axis, (title, power), places in zip(axes[0], maps, microphones_m, strict=True):
+        image = axis.imshow(power.T, origin="lower", extent=(0, ROOM_M[0], 0, ROOM_M[1]), cmap="viridis")
+        axis.plot(places[:, 0], places[:, 1], "w.", markersize=4)
+        axis.plot(SOURCE_M[0], SOURCE_M[1], "x", color="red", markersize=9, markeredgewidth=2)
+        axis.set(title=title, xlabel="x (m)", ylabel="y (m)")
+        figure.colorbar(image, ax=axis, shrink=0.7)
+    return figure
+
+
+def _maps_of_sizes() -> Figure:
+    systems = EXPERIMENTS["one-array"].systems
+    maps = _power(tuple(system.arrays[0] for system in systems))
+    titles = [f"{system.name} ({edge})" for system, edge in zip(systems, ("0.5 m", "3 m"), strict=True)]
+    return _show_maps(list(zip(titles, maps, strict=True)), [system.microphones_m for system in systems])
+
+
+def _maps_of_a_pair() -> Figure:
+    one, other = pair(np.array(ROOM_M) / 2.0, 1, 5.0)
+    maps = _power((one, other))
+    both = np.vstack([one.microphones_m, other.microphones_m])
+    return _show_maps(
+        [("one", maps[0]), ("the other", maps[1]), ("sum", maps[0] + maps[1])],
+        [one.microphones_m, other.microphones_m, both],
+    )
+
+
+def _topology() -> Figure:
+    figure, axes = _figure(1, 3, (11.0, 4.6))
+    centre_m = np.array(ROOM_M) / 2.0
+    sizes = [
+        System(name, (ArraySpec(name, centre_m + tetrahedron_in_cube(edge_m), BAND_HZ),))
+        for name, edge_m in (("small, 0.5 m", 0.5), ("large, 3 m", 3.0))
+    ]
+    apart = [System(f"{metres} m apart", pair(centre_m, 1, metres)) for metres in (0, 3, 5)]
+    office = [System(f"{metres} m apart", pair(np.array(OFFICE_M) / 2.0, 0, metres)) for metres in (0, 3)]
+    for axis, room_m, systems, title in zip(
+        axes[0],
+        (ROOM_M, ROOM_M, OFFICE_M),
+        (sizes, apart, office),
+        ("one array", "two arrays", "office"),
+        strict=True,
+    ):
+        for colour, system in zip(COLOURS, systems, strict=False):
+            places = system.microphones_m
+            axis.plot(places[:, 0], places[:, 1], "o", color=colour, markersize=4, label=system.name)
+        axis.set(xlim=(0, room_m[0]), ylim=(0, room_m[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
+        axis.legend(fontsize=8)
+    return figure
+
+
+def _curve(axis: Any, results: Results, system: str, method: str, colour: str, style: str, label: str) -> None:
+    rt60s_s = [rt60_s for rt60_s in results.rt60s_s if (system, method, rt60_s) in results.values]
+    if not rt60s_s:
+        return
+    intervals = [Interval.of(results.medians(system, method, rt60_s)) for rt60_s in rt60s_s]
+    axis.plot(rt60s_s, [interval.value for interval in intervals], style, color=colour, label=label, markersize=4)
+    low, high = [interval.low for interval in intervals], [interval.high for interval in intervals]
+    axis.fill_between(rt60s_s, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _finish(axis: Any) -> None:
+    axis.axhline(np.sqrt(3.0) / 2.0, color="grey", linestyle=":", linewidth=1.0, label="diagonal of a cell, 0.87 m")
+    axis.set(xlabel="nominal reverberation time (s)", ylabel="median error (m)", ylim=(0.0, None))
+    axis.grid(visible=True, alpha=0.3)
+    axis.legend(fontsize=8)
+
+
+def _one_array(results: Results) -> Figure:
+    figure, axes = _figure(size=(7.5, 5.0))
+    for colour, (system, name) in zip(COLOURS, (("small", "0.5 m"), ("large", "3 m")), strict=False):
+        for style, method in (("o-", "srp-phat"), ("s--", "cepstral"), ("^:", "averaged")):
+            _curve(axes[0, 0], results, system, method, colour, style, f"{name}, {method}")
+    _finish(axes[0, 0])
+    return figure
+
+
+def _diversity(results: Results) -> Figure:
+    figure, axes = _figure(size=(7.5, 5.0))
+    systems = [*(f"pair-{metres}m" for metres in range(6))]
+    for colour, system in zip(COLOURS, systems, strict=False):
+        _curve(axes[0, 0], results, system, "srp-phat", colour, "o-", f"two arrays, {system[5:-1]} m")
+    _curve(axes[0, 0], results, "joint-8", "srp-phat", "black", "s--", "8 microphones, joint")
+    _curve(axes[0, 0], results, "small", "srp-phat", "grey", "^:", "one array")
+    _finish(axes[0, 0])
+    return figure
+
+
+def _office(results: Results) -> Figure:
+    figure, axes = _figure(size=(7.5, 4.5))
+    rt60_s = results.rt60s_s[0]
+    names = {"small": "one array", "joint-8": "8 joint"} | {f"pair-{metres}m": f"{metres} m" for metres in range(4)}
+    shown = [system for system in names if (system, "srp-phat", rt60_s) in results.values]
+    errors = [results.values[system, "srp-phat", rt60_s]["error_m"].ravel() for system in shown]
+    intervals = [Interval.of(results.medians(system, "srp-phat", rt60_s)) for system in shown]
+    axes[0, 0].boxplot(
+        errors, notch=True, conf_intervals=[(interval.low, interval.high) for interval in intervals], showfliers=False
+    )
+    axes[0, 0].set_xticks(range(1, len(shown) + 1), [names[system] for system in shown])
+    axes[0, 0].set(ylabel="error (m); outliers not shown", ylim=(0.0, None))
+    axes[0, 0].grid(visible=True, axis="y", alpha=0.3)
+    return figure
