@@ -18,7 +18,7 @@ from livessl.core.estimators import ESTIMATORS
 from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.gcc import microphone_pairs, uses_envelope
 from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
-from livessl.core.planning import alias_free_hz
+from livessl.core.srp import alias_free_hz
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0

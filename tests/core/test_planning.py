@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from livessl.core import planning
 from livessl.core.gcc import microphone_pairs
 from livessl.core.geometry import Grid, line, posed, tetrahedron
-from livessl.core.srp import steering_delays_s
+from livessl.core.srp import alias_free_hz, delay_gradients_s_m, steering_delays_s
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.simulate.room import absorption
 
@@ -124,7 +124,7 @@ def test_without_reverberation_all_is_direct() -> None:
 def test_gradient_is_that_of_the_steering_delays() -> None:
     microphones_m, pairs = NORTH.microphones_m, microphone_pairs(4)
     points_m = np.random.default_rng(3).uniform([0.5, 0.5, 0.5], [7.5, 9.5, 3.5], (40, 3))
-    found = planning.delay_gradients_s_m(points_m, microphones_m, pairs, C_M_S)
+    found = delay_gradients_s_m(points_m, microphones_m, pairs, C_M_S)
     step_m = 1e-4
     for axis in range(3):
         shift = np.zeros(3)
@@ -150,7 +150,7 @@ def test_band_that_pairs_keep(edge_and_spacing_m: tuple[float, float]) -> None:
     edge_m, spacing_m = edge_and_spacing_m
     microphones_m = tetrahedron(edge_m) + np.array([4.0, 5.0, 2.0])
     nodes_m = Grid(ROOM_BOUNDS_M, spacing_m).nodes_m()
-    kept = planning.alias_free_hz(nodes_m, microphones_m, microphone_pairs(4), spacing_m, C_M_S)
+    kept = alias_free_hz(nodes_m, microphones_m, microphone_pairs(4), spacing_m, C_M_S)
     each, lowest = BANDS[edge_and_spacing_m]
     np.testing.assert_allclose(np.percentile(kept, [5, 25, 50, 75, 95]), each, rtol=0.02)
     np.testing.assert_allclose(np.percentile(kept.min(axis=0), [5, 50, 95]), lowest, rtol=0.04)
@@ -160,7 +160,7 @@ def test_band_that_pairs_keep(edge_and_spacing_m: tuple[float, float]) -> None:
 def test_band_kept_on_the_line_and_across_it() -> None:
     microphones_m = posed(line(0.5, 2), [4.0, 5.0, 2.0])
     points_m = np.array([[7.0, 5.0, 2.0], [4.0, 8.0, 2.0], [4.0, 5.0, 2.0]])
-    endfire, broadside, between = planning.alias_free_hz(points_m, microphones_m, microphone_pairs(2), 0.5, C_M_S)[0]
+    endfire, broadside, between = alias_free_hz(points_m, microphones_m, microphone_pairs(2), 0.5, C_M_S)[0]
     assert endfire > 1e12
     # 2/c sin(gamma/2), gamma the angle that 0.5 m subtend at 3 m
     assert broadside == pytest.approx(C_M_S * np.hypot(3.0, 0.25) / (2 * 0.5 * 0.5), rel=1e-9)
@@ -421,7 +421,7 @@ def test_no_move_where_there_is_no_room() -> None:
         (lambda: planning.delay_std_s(0.5, BAND_HZ, 0.0), "time above 0"),
         (lambda: planning.Conditions(1.0, 0.1, 0.0), "nothing is known exactly"),
         (lambda: planning.Conditions(0.0, 0.1, 0.002), "critical distance: expected above 0"),
-        (lambda: planning.alias_free_hz(FLOOR_M, NORTH.microphones_m, microphone_pairs(4), 0.0, C_M_S), "grid spacing"),
+        (lambda: alias_free_hz(FLOOR_M, NORTH.microphones_m, microphone_pairs(4), 0.0, C_M_S), "grid spacing"),
         (lambda: planning.shifts_m(NORTH, [], ROOM_M, 0.0), "step: expected metres above 0"),
     ],
 )

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.special import sici
 
 from livessl.core.gcc import microphone_pairs
-from livessl.core.srp import pair_weight
+from livessl.core.srp import delay_gradients_s_m, pair_weight
 from livessl.core.types import ArraySpec, FloatArray, IntArray
 
 CLEARANCE_M: Final = 0.5
@@ -114,43 +114,6 @@ def direct_to_reverberant(distance_m: ArrayLike, critical_m: float) -> FloatArra
     """Ratio of powers (r_c / r)^2 at a distance r; infinite without reverberation and at the source."""
     distance = np.asarray(distance_m, dtype=np.float64)
     return np.asarray((critical_m / np.maximum(distance, _NEAREST_M)) ** 2)
-
-
-def delay_gradients_s_m(points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float) -> FloatArray:
-    """Gradient of each pair's delay at each point: (u_k - u_i) / c, u the unit vector from a microphone to the point.
-
-    Exact, near and far; its length is 2 sin(gamma/2)/c, gamma the angle that the pair subtends.
-
-    Parameters
-    ----------
-    points_m : (N, 3) float64
-    microphones_m : (K, 3) float64
-    pairs : (P, 2) int64
-    c_m_s : float
-
-    Returns
-    -------
-    (P, N, 3) float64
-        Seconds a metre.
-    """
-    towards = points_m - microphones_m[:, None]
-    unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=2, keepdims=True)), _NEAREST_M)
-    return np.asarray((unit[pairs[:, 1]] - unit[pairs[:, 0]]) / c_m_s)
-
-
-def alias_free_hz(
-    points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, spacing_m: float, c_m_s: float
-) -> FloatArray:
-    """Highest frequency that each pair keeps on a grid: f_max = 1 / (2 D |grad tau|), (P, N), Hz.
-
-    Below it the phase turns by less than pi from one node to the next, D apart (García-Barrios et al., IEEE Access
-    2021, arXiv 2402.06586). Infinite where the delay does not change.
-    """
-    if not spacing_m > 0:
-        raise ValueError(f"grid spacing: expected metres above 0, got {spacing_m}")
-    steepness = np.sqrt((delay_gradients_s_m(points_m, microphones_m, pairs, c_m_s) ** 2).sum(axis=2))
-    limit = np.full(steepness.shape, np.inf)
-    return np.asarray(np.divide(1.0 / (2.0 * spacing_m), steepness, out=limit, where=steepness > 0.0))
 
 
 def coherence_squared(

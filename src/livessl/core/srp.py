@@ -17,6 +17,9 @@ from scipy.sparse import csr_array
 from livessl.core.geometry import Grid
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray
 
+_NEAREST_M: Final = 1e-9
+"""A point in a microphone has no direction from it; one so far away has."""
+
 _SLAB_NODES: Final = 1 << 15
 """Nodes whose delays are worked out at once: what fits the second-level cache."""
 
@@ -40,14 +43,36 @@ def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: In
     return np.asarray(delays[pairs[:, 1]] - delays[pairs[:, 0]])
 
 
+def delay_gradients_s_m(points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float) -> FloatArray:
+    """Gradient of each pair's delay at each point: (u_k - u_i) / c, u the unit vector from a microphone to the point.
+
+    Exact, near and far; its length is 2 sin(gamma/2)/c, gamma the angle that the pair subtends.
+
+    Parameters
+    ----------
+    points_m : (N, 3) float64
+    microphones_m : (K, 3) float64
+    pairs : (P, 2) int64
+    c_m_s : float
+
+    Returns
+    -------
+    (P, N, 3) float64
+        Seconds a metre.
+    """
+    towards = points_m - microphones_m[:, None]
+    unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=2, keepdims=True)), _NEAREST_M)
+    return np.asarray((unit[pairs[:, 1]] - unit[pairs[:, 0]]) / c_m_s)
+
+
 def alias_free_hz(
     points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, spacing_m: float, c_m_s: float
 ) -> FloatArray:
     """Frequency up to which a pair's map has no spatial aliasing on a grid: f_max = 1 / (2 D |grad tau|).
 
-    tau_ik's gradient is (u_k - u_i)/c, u the unit vectors from the microphones to the point: with D the grid's
-    spacing, the phase 2 pi f tau of every kept frequency turns by less than pi from node to node (García-Barrios,
-    Gutiérrez-Arriola et al., IEEE Access 2021, arXiv 2402.06586). It is infinite where the delay does not change.
+    With D the grid's spacing, the phase 2 pi f tau of every kept frequency turns by less than pi from node to node
+    (García-Barrios, Gutiérrez-Arriola et al., IEEE Access 2021, arXiv 2402.06586). It is infinite where the delay does
+    not change.
 
     Parameters
     ----------
@@ -60,13 +85,17 @@ def alias_free_hz(
     -------
     (P, N) float64
         Hertz.
+
+    Raises
+    ------
+    ValueError
+        Where the spacing is not above 0.
     """
-    towards = points_m - microphones_m[:, None]
-    unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=2, keepdims=True)), 1e-9)
-    gradient = np.sqrt(((unit[pairs[:, 1]] - unit[pairs[:, 0]]) ** 2).sum(axis=2)) / c_m_s
-    limit = np.full(gradient.shape, np.inf)
-    np.divide(1.0 / (2.0 * spacing_m), gradient, out=limit, where=gradient > 0.0)
-    return limit
+    if not spacing_m > 0:
+        raise ValueError(f"grid spacing: expected metres above 0, got {spacing_m}")
+    steepness = np.sqrt((delay_gradients_s_m(points_m, microphones_m, pairs, c_m_s) ** 2).sum(axis=2))
+    limit = np.full(steepness.shape, np.inf)
+    return np.asarray(np.divide(1.0 / (2.0 * spacing_m), steepness, out=limit, where=steepness > 0.0))
 
 
 class SRPMapper:

@@ -12,6 +12,7 @@ from livessl.config import Site
 from livessl.core import planning
 from livessl.core.gcc import microphone_pairs
 from livessl.core.geometry import Grid
+from livessl.core.srp import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.simulate.room import absorption
 
@@ -239,7 +240,7 @@ def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> Arr
     rate_hz = known_hz or RATE_HZ
     pairs = microphone_pairs(len(spec.microphones_m))
     points = _thinned(volume, BAND_NODES).nodes_m()
-    kept = planning.alias_free_hz(points, spec.microphones_m, pairs, site.grid.spacing_m, site.c_m_s)
+    kept = alias_free_hz(points, spec.microphones_m, pairs, site.grid.spacing_m, site.c_m_s)
     apart = np.linalg.norm(spec.microphones_m[pairs[:, 0]] - spec.microphones_m[pairs[:, 1]], axis=1)
     errors = planning.angle_error_deg(np.array(ANGLES_DEG), spec.aperture_m, rate_hz, site.c_m_s)
     return ArrayPlan(
