@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from livessl import wire
-from livessl.capture.devices import Device, Placed
+from livessl.capture.devices import Device
 from livessl.capture.line import Line, played_messages
 from livessl.capture.link import Link
 from livessl.capture.recorded import Part
@@ -71,10 +71,7 @@ def capture_recordings(
     """
     lines = [part.line(site) for part in parts]
     link = _link(name, site.nodes[name].server, lines, clock, run_id)
-    for end_ns, batch in played_messages(lines, _placed(parts), clock):
-        if stop():
-            break
-        link.send(batch)
+    for end_ns in _sent(link, lines, parts, clock, stop):
         if progress is not None:
             progress(end_ns)
     _finish(link, clock, stop)
@@ -103,10 +100,7 @@ def send_session(
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
         raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
-    for end_ns, batch in played_messages(lines, _placed(parts), pace):
-        if stop() or link.refused:
-            break
-        link.send(batch)
+    for end_ns in _sent(link, lines, parts, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while link.pending > MAX_PENDING and not (stop() or link.refused):
@@ -119,8 +113,13 @@ def _link(name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id:
     return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
 
 
-def _placed(parts: Sequence[Part]) -> list[Placed]:
-    return [part.placed for part in parts]
+def _sent(link: Link, lines: Sequence[Line], parts: Sequence[Part], pace: Clock, stop: Stop) -> Iterator[int]:
+    """Send what the lines make of their recordings, block by block; yields the site time reached."""
+    for end_ns, batch in played_messages(lines, [part.placed for part in parts], pace):
+        if stop():
+            return
+        link.send(batch)
+        yield end_ns
 
 
 def _finish(link: Link, clock: Clock, stop: Stop) -> None:

@@ -90,7 +90,8 @@ class SrpPhat:
             maps[name] = to_map(*gccs)
         fused: Float32Array = np.asarray(np.sum(list(maps.values()), axis=0, dtype=np.float32))
         functional = SRPFunctional(evidence, self._c_m_s)
-        position = peaks.best_peak(functional, fused, self._grid)
+        starts = np.stack([self._grid.node_m(node) for node in peaks.highest_nodes(fused, self._grid)])
+        position, _ = peaks.refine(functional, starts, self._grid)
         return Localization(
             position,
             peaks.laplace_covariance_m2(functional, evidence, position, self._grid),

@@ -43,18 +43,17 @@ def highest_nodes(power: Float32Array, grid: Grid, count: int = CANDIDATES) -> l
     return [int(best[candidate]) for candidate in chosen]
 
 
-def best_peak(functional: SRPFunctional, power: Float32Array, grid: Grid) -> FloatArray:
-    """Where the highest peak is, off the grid: the highest nodes looked at more closely, the best of them climbed."""
-    starts = np.stack([grid.node_m(node) for node in highest_nodes(power, grid)])
-    near = (starts[:, None] + _offsets_m(grid)[None]).reshape(-1, 3)
-    values = functional.value(near).reshape(len(starts), -1)
-    order = np.argsort(-values.max(axis=1), kind="stable")[:CLIMBED]
-    tops = [_climb(functional, near[k * values.shape[1] + int(values[k].argmax())], grid) for k in order]
-    return max(tops, key=lambda top: top[1])[0]
+def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
+    """From nodes to the highest top near any of them.
 
+    A finer local grid around every start, all looked at in one go; from the best of them Newton steps that only ever
+    go up.
 
-def refine(functional: SRPFunctional, start_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
-    """Climb from a node to the top nearby: a finer local grid, then Newton steps that only ever go up.
+    Parameters
+    ----------
+    functional : SRPFunctional
+    starts_m : (N, 3) or (3,) float64
+    grid : Grid
 
     Returns
     -------
@@ -63,8 +62,12 @@ def refine(functional: SRPFunctional, start_m: FloatArray, grid: Grid) -> tuple[
     value : float
         The functional there.
     """
-    near = start_m + _offsets_m(grid)
-    return _climb(functional, near[int(functional.value(near).argmax())], grid)
+    near = np.atleast_2d(starts_m)[:, None] + _offsets_m(grid)
+    values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
+    highest = values.argmax(axis=1)
+    order = np.argsort(-values.max(axis=1), kind="stable")[:CLIMBED]
+    tops = [_climb(functional, near[k, highest[k]], float(values[k, highest[k]]), grid) for k in order]
+    return max(tops, key=lambda top: top[1])
 
 
 def _offsets_m(grid: Grid) -> FloatArray:
@@ -74,9 +77,8 @@ def _offsets_m(grid: Grid) -> FloatArray:
     return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
 
 
-def _climb(functional: SRPFunctional, position_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
+def _climb(functional: SRPFunctional, position_m: FloatArray, value: float, grid: Grid) -> tuple[FloatArray, float]:
     axes = list(grid.free_axes)
-    value = float(functional.value(position_m[None])[0])
     reach = float(grid.cell_m.max()) / _SUBDIVISIONS
     for _ in range(_NEWTON_STEPS):
         gradient, hessian = functional.derivatives(position_m)
