@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
 
@@ -240,6 +239,25 @@ class ArraySpec:
 
 
 @dataclass(frozen=True, slots=True)
+class HeardBy:
+    """One array's evidence of one sound.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+        The array.
+    gcc : GCC
+        Of its whole band.
+    below : tuple of GCC
+        Of what lies below each of the band's cut-offs, where its map is limited against spatial aliasing.
+    """
+
+    spec: ArraySpec
+    gcc: GCC
+    below: tuple[GCC, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """A position and how sure it is.
 
@@ -384,26 +402,23 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class MapSnapshot:
-    """Power maps of one window, for people to look at.
+class Window:
+    """What a window was localized from: enough to draw its power maps, should somebody want to look at them.
 
     Parameters
     ----------
     time_ns : int
         Site time at the middle of the window.
-    fused : (G,) float32
-        Sum over the arrays at every grid node, in the grid's order.
-    arrays : mapping of name to (G,) float32
-        One map each.
+    evidence : tuple of HeardBy
+        One for each array that heard it.
     """
 
     time_ns: int
-    fused: Float32Array
-    arrays: Mapping[str, Float32Array] = field(default_factory=dict)
+    evidence: tuple[HeardBy, ...]
 
 
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | MapSnapshot
+Output = Update | Event | Track | Window
 """What fusion says."""
