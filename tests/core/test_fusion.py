@@ -70,6 +70,9 @@ class Scripted:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         self.prepared.append((array, sample_rate_hz))
 
+    def listener(self, array: str, sample_rate_hz: float) -> None:
+        return None
+
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
         heard = tuple(HeardBy(spec, NOTHING) for spec in (NORTH, SOUTH) if spec.name in sounds)
