@@ -19,13 +19,13 @@ from livessl.core.types import FloatArray, HeardBy, IntArray
 NEAR_M: Final = 0.5
 """The confidence is the probability that the place is right to within so much."""
 
-LEAST_CONFIDENCE: Final = 0.85
+LEAST_CONFIDENCE: Final = 0.8
 """Below it a place is refused."""
 
-_LOGISTIC: Final = (-3.7, 1.8, 1.23)
+_LOGISTIC: Final = (-3.34, 2.69, 1.03)
 """Intercept, weight of the margin and of the standing in the log-odds of a right place."""
 
-_INFLATION: Final = 1.3
+_INFLATION: Final = 1.6
 """What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
 
 

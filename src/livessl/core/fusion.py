@@ -168,7 +168,7 @@ class _Stream:
         return pieces, there
 
     def listen(self, rasters: Iterable[int], estimator: Estimator) -> None:
-        """Let a listener of the estimator, where it has any, hear the frames at `rasters`, which follow those before."""
+        """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
         for raster in rasters:
             frame = self.frames.get(raster)
             if frame is None:

@@ -2,15 +2,15 @@
 
 Reverberation is the past. In each band of the short-time spectrum the power P that begins now competes with what the
 past explains, I = max(N, max_s lambda^s P(t - s)): the stationary noise N, and all that was loud before, decaying. What
-exceeds it, S = max(P - I, 0), is taken to come straight from a source, so that the coherence expected between two
+exceeds it, S = max(P - I, 0), is taken to come straight from a source, so that the coherence to expect between two
 microphones is gamma = S / (S + I), and their phases weigh
 
     w = gamma^2 / (1 - gamma^2) = S^2 / (I (I + 2 S)),
 
-the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma, where
-the textbook would estimate it from long averages that reverberation spoils. The GCC is sum_t w conj(U_i) U_k, U = X/|X|,
-summed over the band and *not* normalised: a moment or a band with more evidence counts for more, and sums over frames
-make a window or an event. It knows no geometry and no other array.
+the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma
+where the textbook would estimate it from long averages, which reverberation spoils. The GCC is
+sum_t w conj(U_i) U_k, U = X/|X|, summed over the band and *not* normalised: a moment or a band with more evidence
+counts for more, and sums over frames make a window or an event. It knows no geometry and no other array.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from livessl.core.types import ArraySpec, ComplexArray, Float32Array
 WINDOW_S: Final = 0.032
 """Length of the Hann window; 16 ms and 64 ms did no better, and 16 ms less well for tones in noise."""
 
-HOP_S: Final = 0.008
+HOP_S: Final = 0.005
+"""8 ms cost a tenth of the accuracy in noise, 4 ms gain no more."""
 
 PAST_S: Final = 0.1
 """Time constant of the past's decay; between 0.06 and 0.2 s little changes."""
