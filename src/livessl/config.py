@@ -218,11 +218,20 @@ class SceneDeviceConfig(_Model):
 DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
+class SpoolConfig(_Model):
+    """Where a node keeps the sound that the server may still need; without a folder in memory, never on a disk."""
+
+    directory: Annotated[str, Field(min_length=1)] | None = None
+    max_mb: Positive = 512.0
+    max_age_s: Positive = 3600.0
+
+
 class NodeConfig(_Model):
     """A capture node: one device, one or more arrays on its channels (counted from 1)."""
 
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
+    spool: SpoolConfig = SpoolConfig()
     arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
 
     @model_validator(mode="before")

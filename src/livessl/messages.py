@@ -54,6 +54,8 @@ class Messages:
             "zones": self._site.zones_of(position),
             "late_frames": event.late_frames,
             "latency_s": round(event.latency_s, 4),
+            "late": event.late,
+            "replaces": [],
         }
 
     def update(self, update: Update) -> JsonObject:

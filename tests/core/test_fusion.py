@@ -527,9 +527,9 @@ def test_array_starts_then_is_healthy_then_lost() -> None:
     assert status.age_s == pytest.approx(0.1)
     assert (status.power, status.noise_power, status.clock) == (1e-7, 1e-7, ClockState.LOCKED)
     assert status.counters["marks"] == 10
-    assert status_of(fusion, "north", 49).state is ArrayState.HEALTHY
-    status = status_of(fusion, "north", 50)  # two seconds later
-    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 2 s")
+    assert status_of(fusion, "north", 39).state is ArrayState.HEALTHY
+    status = status_of(fusion, "north", 40)  # one and a half seconds later
+    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 1.5 s")
     play(fusion, node("north", (), range(60, 62)), 62, start=61)
     assert status_of(fusion, "north", 62).state is ArrayState.HEALTHY
     assert status_of(fusion, "south", 62).state is ArrayState.STARTING

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 from livessl import wire
@@ -11,6 +12,7 @@ from livessl.capture.devices import Device
 from livessl.capture.line import Line, played_messages
 from livessl.capture.link import Link
 from livessl.capture.recorded import Part
+from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
 
@@ -37,7 +39,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
     """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
     config: NodeConfig = site.nodes[name]
     line = Line(site, config.arrays, device.sample_rate_hz)
-    link = _link(name, config.server, [line], clock, run_id)
+    link = _link(name, config.server, [line], clock, run_id, _spool(name, config))
     problem = None
     try:
         with device:
@@ -70,7 +72,8 @@ def capture_recordings(
         Where the server has not acknowledged everything.
     """
     lines = [part.line(site) for part in parts]
-    link = _link(name, site.nodes[name].server, lines, clock, run_id)
+    config = site.nodes[name]
+    link = _link(name, config.server, lines, clock, run_id, _spool(name, config))
     for end_ns in _sent(link, lines, parts, clock, stop):
         if progress is not None:
             progress(end_ns)
@@ -95,7 +98,7 @@ def send_session(
         Where the server refuses it, or has not acknowledged everything.
     """
     lines = [part.line(site) for part in parts]
-    link = _link("replay", endpoint, lines, clock, run_id, replay=True)
+    link = _link("replay", endpoint, lines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
@@ -108,9 +111,20 @@ def send_session(
     _finish(link, clock, stop)
 
 
-def _link(name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False) -> Link:
+def _spool(name: str, config: NodeConfig) -> Spool:
+    spool = config.spool
+    directory = None if spool.directory is None else Path(spool.directory) / name
+    kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s)
+    if len(kept):
+        _log.info("the spool holds %d frames of an earlier run; they are sent again", len(kept))
+    return kept
+
+
+def _link(
+    name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, spool: Spool, *, replay: bool = False
+) -> Link:
     rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
+    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, spool)
 
 
 def _sent(link: Link, lines: Sequence[Line], parts: Sequence[Part], pace: Clock, stop: Stop) -> Iterator[int]:

@@ -37,8 +37,8 @@ from livessl.core.types import (
     Update,
 )
 
-LOST_NS: Final = 2_000_000_000
-"""An array not heard from for so long is lost; marks come every 50 ms."""
+LOST_NS: Final = 1_500_000_000
+"""An array not heard from for so long is lost: marks come every 50 ms, and everyone shall know within 2 s."""
 
 TROUBLE_NS: Final = 10_000_000_000
 """How long a fault keeps an array degraded after it was last seen."""
@@ -68,6 +68,7 @@ class ArrayState(StrEnum):
 
     STARTING = "starting"
     HEALTHY = "healthy"
+    QUIET = "quiet"
     DEGRADED = "degraded"
     LOST = "lost"
 
@@ -205,7 +206,44 @@ class Fusion:
         self._event: _OpenEvent | None = None
         self._heard_until = -(2**63)
         self._now_ns = 0
+        self._told_until = -(2**63)
         self.unknown_arrays = 0
+
+    def twin(self) -> Fusion:
+        """Another of the same site around the same estimator, at its beginning, that makes events only."""
+        specs = [stream.spec for stream in self._streams.values()]
+        return Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+
+    def begin(self, raster: int) -> None:
+        """Take it that everything before this raster interval has been told."""
+        self._heard_until = raster
+
+    def leave_out(self, raster: int) -> None:
+        """Tell no event of sound before this raster interval: another has told it."""
+        self._told_until = raster
+
+    @property
+    def closed(self) -> int | None:
+        """The last raster interval that was closed; None before the first."""
+        return None if self._next is None else self._next - 1
+
+    @property
+    def hears(self) -> bool:
+        """Whether a sound goes on."""
+        return self._event is not None
+
+    @property
+    def needed_from(self) -> int | None:
+        """Before this raster interval no frame will be looked at again; None at the beginning."""
+        if self._next is None:
+            return None
+        begin = self._next if self._event is None else self._event.start
+        return max(self._heard_until, begin - round(self._parameters.pre_roll_s / FRAME_S))
+
+    @property
+    def parameters(self) -> FusionParameters:
+        """How arrays are joined."""
+        return self._parameters
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
@@ -384,11 +422,16 @@ class Fusion:
         sounds: dict[str, Sound] = {}
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
+        if event.last_active < self._told_until:
+            return []
         first, last = event.last_active, event.start
         for name, stream in self._streams.items():
-            if not any(stream.has_active(raster) for raster in span):
+            active = [raster for raster in span if stream.has_active(raster)]
+            if not active:
                 continue
-            _, there = stream.segments(span)
+            # beyond its hang-over may lie the run-up to its next sound, which comes when that begins
+            own_end = active[-1] + round(parameters.hang_over_s / FRAME_S) + 1
+            _, there = stream.segments(range(span.start, min(span.stop, own_end)))
             power = np.array([stream.frames[raster].power for raster in there])
             mask = exact_mask(power, parameters.threshold)
             rasters = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
@@ -516,7 +559,7 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
     if stream.left:
         return ArrayState.LOST, "its node has ended"
     if age_ns >= LOST_NS:
-        silence = f"nothing heard from it for {age_ns / 1e9:.0f} s"
+        silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
         return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
     if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
         dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]

@@ -137,6 +137,9 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         if engine.unkept:
             reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
             status = "degraded" if status == "ok" else status
+        if engine.unsaved:
+            reasons.append(f"server.events_db: {engine.unsaved} events wait for it; free space or release the file")
+            status = "degraded" if status == "ok" else status
         if engine.failure is not None:
             status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
             response.status_code = 503
@@ -336,6 +339,7 @@ class _Metrics(Collector):
         yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
         yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
+        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", self._engine.unsaved)
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
         yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
         yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
