@@ -34,8 +34,48 @@ ANSWER_NS: Final = 10_000_000_000
 _log = logging.getLogger(__name__)
 
 
+class Dealer:
+    """The socket: it connects, and reconnects, by itself."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # what cannot go out now waits in our spool, not in ZeroMQ's
+        self._socket.setsockopt(zmq.SNDHWM, 200)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        self._socket.connect(endpoint)
+
+    def send(self, data: bytes) -> bool:
+        """Whether the message could be handed over."""
+        try:
+            self._socket.send(data, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def receive(self) -> bytes | None:
+        """The next message; None where there is none."""
+        try:
+            return self._socket.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+
+    def wait(self, milliseconds: int) -> None:
+        """Until there is a message, at most."""
+        self._socket.poll(milliseconds)
+
+    def close(self, linger_ms: int) -> None:
+        """End the connection; what was handed over has so long to go out."""
+        self._socket.setsockopt(zmq.LINGER, linger_ms)
+        self._socket.close()
+        self._context.term()
+
+
 class Link:
-    """DEALER socket, greetings, order.
+    """Greetings, order, acknowledgements.
 
     Frames stay in the spool until the server needs them no more; what it has not got is sent again after an
     interruption. Marks say how things are now, so only the newest of an array waits for the server to come back.
@@ -49,23 +89,24 @@ class Link:
     clock : Clock
     spool : Spool or None
         Where frames are kept; None keeps them in memory. It is closed with the link.
+    dealer : Dealer or None
+        The connection, instead of one of its own.
     """
 
-    def __init__(self, endpoint: str, hello: wire.Hello, clock: Clock, spool: Spool | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        hello: wire.Hello,
+        clock: Clock,
+        spool: Spool | None = None,
+        dealer: Dealer | None = None,
+    ) -> None:
         self.endpoint = endpoint
         self._hello = hello
         self._clock = clock
         self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # what cannot go out now waits in our spool, not in ZeroMQ's
-        self._socket.setsockopt(zmq.SNDHWM, 200)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
-        self._socket.connect(endpoint)
+        self._dealer = Dealer(endpoint) if dealer is None else dealer
         self._marks: dict[str, Mark] = {}  # while the server is away
         self._live: deque[Kept | Mark] = deque()
         self._backlog = deque(self._spool.frames())
@@ -182,22 +223,16 @@ class Link:
             if self._clock.monotonic_ns() - self._begun_ns > ANSWER_NS:
                 return
             self.service()
-            self._socket.poll(20)
+            self._dealer.wait(20)
 
     def close(self, *, bye: bool) -> None:
         """End the connection; with `bye` the server knows that it is on purpose."""
-        if bye and self._try_send(wire.encode(wire.Bye(self._hello.node, self._hello.run_id))):
-            self._socket.setsockopt(zmq.LINGER, 500)
-        self._socket.close()
-        self._context.term()
+        said = bye and self._try_send(wire.encode(wire.Bye(self._hello.node, self._hello.run_id)))
+        self._dealer.close(500 if said else 0)
         self._spool.close()
 
     def _receive(self) -> None:
-        while True:
-            try:
-                data = self._socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                return
+        while (data := self._dealer.receive()) is not None:
             try:
                 message = wire.decode(data)
             except wire.WireError as error:
@@ -274,9 +309,7 @@ class Link:
         """Whether it is on its way, or there is nothing to send."""
         if data is None:
             return True
-        try:
-            self._socket.send(data, zmq.NOBLOCK)
-        except zmq.Again:
+        if not self._dealer.send(data):
             return False
         self._sent_ns = self._clock.monotonic_ns()
         return True
