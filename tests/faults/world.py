@@ -26,7 +26,7 @@ from livessl.core.types import FRAME_NS, Frame, Mark, Message
 from livessl.server.engine import Engine
 from livessl.server.ingest import Ingest
 from livessl.server.receiver import Greeted, Item, Joined, Left
-from livessl.server.store import Query, Store
+from livessl.server.store import Query, Store, StoreError
 from small_site import RATE_HZ, site_of
 
 START = 20 * 1_767_225_600
@@ -186,8 +186,16 @@ class FragileStore(Store):
     def __init__(self) -> None:
         super().__init__(None)
         self.dies: str | None = None
+        self.full = False
+
+    def add(self, event: Event, time_ns: int, *, provisional: bool = False) -> None:
+        if self.full:
+            raise StoreError("disk full")
+        super().add(event, time_ns, provisional=provisional)
 
     def settle(self, *arguments: Any) -> None:
+        if self.full:
+            raise StoreError("disk full")
         if self.dies == "before":
             raise DiedError
         super().settle(*arguments)
@@ -203,6 +211,7 @@ class Node:
     microphones: Microphones
     link: Link
     stopped: bool = False
+    next_raster: int | None = None
 
 
 class World:
@@ -230,7 +239,7 @@ class World:
         self.wires: dict[str, Wire] = {}
         self.cut: set[str] = set()
         self.published: list[Event] = []
-        self._delay = delay_ticks
+        self.delay_ticks = delay_ticks
         self._spools = spools
         self._connections = self._runs = 0
         self.raster = START
@@ -313,7 +322,7 @@ class World:
         return connection.down.popleft()[1]
 
     def _arrival(self, queue: deque[tuple[int, bytes]]) -> int:
-        delay = self.rng.uniform(*self._delay) * FRAME_NS
+        delay = self.rng.uniform(*self.delay_ticks) * FRAME_NS
         return max(self.clock.time_ns + round(delay), queue[-1][0] if queue else 0)
 
     def heal(self, node: str) -> None:
@@ -331,9 +340,12 @@ class World:
         self._serve()
         self.clock.time_ns += FRAME_NS - FRAME_NS // 2
         self.raster += 1
-        for node in list(self.nodes.values()):
-            if not node.stopped:
-                node.link.send(node.microphones.hear(self.raster - 1))
+        for node in self.nodes.values():
+            first = self.raster - 1 if node.next_raster is None else node.next_raster
+            if not node.stopped:  # else its device's buffer holds what is heard
+                node.link.send([m for raster in range(first, self.raster) for m in node.microphones.hear(raster)])
+                first = self.raster
+            node.next_raster = first
         self._serve()
         for node in self.nodes.values():
             if not node.stopped:
@@ -368,11 +380,11 @@ class World:
         for _ in range(ticks):
             self.tick()
 
-    def recover(self, ticks: int = 400) -> None:
+    def recover(self, ticks: int = 200) -> None:
         """Everything is started and connected again; let it settle."""
         for name in list(self.cut):
             self.heal(name)
-        self.store.dies = None
+        self.store.dies, self.store.full = None, False
         if self.server is None:
             self.start_server()
         for name in ARRAY_OF:

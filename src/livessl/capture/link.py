@@ -102,7 +102,6 @@ class Link:
         dealer: Dealer | None = None,
     ) -> None:
         self.endpoint = endpoint
-        self._hello = hello
         self._clock = clock
         self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
@@ -110,6 +109,7 @@ class Link:
         self._marks: dict[str, Mark] = {}  # while the server is away
         self._live: deque[Kept | Mark] = deque()
         self._backlog = deque(self._spool.frames())
+        self._hello = replace(hello, backlog=_spans(self._backlog))
         self._backlog_sent: deque[Kept] = deque()
         self._live_sent: deque[Kept] = deque()
         self._received: dict[str, int] = {}
@@ -151,7 +151,7 @@ class Link:
         for message in messages:
             if isinstance(message, Frame):
                 self._keep(message)
-            elif self.connected:
+            elif self._greeted:
                 self._live.append(message)
             else:
                 self._marks[message.array] = message
@@ -181,7 +181,7 @@ class Link:
 
     def _keep(self, frame: Frame) -> None:
         kept, gone = self._spool.append(frame)
-        (self._live if self.connected else self._backlog).append(kept)
+        (self._live if self._greeted else self._backlog).append(kept)
         self._marks.pop(frame.array, None)  # a mark before it says how things were
         if gone:
             self._give_up(gone)
@@ -273,10 +273,7 @@ class Link:
         """Everything that the server has not got follows in order of time; what is cut from now on is live."""
         frames = [kept for kept in self._spool.frames() if kept.array in self._hello.arrays]
         self._backlog = deque(kept for kept in frames if not self._is_received(kept))
-        spans: dict[str, tuple[int, int]] = {}
-        for kept in self._backlog:
-            spans[kept.array] = (spans.get(kept.array, (kept.raster, 0))[0], kept.raster + 1)
-        self._hello = replace(self._hello, backlog=spans)
+        self._hello = replace(self._hello, backlog=_spans(self._backlog))
         self._live.extend(self._marks.values())
         self._marks.clear()
         self._say_hello()
@@ -289,6 +286,7 @@ class Link:
         for queue in (self._live, self._live_sent, self._backlog_sent):
             queue.clear()
         self._backlog = deque(self._spool.frames())
+        self._hello = replace(self._hello, backlog=_spans(self._backlog))  # the next server may be another
 
     def _say_hello(self) -> None:
         self._owes_hello = not self._try_send(wire.encode(self._hello))
@@ -313,3 +311,11 @@ class Link:
             return False
         self._sent_ns = self._clock.monotonic_ns()
         return True
+
+
+def _spans(frames: Iterable[Kept]) -> dict[str, tuple[int, int]]:
+    """Of each array the raster interval of its first frame, and that after its last."""
+    spans: dict[str, tuple[int, int]] = {}
+    for kept in frames:
+        spans[kept.array] = (spans.get(kept.array, (kept.raster, 0))[0], kept.raster + 1)
+    return spans

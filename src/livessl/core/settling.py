@@ -165,11 +165,10 @@ class Settling:
             self._keep(source, message, now_ns)
             self.backfilled[message.array] += backlog
             closed = self.live.closed
-            if closed is None or raster > closed:
-                return True
-            if message.active:
+            in_time = -ahead_ns < self.live.parameters.deadline_s * 1e9 if backlog else True
+            if message.active and (not in_time or (closed is not None and raster <= closed)):
                 self._late.add(raster)
-            return not backlog
+            return in_time
         return False
 
     def _keep(self, source: _Source, frame: Frame, now_ns: int) -> None:
