@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -56,18 +57,37 @@ def test_late_events_are_marked_and_name_what_they_replace() -> None:
     both = next(sound for sound in world.groups() if sum(bool(sound & a) for _, a in world.sounds) == 2)
     world.run(min(both) - world.raster - 20)
     world.cut.add("a")
-    world.run(max(both) - min(both) + 60)
-    provisional = world.published_events[-1:]
-    assert [(event["heard_by"], event["late"]) for event in provisional] == [(["south"], False)]
-    told = len(world.published_events)
+    world.run(max(both) - min(both) + 50)
+    provisional = world.published_events[-1]
+    assert (provisional["heard_by"], provisional["late"]) == (["south"], False)
     world.heal("a")
     world.run(40)
-    late = world.published_events[told:]
-    assert [(event["heard_by"], event["late"]) for event in late] == [(["north", "south"], True)]
-    assert late[0]["replaces"] == ([] if late[0]["id"] == provisional[0]["id"] else [provisional[0]["id"]])
-    stored = [event["id"] for event in world.events()]
-    assert stored.count(late[0]["id"]) == 1
-    assert len(stored) == len(set(stored)) == told
+    (late,) = [event for event in world.published_events if event["late"]]
+    assert late["heard_by"] == ["north", "south"]
+    assert (late["replaces"], late["id"]) == ([], provisional["id"])
+    stored = [event for event in world.events() if event["id"] == late["id"]]
+    assert [event["heard_by"] for event in stored] == [["north", "south"]]
+
+
+def test_late_event_of_another_id_takes_the_place_of_what_was_told() -> None:
+    """Where the array that was away heard the sound first, the event begins earlier, and is named after that."""
+    world, first, after = next(
+        (world, min(a), min(b))
+        for world in map(World, range(20))
+        for (north, a), (south, b) in pairwise(world.sounds)
+        if (north, south) == ("north", "south") and 0 < min(b) - min(a) < 3 and max(b) - min(a) < 30
+    )
+    world.run(first - world.raster - 20)
+    world.cut.add("a")
+    world.run(20 + 70)
+    provisional = world.published_events[-1]
+    assert provisional["id"] == f"small-{after * 50}"
+    world.heal("a")
+    world.run(40)
+    (late,) = [event for event in world.published_events if event["late"]]
+    assert late["id"] == f"small-{first * 50}"
+    assert late["replaces"] == [provisional["id"]]
+    assert provisional["id"] not in [event["id"] for event in world.events()]
 
 
 def test_dead_array_delays_nobody() -> None:
