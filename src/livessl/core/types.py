@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float32Array = NDArray[np.float32]
+UInt8Array = NDArray[np.uint8]
+UInt16Array = NDArray[np.uint16]
 FloatArray = NDArray[np.float64]
+RealArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complex64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -176,13 +179,13 @@ class GCC:
         Microphone indices (i, k), i < k.
     lags_s : (L,) float64
         Lags in seconds, ascending and evenly spaced. Positive lag of pair (i, k): channel k hears it later.
-    values : (P, L) float64
+    values : (P, L) float32 or float64
         1 is perfect coherence at that lag.
     """
 
     pairs: IntArray
     lags_s: FloatArray
-    values: FloatArray
+    values: RealArray
 
     def __post_init__(self) -> None:
         if self.values.shape != (len(self.pairs), len(self.lags_s)):
