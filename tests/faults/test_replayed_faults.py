@@ -84,7 +84,7 @@ def test_late_event_of_another_id_takes_the_place_of_what_was_told() -> None:
     assert provisional["id"] == f"small-{after * 50}"
     world.heal("a")
     world.run(40)
-    (late,) = [event for event in world.published_events if event["late"]]
+    late = next(event for event in world.published_events if event["late"])
     assert late["id"] == f"small-{first * 50}"
     assert late["replaces"] == [provisional["id"]]
     assert provisional["id"] not in [event["id"] for event in world.events()]

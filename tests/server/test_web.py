@@ -9,7 +9,7 @@ import socket
 import sqlite3
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -293,6 +293,56 @@ def test_map_before_anything_was_heard(fresh: httpx.Client) -> None:
         assert (response.status_code, response.content) == (204, b"")
 
 
+def watch(server: Server, query: str = "", origin: str | None = None) -> Any:
+    url = f"ws{server.url.removeprefix('http')}/api/v1/map{query}"
+    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=5)
+
+
+def test_map_is_watched(server: Server, client: httpx.Client) -> None:
+    with watch(server, "?array=south&views=floor,side") as socket:
+        packed = [socket.recv(timeout=5) for _ in range(2)]
+        with pytest.raises(TimeoutError):
+            socket.recv(timeout=0.15)  # there is no newer window
+    for view, data in zip(("floor", "side"), packed, strict=True):
+        numbers = client.get("/api/v1/map", params={"array": "south", "view": view, "format": "float32"})
+        assert numbers.headers["X-Map-Shape"] == {"floor": "20,16", "side": "12,20"}[view]
+        assert numbers.headers["X-Map-Bounds-M"] == {"floor": "0,5,0,4", "side": "0,3,0,5"}[view]
+        powers = floats(numbers).ravel()
+        step = (powers.max() - powers.min()) / 255
+        levels = np.frombuffer(data, dtype=np.uint8, offset=48)
+        assert len(levels) == len(powers)
+        assert np.abs(powers.min() + step * levels - powers).max() <= 0.51 * step
+
+
+def test_watchers_get_new_windows() -> None:
+    with running_server(site_of()) as server, watch(server) as socket:
+        for _ in range(2):
+            play(server)
+            assert len(socket.recv(timeout=5)) == 48 + 16 * 20
+            with suppress(TimeoutError):
+                while True:
+                    socket.recv(timeout=0.3)
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("?array=west", "array: none of that name; there are fused, north, south"),
+        ("?views=floor,roof", "views: expected some of floor, side, front"),
+    ],
+)
+def test_map_watched_wrongly(server: Server, query: str, said: str) -> None:
+    with watch(server, query) as socket, pytest.raises(ConnectionClosed) as caught:
+        socket.recv(timeout=5)
+    assert caught.value.rcvd is not None
+    assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, said)
+
+
+def test_page_of_another_server_may_not_watch(server: Server) -> None:
+    with watch(server, origin="http://evil.example") as socket, pytest.raises(ConnectionClosed):
+        socket.recv(timeout=5)
+
+
 @pytest.mark.parametrize(
     ("query", "status", "said"),
     [
@@ -324,6 +374,10 @@ def test_metrics(client: httpx.Client) -> None:
     assert value("livessl_sink_failures_total") == 0
     assert value("livessl_messages_refused_total") == 0
     assert value("livessl_uptime_seconds") > 0
+    for stage in ("sent", "received", "located"):
+        assert value("livessl_latency_seconds_count", kind="event", stage=stage) == 2
+        assert value("livessl_latency_seconds_count", kind="update", stage=stage) > 2
+    assert value("livessl_latency_seconds_count", kind="event", stage="delivered") == 0  # nobody listened
     for array in ("north", "south"):
         assert value("livessl_array_up", array=array) == 0
         assert value("livessl_array_age_seconds", array=array) >= 0
@@ -437,6 +491,32 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):
             assert httpx.get(f"{server.url}/api/v1/health").status_code == 503
+
+
+def test_answers_say_where_their_time_went() -> None:
+    """One machine, one clock: every stage is positive, and they add up to what the client sees at least."""
+    with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
+        node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
+        start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
+        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        wait_until(lambda: server.engine.events == 2, "both events")
+        told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
+        now_ns = CLOCK.now_ns()
+        metrics = httpx.get(f"{server.url}/metrics").text
+    answers = [message for message in told if message["kind"] in ("event", "update")]
+    assert {message["kind"] for message in answers} == {"event", "update"}
+    for message in answers:
+        stages = message["latency_stages_s"]
+        assert set(stages) == {"waited", "sent", "received", "located"}
+        assert min(stages.values()) >= 0
+        assert sum(stages.values()) == pytest.approx(message["latency_s"], abs=3e-4)  # each is rounded to 0.1 ms
+        if message["kind"] == "update":
+            assert stages["waited"] == 0
+            assert message["latency_s"] <= (now_ns - utc_ns(message["end_utc"])) / 1e9
+        else:
+            assert stages["waited"] == pytest.approx(0.3)
+    [delivered] = re.findall(r'^livessl_latency_seconds_count{kind="update",stage="delivered"} (\S+)$', metrics, re.M)
+    assert float(delivered) >= sum(message["kind"] == "update" for message in answers)
 
 
 def test_live_filters_kinds(server: Server) -> None:

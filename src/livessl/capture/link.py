@@ -307,7 +307,7 @@ class Link:
         """Whether it is on its way, or there is nothing to send."""
         if data is None:
             return True
-        if not self._dealer.send(data):
+        if not self._dealer.send(wire.stamped(data, self._clock.now_ns())):
             return False
         self._sent_ns = self._clock.monotonic_ns()
         return True

@@ -14,8 +14,10 @@ from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, Event, MapSnapshot, Message, Output, Track, TrackState, Update
-from livessl.messages import JsonObject, Messages, array_status
+from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
+from livessl.messages import JsonObject, Messages, Stages, array_status
+from livessl.server.latency import Latency
+from livessl.server.maps import Maps
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.store import Store, StoreError
 
@@ -85,7 +87,6 @@ class Engine:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
         self._lock = threading.Lock()
-        self._map: MapSnapshot | None = None
         self._tracks: dict[int, JsonObject] = {}
         self._states: dict[str, str] = {}
         self._replay_now_ns: int | None = None
@@ -97,6 +98,8 @@ class Engine:
         self._started_ns, self._began_ns = clock.now_ns(), clock.monotonic_ns()
         self.events = 0
         self.unkept = 0
+        self.maps = Maps(clock)
+        self.latency = Latency()
         self._begin(site.arrays, store.settled(site.site))
         self._receiver = Receiver(site, clock)
 
@@ -108,7 +111,7 @@ class Engine:
     @property
     def failure(self) -> BaseException | None:
         """What ended one of the threads, if anything did."""
-        return self._failure or self._receiver.failure
+        return self._failure or self._receiver.failure or self.maps.failure
 
     @property
     def mode(self) -> str:
@@ -128,6 +131,7 @@ class Engine:
     def start(self) -> None:
         """Begin to work."""
         self._receiver.start()
+        self.maps.start()
         self._thread.start()
 
     def stop(self) -> None:
@@ -135,6 +139,7 @@ class Engine:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=3.0)
+        self.maps.stop()
         self._receiver.stop()
 
     def wait_idle(self) -> None:
@@ -162,10 +167,6 @@ class Engine:
         with self._lock:
             return list(self._tracks.values())
 
-    def latest_map(self) -> MapSnapshot | None:
-        """Power maps of the newest window."""
-        return self._map
-
     def _array(self, status: ArrayStatus) -> JsonObject:
         ingest, settling = self._receiver.ingest, self._settling
         described = array_status(status, self._site.node_of(status.name))
@@ -188,7 +189,7 @@ class Engine:
         """A clean slate: nothing of another time may leak into this one."""
         self._settling = Settling(self._site.make_fusion(self._method), arrays, settled)
         self._messages: Messages | None = None
-        self._map = None
+        self.maps.clear()
 
     def _run(self) -> None:
         try:
@@ -304,15 +305,24 @@ class Engine:
             elif isinstance(output, Event):
                 self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
-                self._publish(self._messages.update(output))
+                self._publish(self._messages.update(output, self._stages(output, "update")))
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
-                self._map = output
+                self.maps.show(output, self._settling.live.power_maps)
+
+    def _stages(self, answer: Update | Event, kind: str) -> Stages | None:
+        """Where an answer's time went; a recording's was long ago."""
+        if self._replay_now_ns is not None:
+            return None
+        stages = self._receiver.arrivals.stages(answer, self._clock.now_ns())
+        if stages is not None:
+            self.latency.located(kind, stages)
+        return stages
 
     def _tell_provisional(self, output: Event, messages: Messages) -> None:
         """An event that cannot wait for an array that is late or away."""
-        event = messages.event(output)
+        event = messages.event(output, self._stages(output, "event"))
         try:
             self._store.add(event, output.start_ns, provisional=True)
         except StoreError as error:  # it will be settled, and is then kept until the store takes it
@@ -321,11 +331,15 @@ class Engine:
 
     def _tell_settled(self, settled: Settled, messages: Messages) -> None:
         """Events that stay: those that are news are told, once they are stored."""
-        events = [(messages.event(output), output.start_ns) for output in settled.events]
+        before = self._store.provisional(settled.until)
+        in_time = [None if output.late or before else self._stages(output, "event") for output in settled.events]
+        events = [
+            (messages.event(output, stages), output.start_ns)
+            for output, stages in zip(settled.events, in_time, strict=True)
+        ]
         if self._replay_now_ns is not None:
             self._keep_replayed(events)
             return
-        before = self._store.provisional(settled.until)
         replaced = {old["id"]: _overlapped(old, [event for event, _ in events]) for old in before}
         known = {old["id"]: old for old in before}
         news = []

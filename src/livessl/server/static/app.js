@@ -34,9 +34,9 @@ const state = {
   unread: null,     // its message, until it is read out
   mark: null,       // the event that is pointed at or pinned, as a marker
   tracks: new Map(),
-  latencies: [],
+  latencies: { update: [], event: [] }, // messages that say how long they took, the newest last
   maps: null,       // { floor, side, bornMs, time }
-  images: null,     // { floor, side, bornMs } coloured
+  images: null,     // { floor, side, bornMs } coloured, each { canvas, bounds }
   missed: 0,
 };
 
@@ -75,7 +75,7 @@ const HEARD = {
     state.tracks.clear();
     loadSite();
     loadEvents();
-    heat.want();
+    heat.watch();
   },
   arrays(message) {
     if (message.mode && message.mode !== state.mode) changeMode(message.mode);
@@ -87,15 +87,14 @@ const HEARD = {
     state.arrays = message.arrays.map((array) => ({ array, askedMs }));
     arraysPanel.show(state.arrays, now, "live");
     fillMapChoice();
-    if (message.arrays.some(({ active }) => active)) heat.want();
   },
   update(message) {
     const bornMs = born(message, 0, true);
     const shown = marker(message, bornMs);
     state.current.set(message.event_id, shown);
     if (shown.position) leaveTrail(shown);
+    learnLatency("update", message);
     newest(message, shown);
-    heat.want();
   },
   event({ v, seq, ...message }) { // what is left is the event as it is stored
     const bornMs = born(message, message.duration_s, true);
@@ -104,10 +103,9 @@ const HEARD = {
     state.events.add(message.id);
     eventList.add(message, serverNow());
     if (shown.position && shown.status === "located") leaveTrail(shown);
-    learnLatency(message);
+    learnLatency("event", message);
     newest(message, shown);
     announce(message);
-    heat.want();
   },
   track(message) {
     const track = (message.state !== "new" && state.tracks.get(message.id)) || { points: [] };
@@ -171,7 +169,7 @@ async function loadEvents(tries = 0) {
     if (events.length > 0 && (state.last === null || born(events[0], events[0].duration_s, false) > state.last.bornMs + LATE_MS)) {
       newest(events[0], marker(events[0], born(events[0], events[0].duration_s, false)));
     }
-    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.length < TRAIL) learnLatency(event);
+    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.event.length < TRAIL) learnLatency("event", event);
     redraw();
   } catch (error) {
     console.warn("livessl: events:", error.message);
@@ -220,11 +218,26 @@ function newest(message, shown) {
   state.unread = { kind: "event", ...message }; // read out with the next tick, so that numbers and plans agree
 }
 
-function learnLatency({ latency_s: latency }) {
-  if (!Number.isFinite(latency)) return;
-  state.latencies = [...state.latencies, latency].slice(-TRAIL);
-  const sorted = [...state.latencies].sort((a, b) => a - b);
-  write(find("vital-latency"), `${number(sorted[sorted.length >> 1])} s`);
+function median(values) {
+  return values.sort((a, b) => a - b)[values.length >> 1];
+}
+
+function milliseconds(seconds) {
+  return `${number(1000 * seconds, 0)} ms`;
+}
+
+/** The middle one of the last answers: while a sound lasts, and after it has ended; where the time goes, on pointing. */
+function learnLatency(kind, message) {
+  if (!Number.isFinite(message.latency_s)) return;
+  state.latencies[kind] = [...state.latencies[kind], message].slice(-TRAIL);
+  const { update, event } = state.latencies;
+  const told = Object.entries({ live: update, event }).filter(([, heard]) => heard.length > 0);
+  write(find("vital-latency"), told.map(([name, heard]) => `${name} ${milliseconds(median(heard.map((one) => one.latency_s)))}`).join(" · "));
+  const parts = told.map(([name, heard]) => [name, heard.map((one) => one.latency_stages_s).filter(Boolean)]).filter(([, stages]) => stages.length > 0);
+  find("vital-latency").title = parts.map(([name, stages]) => {
+    const each = Object.keys(stages[0]).map((stage) => `${stage} ${milliseconds(median(stages.map((one) => one[stage])))}`);
+    return `${name}: ${each.join(", ")}`;
+  }).join("\n");
 }
 
 function announce(event) {
@@ -244,7 +257,7 @@ function changeMode(mode) {
   state.tracks.clear();
   state.current.clear();
   state.trail = [];
-  state.last = null;
+  state.last = state.maps = state.images = null;
   loadEvents();
 }
 
@@ -348,7 +361,8 @@ function readTheme() {
 }
 
 function colourMaps() {
-  state.images = state.maps && { floor: paint(state.maps.floor, table), side: paint(state.maps.side, table), bornMs: state.maps.bornMs };
+  const painted = (picture) => ({ canvas: paint(picture, table), bounds: picture.bounds });
+  state.images = state.maps && { floor: painted(state.maps.floor), side: painted(state.maps.side), bornMs: state.maps.bornMs };
 }
 
 /** Something to draw has changed: it is drawn with the next tick, however many messages come until then. */
@@ -364,7 +378,7 @@ function scene(now) {
   return {
     now,
     map: state.images,
-    grid: site.grid,
+    thickness: site.grid.spacing_m,
     zones: Object.entries(site.zones ?? {}).map(([name, { bounds_m: bounds }]) => [name, bounds.map(([a]) => a), bounds.map(([, b]) => b)]),
     arrays: Object.entries(site.arrays).map(([name, array]) => ({
       name,
