@@ -429,10 +429,25 @@ def test_live_begins_with_a_greeting(server: Server) -> None:
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 
+def test_live_goes_on_where_a_client_was(server: Server) -> None:
+    with live(server) as socket:
+        hello, first, second = (json.loads(socket.recv(timeout=5)) for _ in range(3))
+    with live(server, f"?since_seq={first['seq']}") as socket:
+        greeting, following = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert greeting["kind"] == "hello"
+    assert following == second
+    assert hello["last_seq"] > 1_600_000_000_000  # above all numbers of an earlier life
+    with live(server, "?since_seq=5") as socket:
+        _, gap = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert (gap["kind"], gap["missed"]) == ("gap", None)
+
+
 @pytest.mark.parametrize(
     ("query", "said"),
     [
         ("?kinds=events", "kinds: expected some of arrays, event, track, update"),
+        ("?since_seq=-1", "since_seq: expected the seq of a message"),
+        ("?since_seq=x", "since_seq: expected the seq of a message"),
         ("?zone=hall", "zone: none of that name; zones are door, room"),
     ],
 )

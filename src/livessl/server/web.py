@@ -253,16 +253,21 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
 def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub: Hub) -> None:
     @app.websocket("/api/v1/live")
     async def live(
-        socket: WebSocket, kinds: str | None = None, min_confidence: str = "0", zone: str | None = None
+        socket: WebSocket,
+        kinds: str | None = None,
+        min_confidence: str = "0",
+        zone: str | None = None,
+        since_seq: str | None = None,
     ) -> None:
         await socket.accept()  # a reason can only be told to a client that is connected
         try:
             _refuse_strangers(socket)
             wanted = _filter(site, kinds, min_confidence, zone)
+            since = _number("since_seq", since_seq)
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
             return
-        subscription = hub.subscribe(wanted)
+        subscription = hub.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
             "seq": hub.last_seq,
@@ -321,6 +326,12 @@ def _refuse_strangers(socket: WebSocket) -> None:
     origin = socket.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
         raise ValueError("origin: pages of other servers may not listen")
+
+
+def _number(name: str, text: str | None) -> int | None:
+    if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ValueError(f"{name}: expected the seq of a message")
+    return None if text is None else int(text)
 
 
 def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
