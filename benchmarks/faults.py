@@ -1,6 +1,7 @@
-"""Breaks things on purpose and counts what is lost: `replayed` in simulated time, `processes` with real ones.
+"""Breaks things on purpose and counts what is lost.
 
-`python benchmarks/faults.py replayed --seeds 1000` and `python benchmarks/faults.py processes --out FOLDER`.
+`python benchmarks/faults.py replayed --seeds 1000` in simulated time, `processes --out FOLDER` with real processes, and
+`wire` with damaged messages. What came out is in docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ import json
 import logging
 import math
 import random
+import resource
 import shutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +24,7 @@ from typing import Any
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "faults")]
 
+from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
 
@@ -133,6 +137,19 @@ def compared(name: str, got: list[dict[str, Any]], expected: list[dict[str, Any]
     }
 
 
+def damaged(count: int) -> int:
+    """Damaged messages in ten parts; the memory after each."""
+    logging.disable(logging.CRITICAL)
+    outcomes: Counter[str] = Counter()
+    began = time.monotonic()
+    for part in range(10):
+        outcomes += campaign(count // 10, part)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        print(f"{outcomes.total()} messages, {dict(outcomes)}, at most {peak_mb:.1f} MB", flush=True)
+    print(f"{time.monotonic() - began:.0f} s")
+    return 0
+
+
 def main() -> int:
     """Run a campaign; 1 where anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -144,7 +161,11 @@ def main() -> int:
     sub = campaigns.add_parser("processes", help="real processes and sockets: 40 sounds under each fault")
     sub.add_argument("--out", type=Path, required=True, help="folder for recordings and results; what is there stays")
     sub.add_argument("--fault", choices=list(PROCESSES), action="append", help="only these (all)")
+    sub = campaigns.add_parser("wire", help="damaged messages, given to the server's ingest")
+    sub.add_argument("--count", type=int, default=1_000_000, help="how many (1 000 000)")
     arguments = parser.parse_args()
+    if arguments.campaign == "wire":
+        return damaged(arguments.count)
     began = time.monotonic()
     if arguments.campaign == "processes":
         results = processes(arguments.out, arguments.fault or list(PROCESSES))

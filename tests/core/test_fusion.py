@@ -650,3 +650,17 @@ def test_memory_does_not_grow(arrays: tuple[str, ...]) -> None:
             # an event of 20 frames, and 15 for pre-roll, window and hang-over before it
             assert len(held) <= len(arrays) * (20 + 15 + 2)
     assert max(sizes[1:]) <= sizes[0] + 200  # counters get longer
+
+
+def test_microphone_that_dies_amid_sound_is_found_too() -> None:
+    """While there is sound no mark comes; a frame's samples tell the same."""
+    fusion = fusion_of()
+    samples = np.full((4, 20), 0.1, np.float32)
+    samples[2] = 0.0
+    arrivals: Arrivals = [(k + 1.0, frame("north", k, samples=samples.copy())) for k in range(30)]
+    play(fusion, arrivals, 19)
+    assert status_of(fusion, "north", 20).state is ArrayState.HEALTHY
+    play(fusion, arrivals[20:], 30, start=20)
+    status = status_of(fusion, "north", 30)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"

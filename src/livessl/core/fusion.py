@@ -134,7 +134,8 @@ class _Stream:
     power: float | None = None
     active: bool = False
     rate_hz: float | None = None
-    silent_since_ns: int | None = None
+    dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
+    dead_since_ns: int = 0
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
@@ -144,6 +145,13 @@ class _Stream:
 
     def worry(self, now_ns: int, what: str) -> None:
         self.trouble_ns, self.trouble = now_ns, what
+
+    def find_dead(self, now_ns: int, alive: Iterable[bool]) -> None:
+        """Take note of the channels that had anything but zeros."""
+        dead = tuple(k for k, lives in enumerate(alive, start=1) if not lives)
+        if dead and not self.dead:
+            self.dead_since_ns = now_ns
+        self.dead = dead
 
     def has_active(self, raster: int) -> bool:
         frame = self.frames.get(raster)
@@ -337,6 +345,7 @@ class Fusion:
         stream.counters["frames"] += 1
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
+            stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -524,10 +533,7 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
     stream.counters["overflows"], stream.counters["lost_frames"] = mark.overflows, mark.lost_frames
     if stream.watermark is None or mark.raster >= stream.watermark:
         stream.mark, stream.power, stream.active = mark, mark.power, False
-        if min(mark.channel_power, default=1.0) > 0.0:
-            stream.silent_since_ns = None
-        elif stream.silent_since_ns is None:
-            stream.silent_since_ns = now_ns
+        stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
 def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
@@ -567,9 +573,9 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
     if age_ns >= LOST_NS:
         silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
         return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
-    if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
-        dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]
-        which = "all channels are" if len(dead) == len(stream.mark.channel_power) else f"microphone {dead} is"
+    if stream.dead and now_ns - stream.dead_since_ns >= SILENT_NS:
+        every = len(stream.dead) == len(stream.spec.microphones_m)
+        which = "all channels are" if every else f"microphone {list(stream.dead)} is"
         return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
     if troubled:
         return ArrayState.DEGRADED, stream.trouble

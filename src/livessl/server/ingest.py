@@ -19,6 +19,9 @@ SOON_NS: Final = 20_000_000
 GONE_NS: Final = 2_000_000_000
 """A node silent for so long no longer holds its name and its arrays."""
 
+THERE_NS: Final = 1_400_000_000
+"""A node that has nothing else to say greets once a second; a dead one is not there any more when its array is lost."""
+
 NOTICE_NS: Final = 60_000_000_000
 """One notice a minute about senders of rubbish, not one a message."""
 
@@ -91,8 +94,11 @@ class Ingest:
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
     def is_live(self, array: str, now_ns: int) -> bool:
-        """Whether the node that an array is on has been heard of lately."""
-        return any(array in hello.arrays for hello in self.live_nodes(now_ns))
+        """Whether the node that an array is on has said anything in the last moments."""
+        return any(
+            array in peer.hello.arrays and not peer.ended and now_ns - peer.heard_ns < THERE_NS
+            for peer in self._peers.values()
+        )
 
     def receive(self, routing_id: bytes, data: bytes, now_ns: int) -> Arrival:
         """Take in one message from one peer."""
