@@ -19,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 import soundfile
 import yaml
 from proxy import Proxy
@@ -32,6 +33,9 @@ from small_site import RATE_HZ, hiss, small
 Event = dict[str, Any]
 
 FRAME_S = 0.05
+TAIL_S = 120.0
+"""Quiet after the last sound: a node does not end because its server is away, and here it shall not either."""
+
 NODES = {"a": "north", "b": "south"}
 
 
@@ -53,6 +57,10 @@ def make_recordings(directory: Path, count: int, gap_s: float, seed: int = 5) ->
         gap_s=gap_s,
     )
     write_scene(directory, site, scene, seed=seed)
+    for k, array in enumerate(NODES.values()):
+        samples, rate = soundfile.read(directory / f"{array}.wav", always_2d=True)
+        hum = 1e-4 * np.random.default_rng(k).standard_normal((round(TAIL_S * rate), samples.shape[1]))
+        soundfile.write(directory / f"{array}.wav", np.concatenate([samples, hum]), rate, subtype="PCM_16")
 
 
 def free_port() -> int:
@@ -169,6 +177,19 @@ class Playing:
         """Seconds of the recordings that have passed."""
         return time.time() - self.start_ns / 1e9
 
+    def is_settled(self) -> bool:
+        """Whether both nodes are well again, and all that they had kept has been taken in."""
+        before = self.get("arrays")
+        time.sleep(3.0)
+        after = self.get("arrays")
+        if before is None or after is None:
+            return False
+        taken = [
+            [array["counters"]["frames"] + array["counters"]["backfilled"] for array in both["arrays"]]
+            for both in (before, after)
+        ]
+        return {array["state"] for array in after["arrays"]} == {"healthy"} and taken[0] == taken[1]
+
     def events(self) -> list[Event]:
         """What is stored, oldest first, whether or not a server runs; `at_s` counts from the recordings' start."""
         with closing(sqlite3.connect(self.directory / "events.db", timeout=10)) as db:
@@ -187,9 +208,9 @@ def wait_for(condition: Callable[[], object], what: str, within_s: float) -> Non
 
 
 def duration_s(recordings: Path) -> float:
-    """Of the recordings."""
+    """Of the recordings, without the quiet at their end."""
     info = soundfile.info(recordings / "north.wav")
-    return float(info.frames / info.samplerate)
+    return float(info.frames / info.samplerate) - TAIL_S
 
 
 def play(
@@ -206,10 +227,7 @@ def play(
             proxy.weather.cut = False
         if "server" not in site.processes:
             site.start_server()
-        site.wait_ready()
         site.sleep_until(end_s)
-        for name in NODES:
-            if name in site.processes:
-                site.processes[name].wait(timeout=90)
-        time.sleep(3.0)
+        site.wait_ready()
+        wait_for(lambda: site.is_settled(), "the last events", 90)
         return site.events()
