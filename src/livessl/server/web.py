@@ -101,8 +101,9 @@ def describe_site(site: Site, mode: str) -> JsonObject:
                 "microphones_m": spec.microphones_m.round(4).tolist(),
                 "band_hz": list(spec.band_hz),
             }
-            for spec in site.specs
+            for spec in site.processed
         },
+        "joint": {name: list(members) for name, members in site.joint.items()},
         "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
     }
 
@@ -219,8 +220,9 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         format: Annotated[Literal["png", "float32"], Query()] = "png",  # noqa: A002 - the API's word
     ) -> Response:
         """The newest power map: a projection (largest value along the axis left out) or the whole volume."""
-        if array != "fused" and array not in site.arrays:
-            raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
+        known = ["fused", *(spec.name for spec in site.processed)]
+        if array not in known:
+            raise HTTPException(404, f"no array {array!r}; there are {', '.join(known)}")
         if view == "volume" and format == "png":
             raise HTTPException(422, "view=volume has no picture; use format=float32")
         snapshot = engine.latest_map()
