@@ -600,7 +600,7 @@ def _check(arguments: argparse.Namespace) -> int:
     grid = site.search_grid()
     if arguments.json:
         checked = {"valid": True, "faults": [], "warnings": list(site.warnings), "site": site.site}
-        print(json.dumps({**checked, "arrays": list(site.arrays), "joint": site.joint, "nodes": grid.size}))
+        print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
     else:
         _tell_warnings(site)
         arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)

@@ -306,7 +306,7 @@ class Stacked:
         for blocks in zip(*(recording.blocks(start_ns) for recording in self.recordings), strict=True):
             first = blocks[0]
             if len({(block.first_index, block.samples.shape[1]) for block in blocks}) > 1:
-                at_s = (first.stamp_ns - start_ns) / 1e9
+                at_s = (min(block.stamp_ns for block in blocks) - start_ns) / 1e9
                 raise DeviceError(
                     f"{self.name}: expected recordings that run together to the sample, got a gap or an end in one of "
                     f"them only, {at_s:.3f} s after they begin; record them through one device"

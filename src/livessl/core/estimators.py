@@ -167,7 +167,8 @@ def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) ->
             f"array {name!r}: joint processing expects {MAX_MICROPHONES} microphones at most, got {count}; "
             "join fewer arrays, or let their maps be summed instead"
         )
-    return ArraySpec(name, np.vstack([spec.microphones_m for spec in arrays]), bands_hz.pop())
+    microphones_m = np.ascontiguousarray(np.vstack([spec.microphones_m for spec in arrays]))  # sums depend on the order
+    return ArraySpec(name, microphones_m, bands_hz.pop())
 
 
 def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:
