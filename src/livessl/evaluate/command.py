@@ -37,7 +37,12 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--jobs", type=_whole, help="processes (default: one a core)")
     parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of processes here")
     parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
-    parser.add_argument("--snr", type=float, metavar="DB", help="add white sensor noise (default: none)")
+    parser.add_argument(
+        "--snr",
+        type=float,
+        metavar="DB",
+        help="white sensor noise, so far below each recording's mean power (default: none)",
+    )
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
     parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")

@@ -72,7 +72,8 @@ class Settings:
     spacing_m : float
         Of the search grid: cell-centred.
     snr_db : float or None
-        White sensor noise below the mean power of the event at the system's microphones; None is the paper's: none.
+        White sensor noise, independent at each microphone, so far below the mean power of the whole recording, over the
+        system's microphones; None is the paper's: none.
     segment : str
         Which of an event's segments is localized: "longest", or "peak" for the one that holds the loudest frame.
     band_limit : bool

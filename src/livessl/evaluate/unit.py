@@ -116,7 +116,7 @@ class Position:
                     }
                 )
                 for index, system in enumerate(experiment.systems):
-                    samples = _recorded(wet[self._channels[index]], settings.snr_db, noise, (len(heads), index))
+                    samples = recorded(wet[self._channels[index]], settings.snr_db, noise, (len(heads), index))
                     found[index].append(self._heard(system, samples))
         return [
             row
@@ -211,10 +211,14 @@ def _convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
     return np.asarray(scipy.fft.irfft(spectrum, n_fft, axis=1, overwrite_x=True)[:, :count], dtype=np.float32)
 
 
-def _recorded(
+def recorded(
     wet: Float32Array, snr_db: float | None, noise: np.random.SeedSequence, key: tuple[int, int]
 ) -> Float32Array:
-    """Add the sensors' noise, set the level, round to 16 bits."""
+    """Add the sensors' noise to what a system hears (K, n), set the level, round to 16 bits.
+
+    The noise is white, independent at each microphone and drawn by `key`, `snr_db` below the mean power over all
+    microphones and the whole recording.
+    """
     if snr_db is not None:
         rng = np.random.default_rng(np.random.SeedSequence(noise.entropy, spawn_key=(*noise.spawn_key, *key)))
         rms = np.sqrt(np.square(wet).mean(dtype=np.float64) * 10.0 ** (-snr_db / 10.0))
