@@ -319,7 +319,7 @@ def test_watchers_get_new_windows() -> None:
         for _ in range(2):
             play(server)
             assert len(socket.recv(timeout=5)) == 48 + 16 * 20
-            with pytest.raises(TimeoutError):
+            with pytest.raises(TimeoutError):  # noqa: PT012 - which of them is not known
                 while True:
                     socket.recv(timeout=0.3)
 
