@@ -63,6 +63,7 @@ class Server:
         method: str | None = None,
         on_event: Callable[[JsonObject], None] | None = None,
     ) -> None:
+        self._clock = clock
         self._on_event = on_event
         self._hub = Hub()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -75,10 +76,11 @@ class Server:
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish, method)
             undo.pop_all()
-        app = create_app(site, self.engine, self._hub, self._store, self._sinks)
+        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
+                ws="websockets-sansio",  # the quickest to send many small messages
                 log_level="warning",
                 limit_concurrency=MAX_CONNECTIONS,
                 ws_max_size=MAX_SAID_BYTES,
@@ -122,6 +124,7 @@ class Server:
         self.stop()
 
     def _publish(self, message: JsonObject) -> None:
+        told_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
         if message["kind"] == "event":
             self._sinks.take(message)
             if self._on_event is not None:
@@ -130,7 +133,7 @@ class Server:
         if loop is None:
             return
         try:
-            loop.call_soon_threadsafe(self._hub.publish, message)
+            loop.call_soon_threadsafe(self._hub.publish, message, told_ns)
         except RuntimeError:  # the loop has just closed: nobody is left to tell
             _log.debug("a message came after the end")
 

@@ -16,6 +16,7 @@ from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.types import Message
 from livessl.server.ingest import Ingest
+from livessl.server.latency import Arrival, Arrivals
 
 POLL_MS: Final = 20
 """How long the thread waits for sound before it looks whether acknowledgements are due."""
@@ -70,6 +71,7 @@ class Receiver:
 
     def __init__(self, site: Site, clock: Clock) -> None:
         self.ingest = Ingest(site)
+        self.arrivals = Arrivals()
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
         self._stop = threading.Event()
@@ -131,12 +133,14 @@ class Receiver:
                 routing_id, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            arrival = self.ingest.receive(routing_id, b"".join(parts), self._clock.monotonic_ns())
+            data = b"".join(parts)
+            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns())
             if arrival.joined is not None:
                 self._put(Joined(arrival.joined))
             if arrival.left is not None:
                 self._put(Left(arrival.left))
             if arrival.message is not None:
+                self.arrivals.note(arrival.message.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
                 self._put(arrival.message)
             if arrival.reply is not None:
                 self._reply(routing_id, arrival.reply)
