@@ -19,9 +19,11 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
 from livessl.clock import utc_ns, utc_text
-from livessl.config import Site
+from livessl.config import Site, is_loopback
 from livessl.core.types import FRAME_S, Float32Array, MapSnapshot
+from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
+from livessl.server.auth import Gate
 from livessl.server.engine import Engine
 from livessl.server.hub import Filter, Hub, Subscription
 from livessl.server.png import map_png
@@ -41,11 +43,18 @@ KINDS: Final = frozenset({"update", "event", "track", "arrays"})
 VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
 """A view and the axis that its projection takes the maximum over."""
 
+_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    401: {"description": "no token, or one that is not known"},
+    403: {"description": "a token of a lesser role"},
+}
+
 _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
 
 
-def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> FastAPI:
-    """The application around a running engine."""
+def create_app(
+    site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks, tokens: Tokens | None = None
+) -> FastAPI:
+    """The application around a running engine, open to anyone or to those who have a token."""
     app = FastAPI(
         title="livessl",
         version=__version__,
@@ -53,11 +62,16 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks)
         docs_url=None,  # its page would load scripts from elsewhere
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
+        responses={} if tokens is None else _REFUSALS,
     )
 
-    if _is_loopback(site.server.http.host):
+    app.add_middleware(Gate, tokens=tokens, refusals=engine.refusals)
+    if tokens is None and is_loopback(site.server.http.host):
         # else a page from anywhere could have its own name point here, and read as if it were ours
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
+        app.add_middleware(
+            TrustedHostMiddleware,
+            allowed_hosts=["127.0.0.1", "localhost", "[::1]", site.server.http.host],
+        )
 
     @app.middleware("http")
     async def _headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
@@ -68,6 +82,7 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks)
         return response
 
     _add_state_routes(app, site, engine, hub, store, sinks)
+    _add_access_route(app, engine, tokens)
     _add_event_routes(app, site, store)
     _add_map_route(app, site, engine)
     _add_live_route(app, site, engine, hub)
@@ -77,7 +92,15 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks)
         return FileResponse(STATIC / "index.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    if tokens is not None:
+        _tell_of_tokens(app.openapi())
     return app
+
+
+def _tell_of_tokens(described: JsonObject) -> None:
+    """Into the OpenAPI, which knows of no gate before the application."""
+    described.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    described["security"] = [{"token": []}]
 
 
 def describe_site(site: Site, mode: str) -> JsonObject:
@@ -104,11 +127,12 @@ def describe_site(site: Site, mode: str) -> JsonObject:
             for spec in site.specs
         },
         "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
+        "privacy": _privacy(site),
     }
 
 
-def _is_loopback(host: str) -> bool:
-    return host in ("127.0.0.1", "localhost", "::1")
+def _privacy(site: Site) -> JsonObject:
+    return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
 def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
@@ -128,8 +152,8 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         return {"v": API_VERSION, "tracks": engine.tracks()}
 
     @app.get("/api/v1/health", tags=["state"])
-    def get_health(response: Response) -> JsonObject:
-        """Whether the server works (503 where it does not) and how the arrays are."""
+    def get_health(request: Request, response: Response) -> JsonObject:
+        """Whether the server works (503 where it does not) and how the arrays are; without a token the status only."""
         arrays = engine.arrays()
         reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
         states = {a["state"] for a in arrays}
@@ -140,6 +164,8 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         if engine.failure is not None:
             status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
             response.status_code = 503
+        if request.scope["client_role"] is None:
+            return {"v": API_VERSION, "status": status}
         return {
             "v": API_VERSION,
             "status": status,
@@ -148,6 +174,13 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
             "uptime_s": round(engine.uptime_s(), 3),
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
+            "privacy": _privacy(site),
+            "secured": {
+                "nodes": site.keys is not None,
+                "tokens": site.server.http.tokens is not None,
+                "tls": site.server.http.certificate is not None,
+            },
+            "refused": {door: engine.refusals.count(door) for door in ("nodes", "http")},
         }
 
     registry = CollectorRegistry()
@@ -157,6 +190,21 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
     def get_metrics() -> PlainTextResponse:
         """Metrics in the text format of Prometheus."""
         return PlainTextResponse(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+def _add_access_route(app: FastAPI, engine: Engine, tokens: Tokens | None) -> None:
+    @app.get("/api/v1/access", tags=["state"])
+    def get_access() -> JsonObject:
+        """Who may ask, which nodes are enrolled, and who was refused; for admins."""
+        return {
+            "v": API_VERSION,
+            "clients": [{"name": c.name, "role": str(c.role)} for c in (tokens.clients if tokens else ())],
+            "nodes": engine.enrolled,
+            "refused": [
+                {"door": r.door, "who": r.who, "reason": r.reason, "count": r.count, "last_utc": utc_text(r.last_ns)}
+                for r in engine.refusals.known()
+            ],
+        }
 
 
 def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
@@ -339,6 +387,10 @@ class _Metrics(Collector):
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
         yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
         yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
+        refused = CounterMetricFamily("livessl_refused", "Peers and requests turned away.", labels=["door", "reason"])
+        for (door, reason), count in self._engine.refusals.counts().items():
+            refused.add_metric([door, reason], count)
+        yield refused
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
         level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])
