@@ -16,18 +16,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
-from livessl.core.estimators import Localization, Sound, SrpPhat
+from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
 from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.types import (
     FRAME_NS,
+    GCC,
     ArraySpec,
     ClockState,
     Event,
     Float32Array,
     FloatArray,
     Frame,
-    MapSnapshot,
+    HeardBy,
     Mark,
     Message,
     Output,
@@ -35,6 +36,7 @@ from livessl.core.types import (
     Track,
     TrackState,
     Update,
+    Window,
 )
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
@@ -48,6 +50,9 @@ START = 20 * 1_700_000_000
 HANG_OVER = 6
 DEADLINE = 10
 """Defaults, in raster intervals of 50 ms."""
+
+NOTHING = GCC(np.array([[0, 1]]), np.array([0.0, 1e-4]), np.zeros((1, 2)))
+"""Evidence of no sound."""
 
 Arrivals = list[tuple[float, Message]]
 """When, in raster intervals after START, a message comes in."""
@@ -67,8 +72,11 @@ class Scripted:
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
-        nothing = np.zeros((1, 1, 1), dtype=np.float32)
-        return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, nothing, dict.fromkeys(sounds, nothing))
+        heard = tuple(HeardBy(spec, NOTHING) for spec in (NORTH, SOUTH) if spec.name in sounds)
+        return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
+
+    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+        return PowerMaps(GRID, np.full(GRID.size, len(evidence), dtype=np.float32), {})
 
 
 @pytest.fixture(scope="module")
@@ -441,7 +449,8 @@ def test_servers_clock_set_back_starts_over() -> None:
 def test_updates_come_only_while_there_is_sound() -> None:
     scripted = Scripted()
     arrivals = node("north", range(10, 20), range(120)) + node("south", range(14, 20), range(120))
-    said = play(fusion_of(scripted, updates=True), arrivals, 120)
+    fusion = fusion_of(scripted, updates=True)
+    said = play(fusion, arrivals, 120)
     updates = [(when, output) for when, output in said if isinstance(output, Update)]
     assert [when for when, _ in updates] == [12, 14, 16, 18, 20]  # every 0.1 s, as the interval ends
     assert {update.event_id for _, update in updates} == {f"site-{(START + 10) * 50}"}
@@ -449,8 +458,10 @@ def test_updates_come_only_while_there_is_sound() -> None:
     # windows of 0.2 s, their middle 0.1 s ago; before the sound there is nothing to use
     assert [update.estimate.time_ns for _, update in updates] == [now_ns(when - 2) for when, _ in updates]
     assert [call["north"] for call in scripted.calls[:-1]] == [[40], [80], [80], [80], [80]]
-    maps = [(when, output) for when, output in said if isinstance(output, MapSnapshot)]
-    assert [(when, snapshot.time_ns) for when, snapshot in maps] == [(w, u.estimate.time_ns) for w, u in updates]
+    windows = [(when, output) for when, output in said if isinstance(output, Window)]
+    assert [(when, window.time_ns) for when, window in windows] == [(w, u.estimate.time_ns) for w, u in updates]
+    assert [len(window.evidence) for _, window in windows] == [1, 1, 2, 2, 2]
+    assert fusion.power_maps(windows[-1][1]).fused.max() == 2.0
     tracks = [(when, output) for when, output in said if isinstance(output, Track)]
     assert [track.state for _, track in tracks] == [TrackState.NEW] + [TrackState.UPDATE] * 4 + [TrackState.END]
     assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate

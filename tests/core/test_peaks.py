@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from livessl.core import peaks
 from livessl.core.gcc import GCCPhat, mean_square_angular_frequency
 from livessl.core.geometry import Grid, line, posed
-from livessl.core.srp import HeardBy, SRPFunctional
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray
+from livessl.core.srp import SRPFunctional
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
 GRID = Grid(BOUNDS_M, 0.1)

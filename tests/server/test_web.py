@@ -296,6 +296,56 @@ def test_map_before_anything_was_heard(fresh: httpx.Client) -> None:
         assert (response.status_code, response.content) == (204, b"")
 
 
+def watch(server: Server, query: str = "", origin: str | None = None) -> Any:
+    url = f"ws{server.url.removeprefix('http')}/api/v1/map{query}"
+    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=5)
+
+
+def test_map_is_watched(server: Server, client: httpx.Client) -> None:
+    with watch(server, "?array=south&views=floor,side") as socket:
+        packed = [socket.recv(timeout=5) for _ in range(2)]
+        with pytest.raises(TimeoutError):
+            socket.recv(timeout=0.15)  # there is no newer window
+    for view, data in zip(("floor", "side"), packed, strict=True):
+        numbers = client.get("/api/v1/map", params={"array": "south", "view": view, "format": "float32"})
+        assert numbers.headers["X-Map-Shape"] == {"floor": "20,16", "side": "12,20"}[view]
+        assert numbers.headers["X-Map-Bounds-M"] == {"floor": "0,5,0,4", "side": "0,3,0,5"}[view]
+        powers = floats(numbers).ravel()
+        step = (powers.max() - powers.min()) / 255
+        levels = np.frombuffer(data, dtype=np.uint8, offset=48)
+        assert len(levels) == len(powers)
+        assert np.abs(powers.min() + step * levels - powers).max() <= 0.51 * step
+
+
+def test_watchers_get_new_windows() -> None:
+    with running_server(site_of()) as server, watch(server) as socket:
+        for _ in range(2):
+            play(server)
+            assert len(socket.recv(timeout=5)) == 48 + 16 * 20
+            with pytest.raises(TimeoutError):
+                while True:
+                    socket.recv(timeout=0.3)
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("?array=west", "array: none of that name; there are fused, north, south"),
+        ("?views=floor,roof", "views: expected some of floor, side, front"),
+    ],
+)
+def test_map_watched_wrongly(server: Server, query: str, said: str) -> None:
+    with watch(server, query) as socket, pytest.raises(ConnectionClosed) as caught:
+        socket.recv(timeout=5)
+    assert caught.value.rcvd is not None
+    assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, said)
+
+
+def test_page_of_another_server_may_not_watch(server: Server) -> None:
+    with watch(server, origin="http://evil.example") as socket, pytest.raises(ConnectionClosed):
+        socket.recv(timeout=5)
+
+
 @pytest.mark.parametrize(
     ("query", "status", "said"),
     [

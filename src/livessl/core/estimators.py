@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -12,8 +12,8 @@ from livessl.core import peaks
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
 from livessl.core.gcc import GCCPhat, uses_envelope
 from livessl.core.geometry import Grid
-from livessl.core.srp import HeardBy, SRPFunctional, SRPMapper, alias_free_hz
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, IntArray
+from livessl.core.srp import SRPFunctional, SRPMapper, alias_free_hz
+from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +26,31 @@ class Sound:
 
 @dataclass(frozen=True, slots=True)
 class Localization:
-    """A place, how sure, and the maps (G,) it was read from."""
+    """A place, how sure, and what it was read from: the arrays' evidence, in the order of their names."""
 
     position_m: FloatArray
     covariance_m2: FloatArray
     confidence: float
+    evidence: tuple[HeardBy, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PowerMaps:
+    """Power at every node of a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+        Which nodes; it may be coarser than the grid that is searched.
+    fused : (G,) float32
+        Sum over the arrays, in the grid's order.
+    arrays : mapping of name to (G,) float32
+        One map each.
+    """
+
+    grid: Grid
     fused: Float32Array
-    maps: Mapping[str, Float32Array]
+    arrays: Mapping[str, Float32Array]
 
 
 class Estimator(Protocol):
@@ -46,6 +64,13 @@ class Estimator(Protocol):
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Localize one sound heard by the arrays named in `sounds`; at least one."""
+        ...
+
+    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+        """Maps of what `locate` went by, for people: the fused one, and those of the arrays named (None for all).
+
+        It may be called from another thread than `locate`.
+        """
         ...
 
 
@@ -73,22 +98,19 @@ class SrpPhat:
         self._grid = grid
         self._c_m_s = c_m_s
         self._band_limit = band_limit
-        self._tools: dict[str, tuple[float, GCCPhat, SRPMapper, Sequence[float]]] = {}
+        self._correlators: dict[str, tuple[float, GCCPhat, Sequence[float]]] = {}
+        self._mappers: dict[str, tuple[FloatArray, SRPMapper]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
-        self._tools_for(array, sample_rate_hz)
+        correlate, cut_offs_hz = self._correlator(array, sample_rate_hz)
+        self._mapper(self._arrays[array], correlate.pairs, correlate.lags_s, cut_offs_hz)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Sum the arrays' maps, take the peak, refine it below the grid."""
-        evidence: list[HeardBy] = []
-        maps: dict[str, Float32Array] = {}
-        for name in sorted(sounds):  # float sums depend on the order: the answer must not
-            correlate, to_map, cut_offs_hz = self._tools_for(name, sounds[name].sample_rate_hz)
-            gccs = correlate.below(sounds[name].segments, cut_offs_hz)
-            evidence.append(HeardBy(self._arrays[name], gccs[0]))
-            maps[name] = to_map(*gccs)
-        fused: Float32Array = np.asarray(np.sum(list(maps.values()), axis=0, dtype=np.float32))
+        # float sums depend on the order: the answer must not
+        evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
+        fused = self.power_maps(evidence, separately=()).fused
         functional = SRPFunctional(evidence, self._c_m_s)
         starts = np.stack([self._grid.node_m(node) for node in peaks.highest_nodes(fused, self._grid)])
         position, _ = peaks.refine(functional, starts, self._grid)
@@ -96,12 +118,29 @@ class SrpPhat:
             position,
             peaks.laplace_covariance_m2(functional, evidence, position, self._grid),
             peaks.confidence(fused, self._grid, position),
-            fused,
-            maps,
+            evidence,
         )
 
-    def _tools_for(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, SRPMapper, Sequence[float]]:
-        known = self._tools.get(array)
+    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+        """Map each array's evidence onto the grid, and sum."""
+        fused = np.zeros(self._grid.size, dtype=np.float32)
+        arrays: dict[str, Float32Array] = {}
+        for heard in evidence:
+            spec, gcc = heard.spec, heard.gcc
+            cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(heard.below)]
+            power = self._mapper(spec, gcc.pairs, gcc.lags_s, cut_offs_hz)(gcc, *heard.below)
+            fused += power
+            if separately is None or spec.name in separately:
+                arrays[spec.name] = power
+        return PowerMaps(self._grid, fused, arrays)
+
+    def _heard(self, array: str, sound: Sound) -> HeardBy:
+        correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)
+        gcc, *below = correlate.below(sound.segments, cut_offs_hz)
+        return HeardBy(self._arrays[array], gcc, tuple(below))
+
+    def _correlator(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, Sequence[float]]:
+        known = self._correlators.get(array)
         if known is not None and known[0] == sample_rate_hz:
             return known[1:]
         spec = self._arrays[array]
@@ -109,9 +148,17 @@ class SrpPhat:
         cut_offs_hz: Sequence[float] = ()
         if not uses_envelope(spec.band_hz) and self._limits_band(spec, correlate.pairs):
             cut_offs_hz = third_octaves_below_hz(spec.band_hz)
-        mapper = SRPMapper(spec, self._grid, correlate.pairs, correlate.lags_s, self._c_m_s, cut_offs_hz)
-        self._tools[array] = (sample_rate_hz, correlate, mapper, cut_offs_hz)
-        return correlate, mapper, cut_offs_hz
+        self._correlators[array] = (sample_rate_hz, correlate, cut_offs_hz)
+        return correlate, cut_offs_hz
+
+    def _mapper(self, spec: ArraySpec, pairs: IntArray, lags_s: FloatArray, cut_offs_hz: Sequence[float]) -> SRPMapper:
+        """The mapper of an array's lags; made anew when its sampling rate, and with it the lags, have changed."""
+        known = self._mappers.get(spec.name)
+        if known is not None and np.array_equal(known[0], lags_s):
+            return known[1]
+        mapper = SRPMapper(spec, self._grid, pairs, lags_s, self._c_m_s, cut_offs_hz)
+        self._mappers[spec.name] = (lags_s, mapper)
+        return mapper
 
     def _limits_band(self, spec: ArraySpec, pairs: IntArray) -> bool:
         if self._band_limit is not None:

@@ -20,6 +20,9 @@ CEPSTRAL_FRAME_S: Final = 0.6
 MEMORY: Final = 0.06
 """Weight of a frame's innovation in the channel's running cepstrum: the paper's "memory parameter"."""
 
+FFT_FACTOR: Final = 16
+"""Transforms' lengths are multiples of it, so that lags may lie FFT_FACTOR/m samples apart, m whole."""
+
 _FLOOR: Final = 1e-6
 """Least magnitude whose logarithm is taken, relative to the frame's largest: 120 dB down is no sound."""
 
@@ -48,9 +51,14 @@ class FrontEnd(Protocol):
         ...
 
 
+def fast_length(count: int) -> int:
+    """Least length, at least `count`, that is fast to transform and a multiple of `FFT_FACTOR`."""
+    return FFT_FACTOR * scipy.fft.next_fast_len(-(-count // FFT_FACTOR), real=True)
+
+
 def whole_segment(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:  # noqa: ARG001 - a FrontEnd
     """One frame: the segment, as it is."""
-    n_fft = scipy.fft.next_fast_len(samples.shape[1] + lags, real=True)
+    n_fft = fast_length(samples.shape[1] + lags)
     return Spectra(scipy.fft.rfft(samples, n_fft, axis=1)[None], n_fft)
 
 
@@ -67,7 +75,7 @@ def averaged(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra
     padded[:, :count] = samples
     cut = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)[:, ::hop].swapaxes(0, 1)
     window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
-    n_fft = scipy.fft.next_fast_len(length + max(lags, length), real=True)
+    n_fft = fast_length(length + max(lags, length))
     return Spectra(np.asarray(scipy.fft.rfft(cut * window, n_fft, axis=2), dtype=np.complex64), n_fft)
 
 
@@ -79,7 +87,7 @@ def cepstral(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra
     """
     length = max(1, min(round(CEPSTRAL_FRAME_S * sample_rate_hz), samples.shape[1] // 2))
     count = samples.shape[1] // length
-    n_fft = 2 * scipy.fft.next_fast_len(-(-(length + max(lags, length)) // 2), real=True)  # even: `fold` needs a middle
+    n_fft = fast_length(length + max(lags, length))
     frames = samples[:, : count * length].reshape(len(samples), count, length)
     channel: NDArray[np.float64] | None = None
     values = np.empty((count, len(samples), n_fft // 2 + 1), dtype=np.complex64)

@@ -7,7 +7,7 @@ being waited for has reached it, or at its deadline; who is late or missing cont
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
-from livessl.core.estimators import Estimator, Localization, Sound
+from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
@@ -28,13 +28,13 @@ from livessl.core.types import (
     Event,
     FloatArray,
     Frame,
-    MapSnapshot,
     Mark,
     Message,
     Output,
     Status,
     Track,
     Update,
+    Window,
 )
 
 LOST_NS: Final = 2_000_000_000
@@ -231,6 +231,10 @@ class Fusion:
         """Work out what an array's sound will need, so that its first event does not wait for it."""
         self._estimator.prepare(array, sample_rate_hz)
 
+    def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
+        """The estimator's maps of a window that it localized; it may be called from another thread than `step`."""
+        return self._estimator.power_maps(window.evidence, separately)
+
     def leave(self, array: str) -> None:
         """The array's node said good-bye: nobody waits for it."""
         if array in self._streams:
@@ -371,9 +375,8 @@ class Fusion:
         status, _ = self._judge(estimate)
         loudest = max(float(power.max()) for power in powers.values())
         update = Update(self._id(event.start), status, estimate, loudest, self._contributions(powers, estimate))
-        snapshot = MapSnapshot(middle_ns, found.fused, found.maps)
         tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
-        return [update, snapshot, *tracks]
+        return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None

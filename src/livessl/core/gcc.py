@@ -11,27 +11,34 @@ from typing import Final
 
 import numpy as np
 import scipy.fft
-from scipy.signal import upfirdn
-from scipy.special import i0
 
 from livessl.core.activity import band_bins
-from livessl.core.frontends import FrontEnd, Spectra, whole_segment
-from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, IntArray
+from livessl.core.frontends import FFT_FACTOR, FrontEnd, Spectra, whole_segment
+from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
 """Fine lags a sample. Nearest-lag look-up then errs by 1/16 sample: 8 degrees of phase at 6 kHz and 16 kHz sampling."""
 
-_HALF_WIDTH: Final = 24
-"""Samples of the interpolation kernel on each side: 80 dB for bands up to 0.45 of the sampling rate."""
-
-_KAISER_BETA: Final = 7.86
-"""Kaiser window for 80 dB: 0.1102 (80 - 8.7)."""
-
 ENVELOPE_ABOVE: Final = 0.25
 """Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
 
-_SILENT: Final = 1e-12
-"""Cross-power below this share of the largest carries no phase worth whitening."""
+_SILENT: Final = 1e-6
+"""A channel's bins 120 dB below its loudest in the band carry no phase worth whitening: they are rounding."""
+
+_NYQUIST_MARGIN: Final = 1.25
+"""Near-Nyquist lags are so much denser than the band's upper edge asks for; the interpolation needs the room."""
+
+_BEYOND: Final = 4
+"""Near-Nyquist lags further out than any that is asked for, on each side."""
+
+_RIDGE: Final = 1e-10
+"""Keeps the least-squares weights small where the lags determine more than the band holds."""
+
+_PRODUCT_BINS: Final = 2048
+"""Up to so many bins, a third of a second, lags come by a matrix that is kept; above it by a short inverse FFT."""
+
+_MATRICES: Final = 16
+"""Matrices kept: a site's windows have few lengths."""
 
 
 def microphone_pairs(count: int) -> IntArray:
@@ -43,9 +50,8 @@ class GCCPhat:
     """GCC-PHAT of one array at one sampling rate, with its constants worked out once.
 
     R_ik(tau) = 1/B sum_{f in band} Re[ conj(X_i) X_k / |X_i X_k| e^{j 2 pi f tau} ], so that a pure delay gives 1 at
-    its lag (Knapp and Carter 1976, PHAT weighting, averaged over the B bins of the band). The lags around zero are
-    taken from one inverse FFT at the sampling rate and interpolated to `OVERSAMPLING` lags a sample by a
-    Kaiser-windowed sinc: exact in the band to 80 dB, and far cheaper than a zero-padded FFT.
+    its lag (Knapp and Carter 1976, PHAT weighting, averaged over the B bins of the band). It is worked out at a few
+    near-Nyquist lags and interpolated to `OVERSAMPLING` lags a sample (`LagSampling`).
 
     Where the band begins above `ENVELOPE_ABOVE` times its own width, R is the magnitude of the same sum instead of its
     real part: a carrier's periods would be side lobes nearly as high as the peak, and a centimetre of error in a
@@ -77,13 +83,8 @@ class GCCPhat:
         self._rate_hz = sample_rate_hz
         self._front_end = front_end
         self._envelope = uses_envelope(spec.band_hz)
-        largest = spec.aperture_m / c_m_s * sample_rate_hz
-        fine = int(np.ceil(largest * OVERSAMPLING)) + 2 * OVERSAMPLING
-        self.lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
-        self._coarse = fine // OVERSAMPLING + _HALF_WIDTH
-        offset = np.arange(-_HALF_WIDTH * OVERSAMPLING, _HALF_WIDTH * OVERSAMPLING + 1) / OVERSAMPLING
-        window = i0(_KAISER_BETA * np.sqrt(1.0 - (offset / _HALF_WIDTH) ** 2)) / i0(_KAISER_BETA)
-        self._kernel: Float32Array = (np.sinc(offset) * window).astype(np.float32)
+        self._sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / c_m_s)
+        self.lags_s = self._sampling.fine_lags_s
 
     def __call__(self, segments: Sequence[Float32Array]) -> GCC:
         """GCC of a sound's segments, each (K, n) and without gaps: their mean, weighted by length.
@@ -94,27 +95,20 @@ class GCCPhat:
 
     def below(self, segments: Sequence[Float32Array], cut_offs_hz: Sequence[float]) -> list[GCC]:
         """GCC of the whole band, and then of what of it lies below each cut-off, all over the whole band's B."""
-        total = np.zeros((1 + len(cut_offs_hz), len(self.pairs), 2 * self._coarse + 1), dtype=np.complex64)
+        shape = (1 + len(cut_offs_hz), len(self.pairs), self._sampling.count)
+        total: ComplexArray | Float32Array
+        total = np.zeros(shape, np.complex64) if self._envelope else np.zeros(shape, np.float32)
         for segment in segments:
-            spectra = self._front_end(segment, self._rate_hz, self._coarse)
+            spectra = self._front_end(segment, self._rate_hz, self._sampling.room)
             cross = CrossSpectra(spectra, self.pairs, self._rate_hz, self._band_hz)
             for part, cut_off_hz in zip(total, (np.inf, *cut_offs_hz), strict=True):
-                part += segment.shape[1] * cross.correlations(self._coarse, cut_off_hz, envelope=self._envelope)
+                part += segment.shape[1] * self._sampling.sample(cross, cut_off_hz, envelope=self._envelope)
         total /= max(1, sum(segment.shape[1] for segment in segments))
-        return [self._fine(part) for part in total]
-
-    def _fine(self, total: ComplexArray) -> GCC:
-        correlation = total if self._envelope else total.real
-        fine = upfirdn(self._kernel, correlation, up=OVERSAMPLING, axis=1)
-        centre = (self._coarse + _HALF_WIDTH) * OVERSAMPLING
-        reach = len(self.lags_s) // 2
-        fine = fine[:, centre - reach : centre + reach + 1]
-        values = np.abs(fine) if self._envelope else fine
-        return GCC(self.pairs.copy(), self.lags_s.copy(), values.astype(np.float64))
+        return [GCC(self.pairs, self.lags_s, self._sampling.fine(part)) for part in total]
 
 
 class CrossSpectra:
-    """Whitened cross-spectra of all pairs in the band, averaged over frames.
+    """Whitened cross-spectra of all pairs in the band, summed over frames.
 
     Parameters
     ----------
@@ -126,15 +120,20 @@ class CrossSpectra:
     """
 
     def __init__(self, spectra: Spectra, pairs: IntArray, sample_rate_hz: float, band_hz: tuple[float, float]) -> None:
-        self._n_fft = spectra.n_fft
-        self._rate_hz = sample_rate_hz
-        self._low, self._high = band_bins(spectra.n_fft, sample_rate_hz, band_hz)
-        inside = spectra.values[:, :, self._low : self._high]
+        self.n_fft = spectra.n_fft
+        self.sample_rate_hz = sample_rate_hz
+        self.low, high = band_bins(spectra.n_fft, sample_rate_hz, band_hz)
+        inside = _phase_only(spectra.values[:, :, self.low : high])
         first, second = pairs.T
-        self._whitened = np.zeros((len(pairs), self._high - self._low), dtype=np.complex64)
+        self.whitened = np.zeros((len(pairs), high - self.low), dtype=np.complex64)
         for frame in inside:
-            self._whitened += _phase_only(np.conj(frame[first]) * frame[second])
-        self._share = max(1, self._high - self._low) * max(1, len(inside))
+            self.whitened += np.conj(frame)[first] * frame[second]
+        self.share = max(1, high - self.low) * max(1, len(inside))
+
+    def bins_below(self, cut_off_hz: float) -> int:
+        """How many of the band's bins lie at or below a cut-off."""
+        bins = self.whitened.shape[1]
+        return max(0, int(min(bins, cut_off_hz * self.n_fft / self.sample_rate_hz + 1 - self.low)))
 
     def correlations(self, reach: int, cut_off_hz: float = np.inf, *, envelope: bool = False) -> ComplexArray:
         """GCC-PHAT at whole-sample lags around zero: the mean over frames and over the bins of the band.
@@ -152,16 +151,94 @@ class CrossSpectra:
         -------
         (P, 2 reach + 1) complex64
         """
-        n_fft = self._n_fft
-        kept = int(np.clip(cut_off_hz * n_fft / self._rate_hz + 1 - self._low, 0, self._whitened.shape[1]))
-        spectrum = np.zeros((len(self._whitened), n_fft if envelope else n_fft // 2 + 1), dtype=np.complex64)
-        spectrum[:, self._low : self._low + kept] = self._whitened[:, :kept]
-        if envelope:
-            correlation = scipy.fft.ifft(spectrum, axis=1) * n_fft
-        else:
-            correlation = (scipy.fft.irfft(spectrum, n_fft, axis=1) * (n_fft / 2.0)).astype(np.complex64)
+        return self.around_zero(self.n_fft, reach, cut_off_hz, envelope=envelope).astype(np.complex64)
+
+    def around_zero(self, count: int, reach: int, cut_off_hz: float, *, envelope: bool) -> ComplexArray | Float32Array:
+        """The same at lags n_fft/count samples apart, by an inverse FFT of `count` points: real, or analytic."""
+        kept = self.bins_below(cut_off_hz)
+        spectrum = np.zeros((len(self.whitened), count if envelope else count // 2 + 1), dtype=np.complex64)
+        spectrum[:, self.low : self.low + kept] = self.whitened[:, :kept]
+        transform, gain = (scipy.fft.ifft, float(count)) if envelope else (scipy.fft.irfft, count / 2.0)
+        correlation = transform(spectrum, count, axis=1, overwrite_x=True)
         around = np.concatenate([correlation[:, -reach:], correlation[:, : reach + 1]], axis=1)
-        return np.asarray(around / self._share, dtype=np.complex64)
+        return np.asarray(around * np.float32(gain / self.share))
+
+
+class LagSampling:
+    """The lags a band-limited GCC is worked out at, and the interpolation from these to fine ones.
+
+    A GCC without content above f2 is known from lags 1/(2 f2) apart (Dietzen et al. 2021). Taken a quarter denser than
+    that and a little further out than needed, a fixed matrix leads from them to any number of fine lags; its weights
+    are those that err least, in the mean square over the frequencies of the band: 2e-6 of the GCC.
+
+    Parameters
+    ----------
+    band_hz : (float, float)
+    sample_rate_hz : float
+    largest_lag_s : float
+        Beyond it no direction lies.
+    """
+
+    def __init__(self, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> None:
+        self._rate_hz = sample_rate_hz
+        fine = int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING)) + 2 * OVERSAMPLING
+        self.fine_lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
+        least = _NYQUIST_MARGIN * 2.0 * band_hz[1] / sample_rate_hz * FFT_FACTOR
+        self._per_factor = scipy.fft.next_fast_len(int(np.ceil(least)), real=True)  # lags in FFT_FACTOR samples
+        step = FFT_FACTOR / self._per_factor
+        self._reach = int(np.ceil(fine / OVERSAMPLING / step)) + _BEYOND
+        self.count = 2 * self._reach + 1
+        self.room = int(np.ceil(self._reach * step))
+        self._lags_s = np.arange(-self._reach, self._reach + 1) * np.float64(step / sample_rate_hz)
+        self._weights = _least_squares(self._lags_s, self.fine_lags_s, band_hz)
+        self._matrices: dict[tuple[int, bool], Float32Array] = {}
+
+    def sample(
+        self, cross: CrossSpectra, cut_off_hz: float = np.inf, *, envelope: bool = False
+    ) -> ComplexArray | Float32Array:
+        """GCC at the near-Nyquist lags: (P, count), float32; or its analytic signal, complex64."""
+        kept, bins = cross.bins_below(cut_off_hz), cross.whitened.shape[1]
+        if bins > _PRODUCT_BINS:
+            count = cross.n_fft // FFT_FACTOR * self._per_factor
+            return cross.around_zero(count, self._reach, cut_off_hz, envelope=envelope)
+        matrix = self._matrix(cross, envelope=envelope)
+        samples = cross.whitened[:, :kept].view(np.float32) @ matrix[: 2 * kept]
+        samples /= np.float32(cross.share)
+        return samples.view(np.complex64) if envelope else samples
+
+    def fine(self, samples: ComplexArray | Float32Array) -> Float32Array:
+        """GCC at the fine lags, (P, L), from those at the near-Nyquist lags; magnitudes of analytic ones."""
+        if np.iscomplexobj(samples):
+            return np.asarray(np.hypot(samples.real @ self._weights, samples.imag @ self._weights), dtype=np.float32)
+        return np.asarray(samples @ self._weights)
+
+    def _matrix(self, cross: CrossSpectra, *, envelope: bool) -> Float32Array:
+        """Real form of e^{j 2 pi f tau}: rows (Re, Im) of each bin, columns the lags, of the envelope (Re, Im) each."""
+        key = (cross.n_fft, envelope)
+        if key not in self._matrices:
+            frequency_hz = (cross.low + np.arange(cross.whitened.shape[1])) * (self._rate_hz / cross.n_fft)
+            phase = 2.0 * np.pi * frequency_hz[:, None] * self._lags_s
+            cosine, sine = np.cos(phase), np.sin(phase)
+            real = np.stack([cosine, -sine], axis=1).reshape(-1, self.count)
+            matrix = real
+            if envelope:
+                imaginary = np.stack([sine, cosine], axis=1).reshape(-1, self.count)
+                matrix = np.stack([real, imaginary], axis=2).reshape(-1, 2 * self.count)
+            while len(self._matrices) >= _MATRICES:
+                del self._matrices[next(iter(self._matrices))]
+            self._matrices[key] = matrix.astype(np.float32)
+        return self._matrices[key]
+
+
+def _least_squares(lags_s: FloatArray, fine_lags_s: FloatArray, band_hz: tuple[float, float]) -> Float32Array:
+    """Weights (count, L) that minimise the mean over the band of |sum_c w_c e^{j 2 pi f t_c} - e^{j 2 pi f t}|^2."""
+
+    def mean_cosine(lag_s: FloatArray) -> FloatArray:
+        low, high = band_hz
+        return np.asarray((high * np.sinc(2.0 * high * lag_s) - low * np.sinc(2.0 * low * lag_s)) / (high - low))
+
+    gram = mean_cosine(lags_s[:, None] - lags_s) + _RIDGE * np.eye(len(lags_s))
+    return np.linalg.solve(gram, mean_cosine(lags_s[:, None] - fine_lags_s)).astype(np.float32)
 
 
 def uses_envelope(band_hz: tuple[float, float]) -> bool:
@@ -176,7 +253,8 @@ def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:
     return float(4.0 * np.pi**2 * (high**3 - low**3) / (3.0 * (high - low)))
 
 
-def _phase_only(cross: ComplexArray) -> ComplexArray:
-    magnitude = np.abs(cross)
-    audible = magnitude > _SILENT * magnitude.max(initial=0.0)
-    return np.divide(cross, magnitude, out=np.zeros_like(cross), where=audible)
+def _phase_only(spectra: ComplexArray) -> ComplexArray:
+    """Each bin over its magnitude, (L, K, B); zero where a channel is silent."""
+    magnitude = np.abs(spectra)
+    floor = _SILENT * magnitude.max(axis=2, initial=0.0, keepdims=True)
+    return np.divide(spectra, magnitude, out=np.zeros_like(spectra), where=magnitude > floor)

@@ -9,8 +9,8 @@ import numpy as np
 
 from livessl.core.gcc import mean_square_angular_frequency
 from livessl.core.geometry import Grid
-from livessl.core.srp import HeardBy, PairTerms, SRPFunctional
-from livessl.core.types import Float32Array, FloatArray
+from livessl.core.srp import PairTerms, SRPFunctional
+from livessl.core.types import Float32Array, FloatArray, HeardBy
 
 CANDIDATES: Final = 8
 """Nodes looked at more closely: between two nodes a lower one on the grid may be the higher one in truth."""

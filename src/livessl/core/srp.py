@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from livessl.core.geometry import Grid
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
 
 _NEAREST_M: Final = 1e-9
 """A point in a microphone has no direction from it; one so far away has."""
@@ -155,14 +155,6 @@ class SRPMapper:
 def pair_weight(microphones: int) -> float:
     """2/K: see the module's head."""
     return 2.0 / microphones
-
-
-@dataclass(frozen=True, slots=True)
-class HeardBy:
-    """One array's evidence: its geometry and its GCC."""
-
-    spec: ArraySpec
-    gcc: GCC
 
 
 class SRPFunctional:

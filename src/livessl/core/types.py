@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
 
@@ -11,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float32Array = NDArray[np.float32]
+UInt8Array = NDArray[np.uint8]
+UInt16Array = NDArray[np.uint16]
 FloatArray = NDArray[np.float64]
+RealArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complex64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -177,13 +179,13 @@ class GCC:
         Microphone indices (i, k), i < k.
     lags_s : (L,) float64
         Lags in seconds, ascending and evenly spaced. Positive lag of pair (i, k): channel k hears it later.
-    values : (P, L) float64
+    values : (P, L) float32 or float64
         1 is perfect coherence at that lag.
     """
 
     pairs: IntArray
     lags_s: FloatArray
-    values: FloatArray
+    values: RealArray
 
     def __post_init__(self) -> None:
         if self.values.shape != (len(self.pairs), len(self.lags_s)):
@@ -234,6 +236,25 @@ class ArraySpec:
         """Largest distance between two microphones, metres."""
         difference = self.microphones_m[:, None] - self.microphones_m[None]
         return float(np.sqrt((difference**2).sum(axis=2)).max())
+
+
+@dataclass(frozen=True, slots=True)
+class HeardBy:
+    """One array's evidence of one sound.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+        The array.
+    gcc : GCC
+        Of its whole band.
+    below : tuple of GCC
+        Of what lies below each of the band's cut-offs, where its map is limited against spatial aliasing.
+    """
+
+    spec: ArraySpec
+    gcc: GCC
+    below: tuple[GCC, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,26 +402,23 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class MapSnapshot:
-    """Power maps of one window, for people to look at.
+class Window:
+    """What a window was localized from: enough to draw its power maps, should somebody want to look at them.
 
     Parameters
     ----------
     time_ns : int
         Site time at the middle of the window.
-    fused : (G,) float32
-        Sum over the arrays at every grid node, in the grid's order.
-    arrays : mapping of name to (G,) float32
-        One map each.
+    evidence : tuple of HeardBy
+        One for each array that heard it.
     """
 
     time_ns: int
-    fused: Float32Array
-    arrays: Mapping[str, Float32Array] = field(default_factory=dict)
+    evidence: tuple[HeardBy, ...]
 
 
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | MapSnapshot
+Output = Update | Event | Track | Window
 """What fusion says."""

@@ -11,8 +11,9 @@ from livessl import wire
 from livessl.clock import Clock, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayStatus
-from livessl.core.types import FRAME_NS, Event, MapSnapshot, Message, Output, Track, TrackState, Update
+from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, array_status
+from livessl.server.maps import Maps
 from livessl.server.receiver import Joined, Left, Receiver
 from livessl.server.refusals import Refusals
 from livessl.server.store import Store, StoreError
@@ -62,7 +63,6 @@ class Engine:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
         self._lock = threading.Lock()
-        self._map: MapSnapshot | None = None
         self._tracks: dict[int, JsonObject] = {}
         self._states: dict[str, str] = {}
         self._replay_now_ns: int | None = None
@@ -73,6 +73,7 @@ class Engine:
         self._started_ns, self._began_ns = clock.now_ns(), clock.monotonic_ns()
         self.events = 0
         self.unkept = 0
+        self.maps = Maps(clock)
         self._begin()
         self._receiver = Receiver(site, clock)
 
@@ -94,7 +95,7 @@ class Engine:
     @property
     def failure(self) -> BaseException | None:
         """What ended one of the threads, if anything did."""
-        return self._failure or self._receiver.failure
+        return self._failure or self._receiver.failure or self.maps.failure
 
     @property
     def mode(self) -> str:
@@ -109,6 +110,7 @@ class Engine:
     def start(self) -> None:
         """Begin to work."""
         self._receiver.start()
+        self.maps.start()
         self._thread.start()
 
     def stop(self) -> None:
@@ -116,6 +118,7 @@ class Engine:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=3.0)
+        self.maps.stop()
         self._receiver.stop()
 
     def wait_idle(self) -> None:
@@ -143,10 +146,6 @@ class Engine:
         with self._lock:
             return list(self._tracks.values())
 
-    def latest_map(self) -> MapSnapshot | None:
-        """Power maps of the newest window."""
-        return self._map
-
     def _array(self, status: ArrayStatus) -> JsonObject:
         ingest = self._receiver.ingest
         described = array_status(status, self._site.node_of(status.name))
@@ -163,7 +162,7 @@ class Engine:
         """A clean slate: nothing of another time may leak into this one."""
         self._fusion = self._site.make_fusion(self._method)
         self._messages: Messages | None = None
-        self._map = None
+        self.maps.clear()
 
     def _run(self) -> None:
         try:
@@ -268,7 +267,7 @@ class Engine:
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
-                self._map = output
+                self.maps.show(output, self._fusion.power_maps)
 
     def _keep_track(self, message: JsonObject, track: Track) -> None:
         with self._lock:

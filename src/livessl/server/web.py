@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -20,12 +20,13 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from livessl import __version__
 from livessl.clock import utc_ns, utc_text
 from livessl.config import Site, is_loopback
-from livessl.core.types import FRAME_S, Float32Array, MapSnapshot
+from livessl.core.types import FRAME_S
 from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
 from livessl.server.auth import Gate
 from livessl.server.engine import Engine
 from livessl.server.hub import Filter, Hub, Subscription
+from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
 from livessl.server.png import map_png
 from livessl.server.sinks import Sinks
 from livessl.server.store import Cursor, Store
@@ -40,9 +41,6 @@ MAX_REASON: Final = 120
 """A closing frame's reason holds 123 bytes (RFC 6455)."""
 
 KINDS: Final = frozenset({"update", "event", "track", "arrays"})
-VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
-"""A view and the axis that its projection takes the maximum over."""
-
 _REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
     401: {"description": "no token, or one that is not known"},
     403: {"description": "a token of a lesser role"},
@@ -262,28 +260,31 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         },
     )
     def get_map(
-        array: Annotated[str, Query(description="'fused' or an array's name")] = "fused",
+        array: Annotated[str, Query(description="'fused' or an array's name")] = FUSED,
         view: Annotated[Literal["floor", "side", "front", "volume"], Query()] = "floor",
         format: Annotated[Literal["png", "float32"], Query()] = "png",  # noqa: A002 - the API's word
     ) -> Response:
         """The newest power map: a projection (largest value along the axis left out) or the whole volume."""
-        if array != "fused" and array not in site.arrays:
+        if array != FUSED and array not in site.arrays:
             raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
         if view == "volume" and format == "png":
             raise HTTPException(422, "view=volume has no picture; use format=float32")
-        snapshot = engine.latest_map()
-        if snapshot is None:
+        drawn = engine.maps.newest(array)
+        if drawn is None:
             return Response(status_code=204)
-        power = _power(snapshot, array)
+        power = drawn.power(array)
         if power is None:
             raise HTTPException(404, f"array {array!r} has no part in the newest map")
-        image = power.reshape(site.search_grid().shape)
-        if view != "volume":
-            image = image.max(axis=VIEWS[view]).T  # rows: y or z, upwards
+        grid, time_ns = drawn.maps.grid, drawn.window.time_ns
+        if view == "volume":
+            image, bounds_m = power.reshape(grid.shape), [edge for bounds in grid.bounds_m for edge in bounds]
+        else:
+            image, bounds_m = projection(power, grid.shape, view), list(bounds_of_view_m(drawn.maps, view))
         headers = {
             "X-Map-Shape": ",".join(str(n) for n in image.shape),
-            "X-Map-Time-Utc": utc_text(snapshot.time_ns),
-            "X-Map-Age-S": f"{(engine.now_ns() - snapshot.time_ns) / 1e9:.3f}",
+            "X-Map-Bounds-M": ",".join(f"{edge:g}" for edge in bounds_m),
+            "X-Map-Time-Utc": utc_text(time_ns),
+            "X-Map-Age-S": f"{(engine.now_ns() - time_ns) / 1e9:.3f}",
             "X-Map-Min": f"{image.min():.6g}",
             "X-Map-Max": f"{image.max():.6g}",
         }
@@ -291,10 +292,6 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
             return Response(map_png(image), media_type="image/png", headers=headers)
         body = np.ascontiguousarray(image, dtype="<f4").tobytes()
         return Response(body, media_type="application/octet-stream", headers=headers)
-
-
-def _power(snapshot: MapSnapshot, array: str) -> Float32Array | None:
-    return snapshot.fused if array == "fused" else snapshot.arrays.get(array)
 
 
 def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
@@ -320,15 +317,47 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
             "last_seq": hub.last_seq,
             "arrays": await asyncio.to_thread(engine.arrays),
         }
-        sending = asyncio.create_task(_send_all(socket, subscription, hello))
-        listening = asyncio.create_task(_until_gone(socket))
         try:
-            await asyncio.wait({sending, listening}, return_when=asyncio.FIRST_COMPLETED)
+            await _while_connected(socket, _send_all(socket, subscription, hello))
         finally:
             hub.unsubscribe(subscription)
-            for task in (sending, listening):
-                task.cancel()
-            await asyncio.gather(sending, listening, return_exceptions=True)
+
+    @app.websocket("/api/v1/map")
+    async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
+        await socket.accept()
+        try:
+            _refuse_strangers(socket)
+            chosen = _chosen_views(site, array, views)
+        except ValueError as error:
+            await socket.close(1008, str(error)[:MAX_REASON])
+            return
+        news, loop = asyncio.Event(), asyncio.get_running_loop()
+
+        def drawn() -> None:
+            loop.call_soon_threadsafe(news.set)
+
+        with engine.maps.watching(array, chosen, drawn):
+            await _while_connected(socket, _send_pictures(socket, engine, array, chosen, news))
+
+
+def _chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
+    if array != FUSED and array not in site.arrays:
+        raise ValueError(f"array: none of that name; there are fused, {', '.join(site.arrays)}")
+    chosen = tuple(dict.fromkeys(view.strip() for view in views.split(",")))
+    if not set(chosen) <= VIEWS.keys():
+        raise ValueError(f"views: expected some of {', '.join(VIEWS)}")
+    return chosen
+
+
+async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -> None:
+    """Do the work until it ends or the client is gone."""
+    tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _refuse_strangers(socket: WebSocket) -> None:
@@ -357,11 +386,35 @@ async def _send_all(socket: WebSocket, subscription: Subscription, first: JsonOb
     message = first
     while True:
         text = json.dumps(message, separators=(",", ":"))
-        try:
-            await asyncio.wait_for(socket.send_text(text), SEND_TIMEOUT_S)
-        except (TimeoutError, WebSocketDisconnect, RuntimeError):
+        if not await _sent(socket.send_text(text)):
             return
         message = await subscription.next()
+
+
+async def _send_pictures(
+    socket: WebSocket, engine: Engine, array: str, views: tuple[str, ...], news: asyncio.Event
+) -> None:
+    """Send each window's pictures as they are drawn; what a slow client has no time for is left out."""
+    shown = None
+    while True:
+        news.clear()
+        drawn = engine.maps.drawn
+        pictures = [] if drawn is None else [drawn.pictures.get((array, view)) for view in views]
+        if drawn is not None and drawn.window is not shown and all(pictures):
+            shown = drawn.window
+            for picture in pictures:
+                if picture is not None and not await _sent(socket.send_bytes(picture.packed(engine.now_ns()))):
+                    return
+        await news.wait()
+
+
+async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
+    """Whether a client took what it was sent, in time."""
+    try:
+        await asyncio.wait_for(sending, SEND_TIMEOUT_S)
+    except (TimeoutError, WebSocketDisconnect, RuntimeError):
+        return False
+    return True
 
 
 async def _until_gone(socket: WebSocket) -> None:

@@ -36,7 +36,7 @@ const state = {
   tracks: new Map(),
   latencies: [],
   maps: null,       // { floor, side, bornMs, time }
-  images: null,     // { floor, side, bornMs } coloured
+  images: null,     // { floor, side, bornMs } coloured, each { canvas, bounds }
   missed: 0,
 };
 
@@ -75,7 +75,7 @@ const HEARD = {
     state.tracks.clear();
     loadSite();
     loadEvents();
-    heat.want();
+    heat.watch();
   },
   arrays(message) {
     if (message.mode && message.mode !== state.mode) changeMode(message.mode);
@@ -87,7 +87,6 @@ const HEARD = {
     state.arrays = message.arrays.map((array) => ({ array, askedMs }));
     arraysPanel.show(state.arrays, now, "live");
     fillMapChoice();
-    if (message.arrays.some(({ active }) => active)) heat.want();
   },
   update(message) {
     const bornMs = born(message, 0, true);
@@ -95,7 +94,6 @@ const HEARD = {
     state.current.set(message.event_id, shown);
     if (shown.position) leaveTrail(shown);
     newest(message, shown);
-    heat.want();
   },
   event({ v, seq, ...message }) { // what is left is the event as it is stored
     const bornMs = born(message, message.duration_s, true);
@@ -107,7 +105,6 @@ const HEARD = {
     learnLatency(message);
     newest(message, shown);
     announce(message);
-    heat.want();
   },
   track(message) {
     const track = (message.state !== "new" && state.tracks.get(message.id)) || { points: [] };
@@ -244,7 +241,7 @@ function changeMode(mode) {
   state.tracks.clear();
   state.current.clear();
   state.trail = [];
-  state.last = null;
+  state.last = state.maps = state.images = null;
   loadEvents();
 }
 
@@ -348,7 +345,8 @@ function readTheme() {
 }
 
 function colourMaps() {
-  state.images = state.maps && { floor: paint(state.maps.floor, table), side: paint(state.maps.side, table), bornMs: state.maps.bornMs };
+  const painted = (picture) => ({ canvas: paint(picture, table), bounds: picture.bounds });
+  state.images = state.maps && { floor: painted(state.maps.floor), side: painted(state.maps.side), bornMs: state.maps.bornMs };
 }
 
 /** Something to draw has changed: it is drawn with the next tick, however many messages come until then. */
@@ -364,7 +362,7 @@ function scene(now) {
   return {
     now,
     map: state.images,
-    grid: site.grid,
+    thickness: site.grid.spacing_m,
     zones: Object.entries(site.zones ?? {}).map(([name, { bounds_m: bounds }]) => [name, bounds.map(([a]) => a), bounds.map(([, b]) => b)]),
     arrays: Object.entries(site.arrays).map(([name, array]) => ({
       name,

@@ -1,10 +1,8 @@
-// Power maps: fetched as raw float32, kept at most as fresh as the sound, and coloured by lightness.
+// Power maps: sent by the server while the page can be seen, as fresh as the sound, and coloured by lightness.
 
-import { utc } from "./format.js";
-
-/** Not sooner than this after the last fetch: five times a second. */
-const MIN_INTERVAL_MS = 200;
-const TIMEOUT_MS = 4000;
+const RETRY_MS = 2000;
+const MAGIC = 0x50414d4c; // "LMAP", little-endian
+const VIEWS = ["floor", "side", "front"];
 const FULL_MS = 1000;
 const GONE_MS = 9000;
 
@@ -44,10 +42,10 @@ export function ramp(theme) {
   return table;
 }
 
-/** The median of what is finite, and the maximum. */
-export function contrast(values) {
-  const sorted = values.filter(Number.isFinite).sort();
-  return sorted.length ? { low: sorted[sorted.length >> 1], high: sorted[sorted.length - 1] } : { low: 0, high: 0 };
+/** The median and the maximum of some levels. */
+export function contrast(levels) {
+  const sorted = levels.slice().sort();
+  return { low: sorted[sorted.length >> 1], high: sorted[sorted.length - 1] };
 }
 
 /** A canvas of one pixel a node, first row at the bottom: the median and all below it transparent. */
@@ -62,7 +60,7 @@ export function paint({ values, rows, columns }, table) {
   for (let row = 0; row < rows; row += 1) {
     for (let column = 0; column < columns; column += 1) {
       const value = values[row * columns + column];
-      const level = Number.isFinite(value) ? Math.min(255, Math.max(0, Math.round((value - low) * scale))) : 0;
+      const level = Math.max(0, Math.round((value - low) * scale));
       const at = ((rows - 1 - row) * columns + column) * 4;
       image.data[at] = table[level * 3];
       image.data[at + 1] = table[level * 3 + 1];
@@ -79,69 +77,80 @@ export function visibility(ageMs) {
   return Math.min(1, Math.max(0, (GONE_MS - ageMs) / (GONE_MS - FULL_MS)));
 }
 
-/** Fetches the floor's and the side's map of the chosen array when asked to, never more often than it may. */
+/** A picture from its bytes: see docs/api.md for the header. */
+export function unpack(bytes) {
+  const view = new DataView(bytes);
+  if (view.getUint32(0, true) !== MAGIC) throw new Error("expected a picture of a map");
+  const header = view.getUint16(6, true);
+  const [rows, columns] = [44, 46].map((at) => view.getUint16(at, true));
+  if (bytes.byteLength !== header + rows * columns) throw new Error(`expected ${rows} x ${columns} levels`);
+  const [bottom, top, left, right] = [28, 32, 36, 40].map((at) => view.getFloat32(at, true));
+  return {
+    view: VIEWS[view.getUint8(5)],
+    values: new Uint8Array(bytes, header),
+    rows,
+    columns,
+    bounds: { left, right, bottom, top },
+    stamp: view.getBigInt64(8, true),
+    bornMs: Date.now() - 1000 * view.getFloat32(16, true),
+  };
+}
+
+/** Watches the floor's and the side's map of the chosen array for as long as the page can be seen. */
 export class HeatFeed {
   constructor(base, onMaps) {
-    this.base = base;
+    this.url = new URL("map", base);
+    this.url.protocol = this.url.protocol === "https:" ? "wss:" : "ws:";
     this.onMaps = onMaps;
     this.choice = "fused";
-    this.wanted = false;
-    this.busy = false;
-    this.fetchedAt = -Infinity;
-    document.addEventListener("visibilitychange", () => this.#pump());
-  }
-
-  /** There may be a newer map. */
-  want() {
-    this.wanted = true;
-    this.#pump();
+    this.socket = null;
+    this.floor = null;
+    this.retry = null;
+    document.addEventListener("visibilitychange", () => this.watch());
   }
 
   /** Show another map: "fused" or an array's name. */
   choose(name) {
     this.choice = name;
     this.onMaps(null);
-    this.want();
+    this.#leave();
+    this.watch();
   }
 
-  async #pump() {
-    if (!this.wanted || this.busy || document.hidden) return;
-    const wait = this.fetchedAt + MIN_INTERVAL_MS - performance.now();
-    this.busy = true;
-    if (wait > 0) await new Promise((done) => setTimeout(done, wait));
-    this.wanted = false;
-    this.fetchedAt = performance.now();
-    const choice = this.choice;
-    try {
-      const [floor, side] = await Promise.all(["floor", "side"].map((view) => this.#fetch(choice, view)));
-      if (choice === this.choice) this.onMaps(floor && side ? { floor, side, bornMs: floor.bornMs, time: floor.time } : null);
-    } catch (error) {
-      if (!(error instanceof TypeError) && error.name !== "TimeoutError") console.warn("livessl: map:", error.message);
-    } finally {
-      this.busy = false;
+  /** Be connected while the page can be seen. */
+  watch() {
+    if (document.hidden) this.#leave();
+    else if (this.socket === null) this.#open();
+  }
+
+  #leave() {
+    clearTimeout(this.retry);
+    const socket = this.socket;
+    this.socket = null;
+    if (socket !== null) socket.close();
+  }
+
+  #open() {
+    this.url.search = new URLSearchParams({ array: this.choice, views: "floor,side" });
+    const socket = new WebSocket(this.url);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.onmessage = ({ data }) => {
+      if (socket === this.socket) this.#take(unpack(data));
+    };
+    socket.onclose = () => {
+      if (socket !== this.socket) return;
+      this.socket = null;
+      this.retry = setTimeout(() => this.watch(), RETRY_MS);
+    };
+  }
+
+  /** Both views of a window make its map. */
+  #take(picture) {
+    if (picture.view === "floor") this.floor = picture;
+    else if (this.floor !== null && this.floor.stamp === picture.stamp) {
+      const time = new Date(Number(picture.stamp / 1000000n)).toISOString();
+      this.onMaps({ floor: this.floor, side: picture, bornMs: picture.bornMs, time });
     }
-    if (this.wanted) this.#pump();
   }
-
-  async #fetch(choice, view) {
-    const url = new URL("map", this.base);
-    url.search = new URLSearchParams({ array: choice, view, format: "float32" });
-    const response = await fetch(url, { cache: "no-store", signal: AbortSignal.timeout(TIMEOUT_MS) });
-    if (response.status === 204 || response.status === 404) return null;
-    if (!response.ok) throw new Error(`${view} map: the server answered ${response.status}`);
-    const bytes = await response.arrayBuffer();
-    const [rows, columns] = (response.headers.get("X-Map-Shape") ?? "").split(",").map(Number);
-    if (!(rows * columns * 4 === bytes.byteLength)) {
-      throw new Error(`${view} map: expected ${rows} x ${columns} float32, got ${bytes.byteLength} bytes`);
-    }
-    const time = response.headers.get("X-Map-Time-Utc");
-    const age = Number(response.headers.get("X-Map-Age-S"));
-    return { values: littleEndian(bytes), rows, columns, time: utc(time) === null ? null : time, bornMs: Date.now() - 1000 * (Number.isFinite(age) ? age : 0) };
-  }
-}
-
-function littleEndian(bytes) {
-  if (new Uint8Array(new Uint16Array([1]).buffer)[0] === 1) return new Float32Array(bytes);
-  const view = new DataView(bytes);
-  return Float32Array.from({ length: bytes.byteLength / 4 }, (_, i) => view.getFloat32(4 * i, true));
 }

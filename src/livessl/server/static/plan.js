@@ -124,20 +124,22 @@ export class Plan {
     this.g.fillRect(...this.#box([0, 0, 0], this.size));
   }
 
-  #heat({ map, grid, now }) {
+  /** A map of a plane is drawn as thick as a cell of the grid that is searched. */
+  #heat({ map, thickness, now }) {
     const image = map?.[this.name];
     const alpha = map ? visibility(now - map.bornMs) : 0;
     if (!image || alpha <= 0) return;
-    const [low, high] = [grid.bounds_m.map(([a]) => a), grid.bounds_m.map(([, b]) => b)];
-    for (const axis of this.view.axes) {
-      if (high[axis] > low[axis]) continue;
-      low[axis] -= grid.spacing_m / 2;
-      high[axis] += grid.spacing_m / 2;
-    }
+    const { left, right, bottom, top } = image.bounds;
+    const [low, high] = [[0, 0, 0], [0, 0, 0]];
+    [[left, right], [bottom, top]].forEach(([from, to], index) => {
+      const flat = to > from ? 0 : thickness / 2;
+      low[this.view.axes[index]] = from - flat;
+      high[this.view.axes[index]] = to + flat;
+    });
     this.g.globalAlpha = alpha;
     this.g.imageSmoothingEnabled = true;
     this.g.imageSmoothingQuality = "low";
-    this.g.drawImage(image, ...this.#box(low, high));
+    this.g.drawImage(image.canvas, ...this.#box(low, high));
     this.g.globalAlpha = 1;
   }
 

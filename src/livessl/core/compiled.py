@@ -1,0 +1,214 @@
+"""The searching and mapping kernels, compiled by numba: what `livessl.core.vectorised` does, many times faster.
+
+Each function has its twin there, which says what it does: the same arguments, the same answers to the last bit.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numba
+import numpy as np
+
+from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT
+
+NAME: Final = "numba"
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_compiled
+def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low, high):  # type: ignore[no-untyped-def]
+    """Lowest and highest lag of every pair over the nodes of every cell."""
+    n_x, n_y, n_z = len(x_m), len(y_m), len(z_m)
+    cells_y, cells_z = -(-n_y // edge), -(-n_z // edge)
+    distance = np.empty((len(microphones_m), n_z), np.float32)
+    low[:] = NO_LAG
+    high[:] = 0
+    for x in range(n_x):
+        for y in range(n_y):
+            first = (x // edge * cells_y + y // edge) * cells_z
+            for m in range(len(microphones_m)):
+                d_x, d_y, at_z = x_m[x] - microphones_m[m, 0], y_m[y] - microphones_m[m, 1], microphones_m[m, 2]
+                flat = d_x * d_x + d_y * d_y
+                for z in range(n_z):
+                    d_z = z_m[z] - at_z
+                    distance[m, z] = np.sqrt(flat + d_z * d_z)
+            for p in range(len(pairs)):
+                nearer, further = distance[pairs[p, 0]], distance[pairs[p, 1]]
+                for cell in range(cells_z):
+                    least, most = np.int32(NO_LAG), np.int32(0)
+                    for z in range(cell * edge, min((cell + 1) * edge, n_z)):
+                        lag = np.int32((further[z] - nearer[z]) * scale + offset)
+                        least, most = min(least, lag), max(most, lag)
+                    low[p, first + cell] = min(low[p, first + cell], np.uint16(least))
+                    high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
+
+
+@_compiled
+def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
+    """Add one array's power at every node."""
+    for node in range(len(table)):
+        total = np.float32(0.0)
+        for p in range(table.shape[1]):
+            total += values[p, table[node, p]]
+        power[node] += weight * total
+
+
+@_compiled
+def running_maxima(values, maxima):  # type: ignore[no-untyped-def]
+    """Maxima over 1, 2, 4, ... lags from each lag on."""
+    maxima[0] = values
+    for level in range(1, len(maxima)):
+        half = 1 << (level - 1)
+        length = values.shape[1] - half
+        for row in range(len(values)):
+            before, now = maxima[level - 1, row], maxima[level, row]
+            for lag in range(length):
+                now[lag] = max(before[lag], before[lag + half])
+            for lag in range(length, values.shape[1]):
+                now[lag] = before[lag]
+
+
+@_compiled
+def _joined(rule, total, power):  # type: ignore[no-untyped-def]
+    if rule == MINIMUM:
+        return min(total, power)
+    if rule == PRODUCT:
+        return total * max(power, np.float32(0.0))
+    return total + power
+
+
+@_compiled
+def _start(rule):  # type: ignore[no-untyped-def]
+    if rule == MINIMUM:
+        return np.float32(np.inf)
+    return np.float32(1.0) if rule == PRODUCT else np.float32(0.0)
+
+
+@_compiled
+def _bounds(first, count, low, high, rows, first_row, weight, rule, maxima, level_of, bound):  # type: ignore[no-untyped-def]
+    """What no node of each of some cells exceeds."""
+    flat = maxima.reshape(maxima.size)
+    length = np.uint32(maxima.shape[2])
+    level_step = np.uint32(maxima.shape[1]) * length
+    bound[:count] = _start(rule)
+    total = np.empty(count, np.float32)
+    for a in range(len(weight)):
+        total[:] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            lows, highs = low[rows[r], first : first + count], high[rows[r], first : first + count]
+            start = np.uint32(r) * length
+            for c in range(count):  # unsigned all along: signed indices would be asked whether they count from the end
+                lowest, highest = np.uint32(lows[c]), np.uint32(highs[c])
+                level = np.uint32(level_of[highest - lowest])
+                at = start + level * level_step
+                second = highest + np.uint32(1) - (np.uint32(1) << level)
+                total[c] += max(flat[at + lowest], flat[at + second])
+        for c in range(count):
+            bound[c] = _joined(rule, bound[c], weight[a] * total[c])
+
+
+@_compiled
+def _covered(first, nodes, shape, boxes):  # type: ignore[no-untyped-def]
+    """Whether a cube of nodes lies wholly in one of the boxes."""
+    for box in boxes:
+        inside = True
+        for axis in range(3):
+            last = min(first[axis] + nodes, shape[axis]) - 1
+            inside = inside and first[axis] >= box[axis, 0] and last <= box[axis, 1]
+        if inside:
+            return True
+    return False
+
+
+@_compiled
+def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row, weight, rule,
+    values, boxes, best, best_node, distance, total, fused,
+):  # fmt: skip
+    """The best node of one cell, if it is better than what is known."""
+    n_x, n_y, n_z = min(edge, len(x_m) - first[0]), min(edge, len(y_m) - first[1]), min(edge, len(z_m) - first[2])
+    count = n_x * n_y * n_z
+    fused[:count] = _start(rule)
+    for a in range(len(weight)):
+        for m in range(first_microphone[a], first_microphone[a + 1]):
+            to = distance[m - first_microphone[a]]
+            n = 0
+            for x in range(first[0], first[0] + n_x):
+                d_x = x_m[x] - microphones_m[m, 0]
+                for y in range(first[1], first[1] + n_y):
+                    d_y = y_m[y] - microphones_m[m, 1]
+                    flat = d_x * d_x + d_y * d_y
+                    for z in range(first[2], first[2] + n_z):
+                        d_z = z_m[z] - microphones_m[m, 2]
+                        to[n] = flat + d_z * d_z
+                        n += 1
+            for n in range(count):
+                to[n] = np.sqrt(to[n])
+        total[:count] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            nearer, further, row = distance[pairs[r, 0]], distance[pairs[r, 1]], values[r]
+            for n in range(count):
+                total[n] += row[np.uint32(np.int32((further[n] - nearer[n]) * scale[a] + offset[a]))]
+        for n in range(count):
+            fused[n] = _joined(rule, fused[n], weight[a] * total[n])
+    for n in range(count):
+        if fused[n] >= best:
+            x, y, z = first[0] + n // (n_y * n_z), first[1] + n // n_z % n_y, first[2] + n % n_z
+            node = (x * len(y_m) + y) * len(z_m) + z
+            better = fused[n] > best or node < best_node
+            if better and not _covered((x, y, z), 1, (len(x_m), len(y_m), len(z_m)), boxes):
+                best, best_node = fused[n], node
+    return best, best_node
+
+
+@_compiled
+def highest(  # type: ignore[no-untyped-def]
+    values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
+    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes,
+):  # fmt: skip
+    """The highest node outside some boxes, by branch and bound."""
+    shape = (len(x_m), len(y_m), len(z_m))
+    top_edge = edge * per_top
+    tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
+    count, children = top_low.shape[1], per_top**3
+    top_bound, child_bound = np.empty(count, np.float32), np.empty(children, np.float32)
+    distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
+    total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
+    _bounds(0, count, top_low, top_high, rows, first_row, weight, rule, maxima, level_of, top_bound)
+    best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
+    order = np.array([np.argmax(top_bound)])
+    for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
+        if turn == 1:
+            top_bound[order[0]] = -np.inf
+            left = np.flatnonzero(top_bound >= best)
+            order = left[np.argsort(-top_bound[left])]
+        for top in order:
+            if top_bound[top] < best or top_bound[top] == -np.inf:
+                break
+            t_x, t_y, t_z = top // (tops_y * tops_z), top // tops_z % tops_y, top % tops_z
+            t_x, t_y, t_z = t_x * top_edge, t_y * top_edge, t_z * top_edge
+            if top_bound[top] == best and (t_x * shape[1] + t_y) * shape[2] + t_z > best_node:
+                continue
+            if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
+                continue
+            _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
+            while True:
+                child = np.argmax(child_bound)
+                bound = child_bound[child]
+                if bound < best or bound == -np.inf:
+                    break
+                child_bound[child] = -np.inf
+                c_x, c_y, c_z = child // (per_top * per_top), child // per_top % per_top, child % per_top
+                first = (t_x + c_x * edge, t_y + c_y * edge, t_z + c_z * edge)
+                if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
+                    continue  # a cube at the volume's edge has cells outside it
+                if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
+                    continue
+                if not _covered(first, edge, shape, boxes):
+                    best, best_node = _best_of_cell(
+                        first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
+                        weight, rule, values, boxes, best, best_node, distance, total, fused,
+                    )  # fmt: skip
+    return best_node, best

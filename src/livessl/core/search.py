@@ -1,0 +1,217 @@
+"""The highest places of the summed power maps, exactly, without the maps: branch and bound over cells of the grid.
+
+Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
+pair can add at any node of the cell; their sum bounds the cell, and a cell below the best node known need not be looked
+into (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer). Mostly some two thousand
+of millions of nodes are visited. The cells are of one size in metres, so memory does not grow with a finer grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from types import ModuleType
+from typing import Final
+
+import numpy as np
+
+from livessl.core import vectorised
+from livessl.core.geometry import Grid
+from livessl.core.srp import pair_weight
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray, UInt8Array, UInt16Array
+
+kernels: ModuleType
+try:
+    from livessl.core import compiled as kernels
+except ImportError:  # without numba
+    kernels = vectorised
+
+CELL_M: Final = 0.2
+"""Edge of a cell, about."""
+
+CELLS_PER_TOP: Final = 4
+"""Cells along an edge of the cubes of cells that are bounded first."""
+
+
+class Rule(IntEnum):
+    """How the arrays' maps are joined. All are monotone in every map, which is what the bounds ask for."""
+
+    SUM = vectorised.SUM
+    PRODUCT = vectorised.PRODUCT
+    """Of the positive parts."""
+    MINIMUM = vectorised.MINIMUM
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A node and the fused power there."""
+
+    node: int
+    power: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Lags:
+    """One array's way from differences of distances to places on its lag axis."""
+
+    count: int
+    scale: np.float32
+    offset: np.float32
+
+
+class PeakSearch:
+    """Finds the peaks of several arrays' fused power on a grid.
+
+    Parameters
+    ----------
+    arrays : sequence of ArraySpec
+        All that may take part.
+    grid : Grid
+    c_m_s : float
+    """
+
+    def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
+        self._grid = grid
+        self._c_m_s = c_m_s
+        self._axes = [grid.axis_m(axis).astype(np.float32) for axis in range(3)]
+        self._edge = max(1, round(CELL_M / grid.spacing_m))
+        self._cells = [-(-n // self._edge) for n in grid.shape]
+        self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
+        self._specs = {spec.name: spec for spec in arrays}
+        self._pairs = {s.name: np.stack(np.triu_indices(len(s.microphones_m), k=1), axis=1) for s in arrays}
+        counts = [len(pairs) for pairs in self._pairs.values()]
+        self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
+        total = sum(counts)
+        tops = int(np.prod(self._tops))
+        self._low, self._high = (np.zeros((total, tops * CELLS_PER_TOP**3), np.uint16) for _ in range(2))
+        self._top_low, self._top_high = (np.zeros((total, tops), np.uint16) for _ in range(2))
+        self._lags: dict[str, _Lags] = {}
+        self._sets: dict[tuple[str, ...], _Rows] = {}
+
+    def prepare(self, array: str, lags_s: FloatArray) -> None:
+        """Work out an array's intervals for a lag axis (L,), evenly spaced around zero.
+
+        Raises
+        ------
+        ValueError
+            Where the axis is longer than 16 bits can count.
+        """
+        if len(lags_s) >= vectorised.NO_LAG:
+            raise ValueError(
+                f"array {array!r}: expected fewer than {vectorised.NO_LAG} lags, got {len(lags_s)}; "
+                "its microphones are too far apart for its sampling rate"
+            )
+        spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
+        rows = slice(first, first + len(pairs))
+        scale = np.float32(1.0 / ((lags_s[1] - lags_s[0]) * self._c_m_s))
+        known = self._lags[array] = _Lags(len(lags_s), scale, np.float32(len(lags_s) // 2 + 0.5))
+        low, high = (np.empty((len(pairs), int(np.prod(self._cells))), np.uint16) for _ in range(2))
+        microphones_m = spec.microphones_m.astype(np.float32)
+        kernels.cell_intervals(
+            *self._axes, microphones_m, pairs.astype(np.int32), known.scale, known.offset, self._edge, low, high
+        )
+        self._low[rows], self._top_low[rows] = self._by_cube(low, np.minimum)
+        self._high[rows], self._top_high[rows] = self._by_cube(high, np.maximum)
+        self._sets.clear()
+
+    def peaks(
+        self,
+        gccs: dict[str, GCC],
+        count: int = 1,
+        apart_nodes: int = 0,
+        rule: Rule = Rule.SUM,
+        without: Sequence[IntArray] = (),
+    ) -> list[Peak]:
+        """The highest nodes, best first: each the highest of those far enough from the ones before it.
+
+        Parameters
+        ----------
+        gccs : dict of array name to GCC
+            At least one; in the order in which the maps are to be joined. Each array must have been prepared.
+        count : int
+        apart_nodes : int
+            Two peaks differ by more than so many nodes along some axis.
+        rule : Rule
+        without : sequence of (3, 2) int64
+            Boxes, first and last node along each axis, in which no peak is wanted.
+        """
+        rows = self._rows(tuple(gccs))
+        for array, gcc in enumerate(gccs.values()):
+            rows.values[rows.first_row[array] : rows.first_row[array + 1], : gcc.values.shape[1]] = gcc.values
+        kernels.running_maxima(rows.values, rows.maxima)
+        boxes = list(without)
+        found: list[Peak] = []
+        for _ in range(count):
+            stacked = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
+            node, power = kernels.highest(
+                rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
+                self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
+                rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset, stacked,
+            )  # fmt: skip
+            if power == -np.inf:
+                break
+            found.append(Peak(int(node), float(power)))
+            at = np.array(np.unravel_index(node, self._grid.shape))
+            boxes.append(np.stack([at - apart_nodes, at + apart_nodes], axis=1))
+        return found
+
+    def _by_cube(self, cells: UInt16Array, extreme: np.ufunc) -> tuple[UInt16Array, UInt16Array]:
+        """Intervals' ends (P, C) of cells in the grid's order: cube after cube, filled up with zeros; and of cubes."""
+        pairs = len(cells)
+        by_axis = cells.reshape(pairs, *self._cells)
+        of_cubes = by_axis
+        for axis, count in enumerate(self._cells):
+            of_cubes = extreme.reduceat(of_cubes, np.arange(0, count, CELLS_PER_TOP), axis=axis + 1)
+        padded = np.zeros((pairs, *(CELLS_PER_TOP * tops for tops in self._tops)), np.uint16)
+        padded[:, : self._cells[0], : self._cells[1], : self._cells[2]] = by_axis
+        split = padded.reshape(pairs, *(n for tops in self._tops for n in (tops, CELLS_PER_TOP)))
+        return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(pairs, -1), of_cubes.reshape(pairs, -1)
+
+    def _rows(self, arrays: tuple[str, ...]) -> _Rows:
+        if arrays not in self._sets:
+            if len(self._sets) >= _SETS:
+                self._sets.clear()
+            self._sets[arrays] = self._new_rows(arrays)
+        return self._sets[arrays]
+
+    def _new_rows(self, arrays: tuple[str, ...]) -> _Rows:
+        specs, lags = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
+        first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
+        rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
+        length = max(one.count for one in lags)
+        levels = int((self._top_high[rows] - self._top_low[rows]).max()).bit_length() + 1
+        return _Rows(
+            values=np.zeros((len(rows), length), np.float32),
+            maxima=np.zeros((levels, len(rows), length), np.float32),
+            level_of=np.array([(n + 1).bit_length() - 1 for n in range(length)], np.uint8),
+            rows=rows,
+            first_row=first_row,
+            weight=np.array([pair_weight(len(spec.microphones_m)) for spec in specs], np.float32),
+            microphones_m=np.concatenate([spec.microphones_m for spec in specs]).astype(np.float32),
+            first_microphone=np.cumsum([0, *(len(spec.microphones_m) for spec in specs)]),
+            pairs=np.concatenate([self._pairs[name] for name in arrays]),
+            scale=np.array([one.scale for one in lags]),
+            offset=np.array([one.offset for one in lags]),
+        )
+
+
+_SETS: Final = 16
+"""Sets of arrays that are kept ready."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """What a search over one set of arrays needs, and the room it works in: see `vectorised.highest`."""
+
+    values: Float32Array
+    maxima: Float32Array
+    level_of: UInt8Array
+    rows: IntArray
+    first_row: IntArray
+    weight: Float32Array
+    microphones_m: Float32Array
+    first_microphone: IntArray
+    pairs: IntArray
+    scale: Float32Array
+    offset: Float32Array

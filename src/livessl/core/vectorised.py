@@ -1,0 +1,265 @@
+"""The searching and mapping kernels on NumPy alone: what always works, and what the compiled ones are held against.
+
+Sums run in one order everywhere, over the pairs of an array and then over the arrays. Rounding to float32 keeps the
+order of numbers, so a sum of maxima is never below the sum of any of the numbers that they are maxima of, rounding
+included: the bounds are exact.
+
+Throughout, R is the rows (all pairs of all arrays of a search, one after the other), L the lags, A the arrays, M their
+microphones, C the cells. Lags are places on the fine axis: `int((|r - r_k| - |r - r_i|) * scale + offset)` in float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from livessl.core.types import Float32Array, IntArray, UInt8Array, UInt16Array
+
+NAME: Final = "NumPy"
+
+SUM: Final = 0
+PRODUCT: Final = 1
+MINIMUM: Final = 2
+
+NO_LAG: Final = 65535
+"""Above every lag: what a cell without nodes begins with."""
+
+_SLAB_NODES: Final = 1 << 15
+"""Nodes whose distances are worked out at once: what fits the second-level cache."""
+
+_CELLS_AT_ONCE: Final = 64
+"""Most cells whose nodes are looked at together; it begins with few, for mostly few are needed."""
+
+
+def lags(
+    nodes_m: Float32Array, microphones_m: Float32Array, pairs: IntArray, scale: np.float32, offset: np.float32
+) -> IntArray:
+    """Place of each pair's delay on the fine lag axis, of nodes (N, 3): (P, N) int32."""
+    x, y, z = (nodes_m[:, axis] - microphones_m[:, axis, None] for axis in range(3))
+    distance = np.sqrt((x * x + y * y) + z * z)
+    return np.asarray(((distance[pairs[:, 1]] - distance[pairs[:, 0]]) * scale + offset).astype(np.int32))
+
+
+def cell_intervals(
+    x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, microphones_m: Float32Array, pairs: IntArray,
+    scale: np.float32, offset: np.float32, edge: int, low: UInt16Array, high: UInt16Array,
+) -> None:  # fmt: skip
+    """Lowest and highest lag of every pair of one array over the nodes of every cell.
+
+    Parameters
+    ----------
+    x_m, y_m, z_m : (n,) float32
+        The grid's axes.
+    microphones_m : (K, 3) float32
+    pairs : (P, 2) int32
+    scale, offset : float32
+        From a difference of distances, m, to a place on the lag axis.
+    edge : int
+        Nodes along an edge of a cell.
+    low, high : (P, C) uint16
+        The answer; the cells in the grid's order, z fastest.
+    """
+    step = max(1, _SLAB_NODES // (len(y_m) * len(z_m) * edge)) * edge
+    cells_yz = -(-len(y_m) // edge) * -(-len(z_m) // edge)
+    for first in range(0, len(x_m), step):
+        slab = x_m[first : first + step]
+        place = lags(_nodes(slab, y_m, z_m), microphones_m, pairs, scale, offset)
+        place = place.reshape(len(pairs), len(slab), len(y_m), len(z_m))
+        cells = slice(first // edge * cells_yz, (first // edge + -(-len(slab) // edge)) * cells_yz)
+        for extreme, out in ((np.minimum, low), (np.maximum, high)):
+            reduced = place
+            for axis in (1, 2, 3):
+                reduced = extreme.reduceat(reduced, np.arange(0, reduced.shape[axis], edge), axis=axis)
+            out[:, cells] = reduced.reshape(len(pairs), -1)
+
+
+def add_power(values: Float32Array, table: UInt16Array, weight: np.float32, power: Float32Array) -> None:
+    """Add one array's power at every node.
+
+    Parameters
+    ----------
+    values : (P, L) float32
+        The array's GCC.
+    table : (G, P) uint16
+        Each node's lags.
+    weight : float32
+    power : (G,) float32
+        Added to.
+    """
+    nodes, pairs = table.shape
+    places = table + np.arange(pairs, dtype=np.int32) * np.int32(values.shape[1])
+    starts = np.arange(0, places.size + 1, pairs, dtype=np.int32)
+    ones = np.ones(places.size, dtype=np.float32)
+    power += weight * (csr_array((ones, places.ravel(), starts), shape=(nodes, values.size)) @ values.ravel())
+
+
+def running_maxima(values: Float32Array, maxima: Float32Array) -> None:
+    """Maxima over 1, 2, 4, ... lags from each lag on: (levels, R, L) of (R, L)."""
+    maxima[0] = values
+    for level in range(1, len(maxima)):
+        half = 1 << (level - 1)
+        maxima[level] = maxima[level - 1]
+        np.maximum(
+            maxima[level - 1, :, :-half], maxima[level - 1, :, half:], out=maxima[level, :, : values.shape[1] - half]
+        )
+
+
+def highest(
+    values: Float32Array, maxima: Float32Array, level_of: UInt8Array, rows: IntArray, first_row: IntArray,
+    weight: Float32Array, rule: int, low: UInt16Array, high: UInt16Array, top_low: UInt16Array, top_high: UInt16Array,
+    x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int, microphones_m: Float32Array,
+    first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray,
+) -> tuple[int, float]:  # fmt: skip
+    """The highest node outside some boxes, by branch and bound: the very one that the whole map would give.
+
+    No node of a cell exceeds the fusion of the pairs' highest values over the cell's lags; two look-ups in the running
+    maxima give the maximum over any interval. Cubes of cells are looked into in the order of their bounds, and of their
+    cells those whose bound reaches what is known already. Of nodes that are equal the first in the grid's order is
+    taken. With no node outside the boxes the value is -inf.
+
+    Parameters
+    ----------
+    values : (R, L) float32
+        GCCs.
+    maxima : (levels, R, L) float32
+    level_of : (L,) uint8
+        By an interval's length less one, the level whose maxima cover it with two.
+    rows : (R,) int64
+        Which of the site's pairs the search's rows are.
+    first_row : (A + 1,) int64
+        Where each array's rows begin.
+    weight : (A,) float32
+    rule : int
+        `SUM`, `PRODUCT` of the positive parts or `MINIMUM` over the arrays.
+    low, high : (site's pairs, T per_top^3) uint16
+        Lag intervals of the cells, cube after cube; 0 where a cube reaches out of the volume.
+    top_low, top_high : (site's pairs, T) uint16
+        The same of the cubes of `per_top` cells an edge.
+    x_m, y_m, z_m, edge
+        As for `cell_intervals`.
+    microphones_m : (M, 3) float32
+    first_microphone : (A + 1,) int64
+    pairs : (R, 2) int64
+        Of each row, within its array.
+    scale, offset : (A,) float32
+    boxes : (E, 3, 2) int64
+        First and last node along each axis of what is left out.
+
+    Returns
+    -------
+    node : int
+    value : float
+    """
+    shape = (len(x_m), len(y_m), len(z_m))
+    tops = tuple(-(-n // (per_top * edge)) for n in shape)
+    best, best_node = np.float32(-np.inf), int(np.prod(shape))
+
+    def promising(which: IntArray, first: IntArray, nodes: int, table: tuple[UInt16Array, UInt16Array]) -> _Cells:
+        """Of cubes with `nodes` an edge, those that may be better than what is known."""
+        bound = _bounds(which, *table, rows, first_row, weight, rule, maxima, level_of)
+        last = np.minimum(first + nodes, shape) - 1
+        bound[(first >= shape).any(axis=1)] = -np.inf
+        for box in boxes:
+            bound[((first >= box[:, 0]) & (last <= box[:, 1])).all(axis=1)] = -np.inf
+        order = np.argsort(-bound, kind="stable")
+        order = order[(bound[order] > -np.inf) & (bound[order] >= best)]
+        return _Cells(which[order], first[order], bound[order], np.ravel_multi_index(tuple(first[order].T), shape))
+
+    inner = np.stack(np.unravel_index(np.arange(per_top**3), (per_top,) * 3), axis=1) * edge
+    inmost = np.stack(np.unravel_index(np.arange(edge**3), (edge,) * 3), axis=1)
+    every = np.arange(top_low.shape[1])
+    corners = np.stack(np.unravel_index(every, tops), axis=1) * (per_top * edge)
+    cubes = promising(every, corners, per_top * edge, (top_low, top_high))
+    while (chosen := cubes.take(best, best_node)) is not None:
+        which, first = chosen
+        children = (which[:, None] * per_top**3 + np.arange(per_top**3)).ravel()
+        cells = promising(children, (first[:, None] + inner).reshape(-1, 3), edge, (low, high))
+        while (chosen := cells.take(best, best_node)) is not None:
+            at = (chosen[1][:, None] + inmost).reshape(-1, 3)
+            at = at[(at < shape).all(axis=1)]
+            for box in boxes:
+                at = at[~((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)]
+            nodes_m = np.stack([axis_m[at[:, axis]] for axis, axis_m in enumerate((x_m, y_m, z_m))], axis=1)
+            fused = _fused(
+                nodes_m, values, microphones_m, first_microphone, pairs, scale, offset, first_row, weight, rule
+            )
+            peak = fused.max(initial=-np.inf)
+            if peak >= best and len(fused):
+                node = int(np.ravel_multi_index(tuple(at[fused == peak].T), shape).min())
+                best_node = node if peak > best else min(node, best_node)
+                best = peak
+    return best_node, float(best)
+
+
+@dataclass
+class _Cells:
+    """Cubes of nodes in the order of their bounds, taken a few at a time: first one, then twice as many each time."""
+
+    which: IntArray
+    first: IntArray
+    bound: Float32Array
+    corner: IntArray
+    _done: int = 0
+    _some: int = 1
+
+    def take(self, best: np.float32, best_node: int) -> tuple[IntArray, IntArray] | None:
+        """The next ones that may hold a node better than the best or, if equal, before it; None where none is left."""
+        while self._done < len(self.which) and self.bound[self._done] >= best:
+            now = slice(self._done, self._done + self._some)
+            self._done, self._some = now.stop, min(2 * self._some, _CELLS_AT_ONCE)
+            bound, corner = self.bound[now], self.corner[now]
+            may_hold = (bound > best) | ((bound == best) & (corner < best_node))
+            if may_hold.any():
+                return self.which[now][may_hold], self.first[now][may_hold]
+        return None
+
+
+def _bounds(
+    which: IntArray, low: UInt16Array, high: UInt16Array, rows: IntArray, first_row: IntArray, weight: Float32Array,
+    rule: int, maxima: Float32Array, level_of: UInt8Array,
+) -> Float32Array:  # fmt: skip
+    """What no node of each of some cells exceeds."""
+    joined = _start(rule, len(which))
+    for a in range(len(weight)):
+        total = np.zeros(len(which), dtype=np.float32)
+        for r in range(first_row[a], first_row[a + 1]):
+            lowest, highest_lag = low[rows[r], which].astype(np.int64), high[rows[r], which].astype(np.int64)
+            level = level_of[highest_lag - lowest].astype(np.int64)
+            total += np.maximum(maxima[level, r, lowest], maxima[level, r, highest_lag + 1 - (1 << level)])
+        joined = _joined(rule, joined, weight[a] * total)
+    return joined
+
+
+def _fused(
+    nodes_m: Float32Array, values: Float32Array, microphones_m: Float32Array, first_microphone: IntArray,
+    pairs: IntArray, scale: Float32Array, offset: Float32Array, first_row: IntArray, weight: Float32Array, rule: int,
+) -> Float32Array:  # fmt: skip
+    """Fused power of nodes (N, 3): (N,)."""
+    joined = _start(rule, len(nodes_m))
+    for a in range(len(weight)):
+        own = slice(first_row[a], first_row[a + 1])
+        microphones = microphones_m[first_microphone[a] : first_microphone[a + 1]]
+        total = np.zeros(len(nodes_m), dtype=np.float32)
+        for row, lag in zip(values[own], lags(nodes_m, microphones, pairs[own], scale[a], offset[a]), strict=True):
+            total += row[lag]
+        joined = _joined(rule, joined, weight[a] * total)
+    return joined
+
+
+def _start(rule: int, count: int) -> Float32Array:
+    return np.full(count, {SUM: 0.0, PRODUCT: 1.0, MINIMUM: np.inf}[rule], dtype=np.float32)
+
+
+def _joined(rule: int, total: Float32Array, power: Float32Array) -> Float32Array:
+    if rule == MINIMUM:
+        return np.minimum(total, power)
+    if rule == PRODUCT:
+        return np.asarray(total * np.maximum(power, np.float32(0.0)))
+    return np.asarray(total + power)
+
+
+def _nodes(x_m: Float32Array, y_m: Float32Array, z_m: Float32Array) -> Float32Array:
+    return np.stack([part.ravel() for part in np.meshgrid(x_m, y_m, z_m, indexing="ij")], axis=1)
