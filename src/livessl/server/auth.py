@@ -59,6 +59,9 @@ class Gate:
         if refusal is not None:
             status, reason = refusal
             self._refusals.note(DOOR, (scope["client"] or ("a local socket",))[0], reason)
+            if scope["type"] == "websocket":  # before it is open: the handshake is answered with 403
+                await send({"type": "websocket.close"})
+                return
             headers = {"WWW-Authenticate": 'Bearer realm="livessl"'} if status == 401 else None
             await JSONResponse({"detail": reason}, status, headers)(scope, receive, send)
             return
