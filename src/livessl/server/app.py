@@ -152,8 +152,8 @@ class Server:
         while self._retention_days is not None:
             before_ns = self._clock.now_ns() - round(self._retention_days * DAY_NS)
             try:
-                gone = await asyncio.to_thread(self._store.expire, before_ns)
-                _log.info("%d events older than %g days were deleted", gone, self._retention_days)
+                if gone := await asyncio.to_thread(self._store.expire, before_ns):
+                    _log.info("%d events older than %g days were deleted", gone, self._retention_days)
             except StoreError as error:
                 _log.error("%s", error)
             await asyncio.sleep(EXPIRE_S)
