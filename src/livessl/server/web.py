@@ -23,7 +23,7 @@ from livessl.config import Site, is_loopback
 from livessl.core.types import FRAME_S
 from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
-from livessl.server.auth import Gate
+from livessl.server.auth import HEALTH, Gate
 from livessl.server.engine import Engine
 from livessl.server.hub import Filter, Hub, Subscription
 from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
@@ -99,6 +99,7 @@ def _tell_of_tokens(described: JsonObject) -> None:
     """Into the OpenAPI, which knows of no gate before the application."""
     described.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
     described["security"] = [{"token": []}]
+    described["paths"][HEALTH]["get"]["security"] = [{}, {"token": []}]
 
 
 def describe_site(site: Site, mode: str) -> JsonObject:
@@ -149,7 +150,7 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         """The tracks that live now."""
         return {"v": API_VERSION, "tracks": engine.tracks()}
 
-    @app.get("/api/v1/health", tags=["state"])
+    @app.get("/api/v1/health", tags=["state"], responses={503: {"description": "the server has failed"}})
     def get_health(request: Request, response: Response) -> JsonObject:
         """Whether the server works (503 where it does not) and how the arrays are; without a token the status only."""
         arrays = engine.arrays()
@@ -206,7 +207,7 @@ def _add_access_route(app: FastAPI, engine: Engine, tokens: Tokens | None) -> No
 
 
 def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
-    @app.get("/api/v1/events", tags=["estimates"])
+    @app.get("/api/v1/events", tags=["estimates"], responses={404: {"description": "no such zone"}})
     def get_events(
         since: Annotated[str | None, Query(description="RFC 3339; events that began then or later")] = None,
         until: Annotated[str | None, Query(description="RFC 3339; events that began then or earlier")] = None,
@@ -224,7 +225,7 @@ def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
         events, following = store.find(query)
         return {"v": API_VERSION, "events": events, "next_cursor": None if following is None else str(following)}
 
-    @app.get("/api/v1/events/{event_id}", tags=["estimates"])
+    @app.get("/api/v1/events/{event_id}", tags=["estimates"], responses={404: {"description": "no such event"}})
     def get_event(event_id: str) -> JsonObject:
         """One event."""
         event = store.get(event_id)
@@ -233,13 +234,18 @@ def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
         return {"v": API_VERSION, **event}
 
 
+def _unprocessable(name: str, what: str) -> HTTPException:
+    """A query that cannot be understood, told as FastAPI tells its own."""
+    return HTTPException(422, [{"type": "value_error", "loc": ["query", name], "msg": what}])
+
+
 def _instant(name: str, text: str | None) -> int | None:
     if text is None:
         return None
     try:
         time_ns = utc_ns(text.replace(" ", "+"))  # an unescaped + in a query arrives as a blank
     except (ValueError, OverflowError) as error:
-        raise HTTPException(422, f"{name}: {error}") from error
+        raise _unprocessable(name, f"{name}: {error}") from error
     return max(-(2**63), min(2**63 - 1, time_ns))
 
 
@@ -247,7 +253,7 @@ def _cursor(text: str | None) -> Cursor | None:
     try:
         return None if text is None else Cursor.parse(text)
     except ValueError as error:
-        raise HTTPException(422, f"cursor: {error}") from error
+        raise _unprocessable("cursor", f"cursor: {error}") from error
 
 
 def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
@@ -257,6 +263,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         responses={
             200: {"content": {"image/png": {}, "application/octet-stream": {}}},
             204: {"description": "no window has been localized yet"},
+            404: {"description": "no such array, or it has no part in the newest map"},
         },
     )
     def get_map(
@@ -268,7 +275,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         if array != FUSED and array not in site.arrays:
             raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
         if view == "volume" and format == "png":
-            raise HTTPException(422, "view=volume has no picture; use format=float32")
+            raise _unprocessable("view", "view=volume has no picture; use format=float32")
         drawn = engine.maps.newest(array)
         if drawn is None:
             return Response(status_code=204)
