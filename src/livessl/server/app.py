@@ -37,6 +37,9 @@ MAX_SAID_BYTES: Final = 4096
 MAX_HEAD_BYTES: Final = 16_384
 """Of a request: its line and all of its headers."""
 
+MAX_UNREAD_BYTES: Final = 131_072
+"""What the system keeps for a client that does not read; left to itself it would be megabytes for each."""
+
 EXPIRE_S: Final = 600.0
 """How often events are looked through for those that have been kept long enough."""
 
@@ -191,6 +194,7 @@ def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # and of all that it accepts
     try:
         listener.bind((host, port))
         listener.listen(128)
