@@ -142,7 +142,7 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
 @given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
 @settings(max_examples=500, deadline=None)
 def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
-    for data in (body, struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + body):
+    for data in (body, struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + body):
         with contextlib.suppress(WireError):
             decode(data)
 
@@ -168,7 +168,7 @@ def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str]
     kind, names = form
     fields = {name: data.draw(JSON_VALUES) for name in names.split()}
     try:
-        message = decode(struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + json.dumps(fields).encode())
+        message = decode(struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + json.dumps(fields).encode())
     except WireError:
         return
     encode(message)
@@ -176,7 +176,7 @@ def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str]
 
 def hello_with(**fields: Any) -> bytes:
     whole = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None, **fields}
-    return encode(EXAMPLES[2])[:6] + json.dumps(whole).encode()
+    return encode(EXAMPLES[2])[: struct.calcsize("<4sBBq")] + json.dumps(whole).encode()
 
 
 def test_hello_of_plain_json_is_taken() -> None:
@@ -215,11 +215,21 @@ def test_field_of_a_wrong_value_is_refused(fields: dict[str, Any]) -> None:
     assert said.startswith("hello: ")
 
 
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_message_says_when_it_was_sent(message: WireMessage) -> None:
+    data = encode(message)
+    assert wire.sent_ns(data) == 0
+    sent = wire.stamped(wire.stamped(data, 7), 1_767_225_600_123_456_789)
+    assert wire.sent_ns(sent) == 1_767_225_600_123_456_789
+    assert wire.stamped(sent, 0) == data
+    assert encode(decode(sent)) == data
+
+
 def test_wrong_head_says_what_was_expected() -> None:
     data = encode(EXAMPLES[1])
     assert "at least a header" in refusal(data[:5])
     assert "beginning with b'LSSL', got b'HTTP'" in refusal(b"HTTP" + data[4:])
-    assert "expected wire version 1, got 2; run the same livessl" in refusal(data[:4] + b"\2" + data[5:])
+    assert "expected wire version 2, got 1; run the same livessl" in refusal(data[:4] + b"\1" + data[5:])
     assert "known kind of message, got 9" in refusal(data[:5] + b"\x09" + data[6:])
 
 

@@ -1,7 +1,7 @@
 """Messages to bytes and back: version, limits, validation. It knows no socket.
 
-One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind), then the body of its kind. Sound
-travels as float32, so that a replayed or live frame is the very frame that was cut.
+One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, when it was sent), then the body of
+its kind. Sound travels as float32, so that a replayed or live frame is the very frame that was cut.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROPHONES, ClockState, Frame, Mark
 
-VERSION: Final = 1
+VERSION: Final = 2
 
 MAX_NAME_BYTES: Final = 64
 """Longest array or node name: the site file allows no longer site, and a header must stay a header."""
@@ -40,7 +40,9 @@ MAX_MESSAGE_BYTES: Final = 256 + 4 * MAX_MICROPHONES * MAX_FRAME_SAMPLES
 """The largest message there can be: a frame of 16 channels."""
 
 _MAGIC: Final = b"LSSL"
-_HEAD: Final = struct.Struct("<4sBB")
+_HEAD: Final = struct.Struct("<4sBBq")
+_SENT: Final = struct.Struct("<q")
+_SENT_AT: Final = _HEAD.size - _SENT.size
 _FRAME: Final = struct.Struct("<BQqqdd?BI")  # name length, sequence, raster, time, rate, power, active, channels, n
 _MARK: Final = struct.Struct("<BQqddQQdBB")  # name length, sequence, raster, powers, overflows, lost, drift, clock, K
 _CLOCK_STATES: Final = tuple(ClockState)
@@ -121,7 +123,7 @@ def decode(data: bytes) -> WireMessage:
         raise WireError(f"message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
     if len(data) < _HEAD.size:
         raise WireError(f"message of {len(data)} bytes: expected at least a header of {_HEAD.size}")
-    magic, version, kind = _HEAD.unpack_from(data)
+    magic, version, kind, _ = _HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise WireError(f"expected a message of livessl beginning with {_MAGIC!r}, got {magic!r}")
     if version != VERSION:
@@ -136,8 +138,18 @@ def decode(data: bytes) -> WireMessage:
     raise WireError(f"expected a known kind of message, got {kind}")
 
 
+def stamped(data: bytes, sent_ns: int) -> bytes:
+    """The same message, sent at that site time by the sender's clock; 0, as encoded, says nothing."""
+    return b"".join([data[:_SENT_AT], _SENT.pack(sent_ns), data[_HEAD.size :]])
+
+
+def sent_ns(data: bytes) -> int:
+    """When a message that decodes was sent, by the sender's clock; 0 where it does not say."""
+    return int(_SENT.unpack_from(data, _SENT_AT)[0])
+
+
 def _head(kind: int) -> bytes:
-    return _HEAD.pack(_MAGIC, VERSION, kind)
+    return _HEAD.pack(_MAGIC, VERSION, kind, 0)
 
 
 def _encode_frame(frame: Frame) -> bytes:

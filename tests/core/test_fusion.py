@@ -196,6 +196,7 @@ def test_two_arrays_locate_together(located: SrpPhat) -> None:
     # out when the hang-over has been seen to be quiet: the interval 15 + 6 ends at 22
     assert when == 16 + HANG_OVER
     assert event.latency_s == pytest.approx(HANG_OVER * 0.05)
+    assert event.complete_ns - event.end_ns == HANG_OVER * FRAME_NS
     for contribution, spec in zip(event.contributions, (NORTH, SOUTH), strict=True):
         assert contribution.array == spec.name
         assert contribution.active_s == pytest.approx(0.3)
@@ -457,6 +458,7 @@ def test_updates_come_only_while_there_is_sound() -> None:
     assert [update.estimate.arrays for _, update in updates] == [("north",)] * 2 + [("north", "south")] * 3
     # windows of 0.2 s, their middle 0.1 s ago; before the sound there is nothing to use
     assert [update.estimate.time_ns for _, update in updates] == [now_ns(when - 2) for when, _ in updates]
+    assert [update.complete_ns for _, update in updates] == [now_ns(when) for when, _ in updates]
     assert [call["north"] for call in scripted.calls[:-1]] == [[40], [80], [80], [80], [80]]
     windows = [(when, output) for when, output in said if isinstance(output, Window)]
     assert [(when, window.time_ns) for when, window in windows] == [(w, u.estimate.time_ns) for w, u in updates]

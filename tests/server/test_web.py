@@ -9,7 +9,7 @@ import socket
 import sqlite3
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -322,7 +322,7 @@ def test_watchers_get_new_windows() -> None:
         for _ in range(2):
             play(server)
             assert len(socket.recv(timeout=5)) == 48 + 16 * 20
-            with pytest.raises(TimeoutError):
+            with suppress(TimeoutError):
                 while True:
                     socket.recv(timeout=0.3)
 
@@ -377,6 +377,10 @@ def test_metrics(client: httpx.Client) -> None:
     assert value("livessl_sink_failures_total") == 0
     assert value("livessl_messages_refused_total") == 0
     assert value("livessl_uptime_seconds") > 0
+    for stage in ("sent", "received", "located"):
+        assert value("livessl_latency_seconds_count", kind="event", stage=stage) == 2
+        assert value("livessl_latency_seconds_count", kind="update", stage=stage) > 2
+    assert value("livessl_latency_seconds_count", kind="event", stage="delivered") == 0  # nobody listened
     for array in ("north", "south"):
         assert value("livessl_array_up", array=array) == 0
         assert value("livessl_array_age_seconds", array=array) >= 0
@@ -491,6 +495,32 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):
             assert httpx.get(f"{server.url}/api/v1/health").status_code == 503
+
+
+def test_answers_say_where_their_time_went() -> None:
+    """One machine, one clock: every stage is positive, and they add up to what the client sees at least."""
+    with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
+        node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
+        start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
+        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        wait_until(lambda: server.engine.events == 2, "both events")
+        told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
+        now_ns = CLOCK.now_ns()
+        metrics = httpx.get(f"{server.url}/metrics").text
+    answers = [message for message in told if message["kind"] in ("event", "update")]
+    assert {message["kind"] for message in answers} == {"event", "update"}
+    for message in answers:
+        stages = message["latency_stages_s"]
+        assert set(stages) == {"waited", "sent", "received", "located"}
+        assert min(stages.values()) >= 0
+        assert sum(stages.values()) == pytest.approx(message["latency_s"], abs=3e-4)  # each is rounded to 0.1 ms
+        if message["kind"] == "update":
+            assert stages["waited"] == 0
+            assert message["latency_s"] <= (now_ns - utc_ns(message["end_utc"])) / 1e9
+        else:
+            assert stages["waited"] == pytest.approx(0.3)
+    [delivered] = re.findall(r'^livessl_latency_seconds_count{kind="update",stage="delivered"} (\S+)$', metrics, re.M)
+    assert float(delivered) >= sum(message["kind"] == "update" for message in answers)
 
 
 def test_live_filters_kinds(server: Server) -> None:

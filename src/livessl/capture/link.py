@@ -220,7 +220,7 @@ class Link:
 
     def _try_send(self, data: bytes) -> bool:
         try:
-            self._socket.send(data, zmq.NOBLOCK)
+            self._socket.send(wire.stamped(data, self._clock.now_ns()), zmq.NOBLOCK)
         except zmq.Again:
             return False
         self._sent_ns = self._clock.monotonic_ns()

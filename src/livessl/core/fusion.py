@@ -374,7 +374,9 @@ class Fusion:
         estimate = _estimate(found, middle_ns, sounds)
         status, _ = self._judge(estimate)
         loudest = max(float(power.max()) for power in powers.values())
-        update = Update(self._id(event.start), status, estimate, loudest, self._contributions(powers, estimate))
+        contributions = self._contributions(powers, estimate)
+        complete_ns = window.stop * FRAME_NS
+        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
         tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
         return [update, Window(middle_ns, found.evidence), *tracks]
 
@@ -423,6 +425,7 @@ class Fusion:
                 heard_by=tuple(sounds),
                 late_frames=event.late_frames,
                 latency_s=(self._now_ns - end_ns) / 1e9,
+                complete_ns=(event.closed + 1) * FRAME_NS,
             )
         ]
 

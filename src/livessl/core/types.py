@@ -324,6 +324,7 @@ class Update:
     estimate: Estimate
     power: float
     contributions: tuple[Contribution, ...] = ()
+    complete_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,6 +355,8 @@ class Event:
         Frames that came after their window had closed.
     latency_s : float
         From the end of the sound to this answer.
+    complete_ns : int
+        Site time at which all had happened that the answer waits for: the sound, and the quiet that ends it.
     """
 
     id: str
@@ -368,6 +371,7 @@ class Event:
     heard_by: tuple[str, ...] = ()
     late_frames: int = 0
     latency_s: float = 0.0
+    complete_ns: int = 0
 
     @property
     def duration_s(self) -> float:

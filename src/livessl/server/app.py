@@ -98,10 +98,11 @@ class Server:
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish, method)
             undo.pop_all()
-        app = create_app(site, self.engine, self._hub, self._store, self._sinks, tokens)
+        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, tokens)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
+                ws="websockets-sansio",  # the quickest to send many small messages
                 log_level="warning",
                 http="h11",  # the one that limits a request's head
                 h11_max_incomplete_event_size=MAX_HEAD_BYTES,
@@ -162,6 +163,7 @@ class Server:
             await asyncio.sleep(EXPIRE_S)
 
     def _publish(self, message: JsonObject) -> None:
+        told_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
         if message["kind"] == "event":
             self._sinks.take(message)
             if self._on_event is not None:
@@ -170,7 +172,7 @@ class Server:
         if loop is None:
             return
         try:
-            loop.call_soon_threadsafe(self._hub.publish, message)
+            loop.call_soon_threadsafe(self._hub.publish, message, told_ns)
         except RuntimeError:  # the loop has just closed: nobody is left to tell
             _log.debug("a message came after the end")
 

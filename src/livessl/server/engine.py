@@ -12,7 +12,8 @@ from livessl.clock import Clock, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayStatus
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
-from livessl.messages import JsonObject, Messages, array_status
+from livessl.messages import JsonObject, Messages, Stages, array_status
+from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Joined, Left, Receiver
 from livessl.server.refusals import Refusals
@@ -74,6 +75,7 @@ class Engine:
         self.events = 0
         self.unkept = 0
         self.maps = Maps(clock)
+        self.latency = Latency()
         self._begin()
         self._receiver = Receiver(site, clock)
 
@@ -254,7 +256,7 @@ class Engine:
             return
         for output in outputs:
             if isinstance(output, Event):
-                event = self._messages.event(output)
+                event = self._messages.event(output, self._stages(output, "event"))
                 try:
                     self._store.add(event, output.start_ns)
                 except StoreError as error:  # better to lose the history than the present
@@ -263,11 +265,20 @@ class Engine:
                 self.events += 1
                 self._publish(event)
             elif isinstance(output, Update):
-                self._publish(self._messages.update(output))
+                self._publish(self._messages.update(output, self._stages(output, "update")))
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
                 self.maps.show(output, self._fusion.power_maps)
+
+    def _stages(self, answer: Update | Event, kind: str) -> Stages | None:
+        """Where an answer's time went; a recording's was long ago."""
+        if self._replay_now_ns is not None:
+            return None
+        stages = self._receiver.arrivals.stages(answer, self._clock.now_ns())
+        if stages is not None:
+            self.latency.located(kind, stages)
+        return stages
 
     def _keep_track(self, message: JsonObject, track: Track) -> None:
         with self._lock:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from livessl.messages import API_VERSION, JsonObject
+from livessl.messages import API_VERSION, JsonObject, json_text
+
+LAGGING: Final = 32
+"""A client so many messages behind, a second of one sound, is told states only as they are now: what a newer message
+of the same sound, track, or of the arrays says again is left out."""
 
 BACKLOG: Final = 256
-"""Messages a client may lag by: some ten seconds of updates. Beyond it the oldest are dropped and the client told."""
+"""Messages a client may lag by. Beyond it the oldest are dropped, events last, and the client told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,27 +45,73 @@ class Filter:
         return self.zone is None or "zones" not in message or self.zone in message["zones"]
 
 
+class Told:
+    """A numbered message on its way to the subscribers: one object for all of them, one text.
+
+    Parameters
+    ----------
+    message : JsonObject
+        With its version and number.
+    told_ns : int or None
+        When it was told, by the clock that nobody sets, where its way to the clients is to be measured.
+    """
+
+    __slots__ = ("_text", "message", "told_ns")
+
+    def __init__(self, message: JsonObject, told_ns: int | None = None) -> None:
+        self.message = message
+        self.told_ns = told_ns
+        self._text: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The message as JSON."""
+        if self._text is None:
+            self._text = json_text(self.message)
+        return self._text
+
+    @property
+    def subject(self) -> Hashable | None:
+        """What the message gives the state of: a later one of the same subject replaces it. Events are no states."""
+        kind = self.message["kind"]
+        return None if kind == "event" else (kind, self.message.get("event_id") or self.message.get("id"))
+
+
 @dataclass(slots=True, eq=False)
 class Subscription:
-    """One client's queue."""
+    """One client's queue: everything, in order, as long as the client keeps up; then states only as they are now."""
 
     wanted: Filter
-    _waiting: deque[JsonObject] = field(default_factory=deque)
+    _waiting: OrderedDict[int, Told] = field(default_factory=OrderedDict)
+    _newest: dict[Hashable, int] = field(default_factory=dict)
     _news: asyncio.Event = field(default_factory=asyncio.Event)
     _missed: int = 0
 
-    def offer(self, message: JsonObject) -> None:
-        """Queue a message; on a full queue the oldest one that is no event goes, else the oldest."""
-        if not self.wanted.passes(message):
-            return
-        if len(self._waiting) >= BACKLOG:
-            victim = next((k for k, old in enumerate(self._waiting) if old["kind"] != "event"), 0)
-            del self._waiting[victim]
-            self._missed += 1
-        self._waiting.append(message)
+    def offer(self, seq: int, told: Told) -> bool:
+        """Queue a message; whether another one had to go for it."""
+        if not self.wanted.passes(told.message):
+            return False
+        gone = len(self._waiting) >= LAGGING and self._make_room(told.subject)
+        self._waiting[seq] = told
+        if told.subject is not None:
+            self._newest[told.subject] = seq
         self._news.set()
+        return gone
 
-    async def next(self) -> JsonObject:
+    def _make_room(self, subject: Hashable | None) -> bool:
+        """Drop the older state of the same subject; of a full queue the oldest state, else the oldest event."""
+        older = None if subject is None else self._newest.get(subject)
+        if older is not None:
+            del self._waiting[older]
+        elif len(self._waiting) >= BACKLOG:
+            victim = min(self._newest.values(), default=next(iter(self._waiting)))
+            self._forget(self._waiting.pop(victim), victim)
+            self._missed += 1
+        else:
+            return False
+        return True
+
+    async def next(self) -> Told:
         """The next message, waiting for one; first of all how many were missed."""
         while not self._waiting:
             self._news.clear()
@@ -69,8 +119,14 @@ class Subscription:
         if self._missed:
             missed, self._missed = self._missed, 0
             reason = f"this client reads too slowly; {missed} messages were dropped, events last"
-            return {"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason}
-        return self._waiting.popleft()
+            return Told({"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason})
+        seq, told = self._waiting.popitem(last=False)
+        self._forget(told, seq)
+        return told
+
+    def _forget(self, told: Told, seq: int) -> None:
+        if told.subject is not None and self._newest.get(told.subject) == seq:
+            del self._newest[told.subject]
 
 
 class Hub:
@@ -79,6 +135,8 @@ class Hub:
     def __init__(self) -> None:
         self._subscriptions: set[Subscription] = set()
         self.last_seq = 0
+        self.superseded = 0
+        """Messages that a slow client never got, for a newer one of the same thing or for want of room."""
 
     @property
     def clients(self) -> int:
@@ -95,9 +153,9 @@ class Hub:
         """Receive no more."""
         self._subscriptions.discard(subscription)
 
-    def publish(self, message: JsonObject) -> None:
+    def publish(self, message: JsonObject, told_ns: int | None = None) -> None:
         """Number a message and offer it to everyone."""
         self.last_seq += 1
-        numbered = {"v": API_VERSION, "seq": self.last_seq, **message}
+        told = Told({"v": API_VERSION, "seq": self.last_seq, **message}, told_ns)
         for subscription in self._subscriptions:
-            subscription.offer(numbered)
+            self.superseded += subscription.offer(self.last_seq, told)

@@ -18,6 +18,7 @@ from livessl.core.types import Message
 from livessl.keys import server_keys
 from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
+from livessl.server.latency import Arrival, Arrivals
 from livessl.server.refusals import Refusals
 
 POLL_MS: Final = 20
@@ -76,6 +77,7 @@ class Receiver:
     def __init__(self, site: Site, clock: Clock) -> None:
         keys = server_keys(site)
         self.ingest = Ingest(site)
+        self.arrivals = Arrivals()
         self.refusals = Refusals(clock)
         self.enrolled = [] if keys is None else sorted(keys.nodes)
         self._guarded = keys is not None
@@ -150,6 +152,7 @@ class Receiver:
             if arrival.left is not None:
                 self._put(Left(arrival.left))
             if arrival.message is not None:
+                self.arrivals.note(arrival.message.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
                 self._put(arrival.message)
             if arrival.reply is not None:
                 self._reply(routing_id, arrival.reply)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -18,14 +17,15 @@ from prometheus_client.registry import Collector
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
-from livessl.clock import utc_ns, utc_text
+from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site, is_loopback
 from livessl.core.types import FRAME_S
 from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
 from livessl.server.auth import HEALTH, Gate
 from livessl.server.engine import Engine
-from livessl.server.hub import Filter, Hub, Subscription
+from livessl.server.hub import Filter, Hub, Subscription, Told
+from livessl.server.latency import Latency
 from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
 from livessl.server.png import map_png
 from livessl.server.sinks import Sinks
@@ -50,7 +50,7 @@ _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: 
 
 
 def create_app(
-    site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks, tokens: Tokens | None = None
+    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, tokens: Tokens | None = None
 ) -> FastAPI:
     """The application around a running engine, open to anyone or to those who have a token."""
     app = FastAPI(
@@ -83,7 +83,7 @@ def create_app(
     _add_access_route(app, engine, tokens)
     _add_event_routes(app, site, store)
     _add_map_route(app, site, engine)
-    _add_live_route(app, site, engine, hub)
+    _add_live_route(app, site, clock, engine, hub)
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
@@ -184,6 +184,7 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
 
     registry = CollectorRegistry()
     registry.register(_Metrics(engine, hub, store, sinks))
+    registry.register(engine.latency.histogram)
 
     @app.get("/metrics", tags=["state"], response_class=PlainTextResponse)
     def get_metrics() -> PlainTextResponse:
@@ -301,7 +302,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         return Response(body, media_type="application/octet-stream", headers=headers)
 
 
-def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
+def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub: Hub) -> None:
     @app.websocket("/api/v1/live")
     async def live(
         socket: WebSocket, kinds: str | None = None, min_confidence: str = "0", zone: str | None = None
@@ -325,7 +326,7 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
             "arrays": await asyncio.to_thread(engine.arrays),
         }
         try:
-            await _while_connected(socket, _send_all(socket, subscription, hello))
+            await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
         finally:
             hub.unsubscribe(subscription)
 
@@ -389,13 +390,12 @@ def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None
     return Filter(chosen, least, zone)
 
 
-async def _send_all(socket: WebSocket, subscription: Subscription, first: JsonObject) -> None:
-    message = first
-    while True:
-        text = json.dumps(message, separators=(",", ":"))
-        if not await _sent(socket.send_text(text)):
-            return
-        message = await subscription.next()
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, clock: Clock, latency: Latency) -> None:
+    told = first
+    while await _sent(socket.send_text(told.text)):
+        if told.told_ns is not None:
+            latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+        told = await subscription.next()
 
 
 async def _send_pictures(
@@ -418,7 +418,8 @@ async def _send_pictures(
 async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
     """Whether a client took what it was sent, in time."""
     try:
-        await asyncio.wait_for(sending, SEND_TIMEOUT_S)
+        async with asyncio.timeout(SEND_TIMEOUT_S):
+            await sending
     except (TimeoutError, WebSocketDisconnect, RuntimeError):
         return False
     return True
@@ -442,6 +443,11 @@ class _Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", self._engine.uptime_s())
         yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
+        yield GaugeMetricFamily("livessl_map_watchers", "Subscribers to maps.", self._engine.maps.watchers)
+        yield CounterMetricFamily("livessl_maps_drawn", "Drawings of maps.", self._engine.maps.drawings)
+        yield CounterMetricFamily(
+            "livessl_messages_superseded", "Messages that slow subscribers never got.", self._hub.superseded
+        )
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
         yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())

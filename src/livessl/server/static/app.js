@@ -35,7 +35,7 @@ const state = {
   unread: null,     // its message, until it is read out
   mark: null,       // the event that is pointed at or pinned, as a marker
   tracks: new Map(),
-  latencies: [],
+  latencies: { update: [], event: [] }, // messages that say how long they took, the newest last
   maps: null,       // { floor, side, bornMs, time }
   images: null,     // { floor, side, bornMs } coloured, each { canvas, bounds }
   missed: 0,
@@ -94,6 +94,7 @@ const HEARD = {
     const shown = marker(message, bornMs);
     state.current.set(message.event_id, shown);
     if (shown.position) leaveTrail(shown);
+    learnLatency("update", message);
     newest(message, shown);
   },
   event({ v, seq, ...message }) { // what is left is the event as it is stored
@@ -103,7 +104,7 @@ const HEARD = {
     state.events.add(message.id);
     eventList.add(message, serverNow());
     if (shown.position && shown.status === "located") leaveTrail(shown);
-    learnLatency(message);
+    learnLatency("event", message);
     newest(message, shown);
     announce(message);
   },
@@ -172,7 +173,7 @@ async function loadEvents(tries = 0) {
     if (events.length > 0 && (state.last === null || born(events[0], events[0].duration_s, false) > state.last.bornMs + LATE_MS)) {
       newest(events[0], marker(events[0], born(events[0], events[0].duration_s, false)));
     }
-    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.length < TRAIL) learnLatency(event);
+    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.event.length < TRAIL) learnLatency("event", event);
     redraw();
   } catch (error) {
     console.warn("livessl: events:", error.message);
@@ -221,11 +222,26 @@ function newest(message, shown) {
   state.unread = { kind: "event", ...message }; // read out with the next tick, so that numbers and plans agree
 }
 
-function learnLatency({ latency_s: latency }) {
-  if (!Number.isFinite(latency)) return;
-  state.latencies = [...state.latencies, latency].slice(-TRAIL);
-  const sorted = [...state.latencies].sort((a, b) => a - b);
-  write(find("vital-latency"), `${number(sorted[sorted.length >> 1])} s`);
+function median(values) {
+  return values.sort((a, b) => a - b)[values.length >> 1];
+}
+
+function milliseconds(seconds) {
+  return `${number(1000 * seconds, 0)} ms`;
+}
+
+/** The middle one of the last answers: while a sound lasts, and after it has ended; where the time goes, on pointing. */
+function learnLatency(kind, message) {
+  if (!Number.isFinite(message.latency_s)) return;
+  state.latencies[kind] = [...state.latencies[kind], message].slice(-TRAIL);
+  const { update, event } = state.latencies;
+  const told = Object.entries({ live: update, event }).filter(([, heard]) => heard.length > 0);
+  write(find("vital-latency"), told.map(([name, heard]) => `${name} ${milliseconds(median(heard.map((one) => one.latency_s)))}`).join(" · "));
+  const parts = told.map(([name, heard]) => [name, heard.map((one) => one.latency_stages_s).filter(Boolean)]).filter(([, stages]) => stages.length > 0);
+  find("vital-latency").title = parts.map(([name, stages]) => {
+    const each = Object.keys(stages[0]).map((stage) => `${stage} ${milliseconds(median(stages.map((one) => one[stage])))}`);
+    return `${name}: ${each.join(", ")}`;
+  }).join("\n");
 }
 
 function announce(event) {

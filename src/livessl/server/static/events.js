@@ -156,6 +156,12 @@ export function percent(fraction) {
   return Number.isFinite(fraction) ? `${Math.round(100 * fraction)} %` : "–";
 }
 
+/** How long the answer took after the sound, and where that went. */
+function latency({ latency_s: total, latency_stages_s: stages }) {
+  const each = stages ? Object.entries(stages).map(([stage, seconds]) => `${stage} ${number(seconds, 3)}`).join(" + ") : "";
+  return `${number(total, 3)} s${each && ` = ${each}`}`;
+}
+
 function details(event) {
   const pair = (name, value, className) => (value ? el("div", { className }, el("dt", { text: name }), el("dd", { text: value })) : null);
   const sigmas = event.covariance_m2?.map((row, axis) => `${"xyz"[axis]} ${number(Math.sqrt(Math.max(0, row[axis])))}`).join("  ");
@@ -167,7 +173,7 @@ function details(event) {
     pair("zones", event.zones?.join(", ")),
     pair("began", event.time_utc ?? `${number(event.start_s, 3)} s into the recording`, "wide"),
     pair("lasted", `${number(event.duration_s, 2)} s`),
-    pair("latency", `${number(event.latency_s, 3)} s`),
+    pair("latency", latency(event), "wide"),
     pair("late frames", event.late_frames ? String(event.late_frames) : null),
     pair("method", event.method),
     pair("id", event.id, "wide"));
