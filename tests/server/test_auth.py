@@ -41,8 +41,8 @@ class Secured:
     def headers(self, role: Role | None) -> dict[str, str]:
         return {} if role is None else {"Authorization": f"Bearer {self.tokens[role]}"}
 
-    def live(self, **more: Any) -> Any:
-        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/live", open_timeout=5, **more)
+    def live(self, path: str = "live", **more: Any) -> Any:
+        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=5, **more)
 
     def routes(self) -> set[str]:
         """All that there is, from the server's own description, with examples for what is in braces."""
@@ -128,9 +128,10 @@ def test_live_with_a_token(secured: Secured, role: Role) -> None:
         {"subprotocols": [Subprotocol("livessl"), Subprotocol("livessl.token.wrong")]},
     ],
 )
-def test_live_without_a_token_is_not_opened(secured: Secured, more: dict[str, Any]) -> None:
+@pytest.mark.parametrize("path", ["live", "map", "nothing"])
+def test_socket_without_a_token_is_not_opened(secured: Secured, path: str, more: dict[str, Any]) -> None:
     with pytest.raises(InvalidStatus) as caught:
-        secured.live(**more)
+        secured.live(path, **more)
     assert caught.value.response.status_code == 403
 
 

@@ -294,6 +294,19 @@ def test_silent_connections_keep_nobody_out(folder: Path) -> None:
                 each.close()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_guard_that_fails_lets_nobody_in_and_ends_the_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> list[bytes]:
+        raise RuntimeError("out of order")
+
+    monkeypatch.setattr("livessl.server.guard._answer", fail)
+    with receiving(folder) as receiver, linked(receiver.endpoint, keys_of(folder, "lab-pc")) as link:
+        until(link, lambda: receiver.failure is not None, "the failure")
+        assert str(receiver.failure) == "out of order"
+        assert not link.connected
+        assert taken(receiver) == []
+
+
 def test_server_whose_keys_are_missing_does_not_start(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="make it with `livessl keys server`"):
         Receiver(keyed(tmp_path), CLOCK)

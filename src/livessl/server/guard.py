@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import zmq
@@ -31,7 +31,11 @@ _log = logging.getLogger(__name__)
 
 
 def guard(
-    context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: ServerKeys, refusals: Refusals
+    context: zmq.Context[zmq.Socket[bytes]],
+    socket: zmq.Socket[bytes],
+    keys: ServerKeys,
+    refusals: Refusals,
+    failed: Callable[[BaseException], None],
 ) -> None:
     """Let only enrolled nodes connect to a socket, from before it is bound until its context ends.
 
@@ -43,6 +47,8 @@ def guard(
     keys : ServerKeys
     refusals : Refusals
         Told of everyone who is turned away.
+    failed : callable
+        Gets what ends the thread before its time: from then on nobody is let in.
     """
     socket.setsockopt(zmq.CURVE_SERVER, 1)
     socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
@@ -54,10 +60,16 @@ def guard(
     asked.setsockopt(zmq.LINGER, 0)
     asked.bind(ZAP_ENDPOINT)
     names = {key: name for name, key in keys.nodes.items()}
-    threading.Thread(target=_run, args=(asked, monitor, names, refusals), name="guard", daemon=True).start()
+    threading.Thread(target=_run, args=(asked, monitor, names, refusals, failed), name="guard", daemon=True).start()
 
 
-def _run(asked: zmq.Socket[bytes], monitor: zmq.Socket[bytes], names: Mapping[bytes, str], refusals: Refusals) -> None:
+def _run(
+    asked: zmq.Socket[bytes],
+    monitor: zmq.Socket[bytes],
+    names: Mapping[bytes, str],
+    refusals: Refusals,
+    failed: Callable[[BaseException], None],
+) -> None:
     poller = zmq.Poller()
     poller.register(asked, zmq.POLLIN)
     poller.register(monitor, zmq.POLLIN)
@@ -73,6 +85,10 @@ def _run(asked: zmq.Socket[bytes], monitor: zmq.Socket[bytes], names: Mapping[by
                         refusals.note(DOOR, "a peer", _BROKEN[event])
         except zmq.ContextTerminated:
             _log.debug("the guard ends with its context")
+        except BaseException as error:
+            _log.exception("the guard of the nodes' socket has failed")
+            failed(error)
+            raise
 
 
 def _answer(request: list[bytes], names: Mapping[bytes, str], refusals: Refusals) -> list[bytes]:

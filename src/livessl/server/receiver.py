@@ -91,7 +91,7 @@ class Receiver:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
         if keys is not None:
-            guard(self._context, self._socket, keys, self.refusals)
+            guard(self._context, self._socket, keys, self.refusals, self._fail)
         try:
             self._socket.bind(site.server.bind)
         except zmq.ZMQError as error:
@@ -134,9 +134,12 @@ class Receiver:
                 for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
                     self._reply(routing_id, ack)
         except BaseException as error:
-            self.failure = error
+            self._fail(error)
             _log.exception("the receiving thread has failed")
             raise
+
+    def _fail(self, error: BaseException) -> None:
+        self.failure = error
 
     def _drain(self) -> None:
         for _ in range(QUEUE_MESSAGES):
