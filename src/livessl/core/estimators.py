@@ -27,12 +27,16 @@ class Sound:
 
 @dataclass(frozen=True, slots=True)
 class Localization:
-    """A place, how sure, and what it was read from: the arrays' evidence, in the order of their names."""
+    """A place, how sure, and what it was read from: the arrays' evidence, in the order of their names.
+
+    `proven` says that no node of the grid is higher; else the search was given up, for nothing stood out.
+    """
 
     position_m: FloatArray
     covariance_m2: FloatArray
     confidence: float
     evidence: tuple[HeardBy, ...]
+    proven: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +128,7 @@ class SrpPhat:
             peaks.laplace_covariance_m2(functional, evidence, position, grid),
             peaks.confidence(find, found[0], grid, position),
             evidence,
+            found[0].proven,
         )
 
     def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
