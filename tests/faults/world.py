@@ -287,7 +287,9 @@ class World:
         active = frozenset(r for of, rasters in self.sounds for r in rasters if of == array)
         spool = Spool(None if self._spools is None else self._spools / name)
         hello = wire.Hello(name, f"run-{self._runs}", {array: float(RATE_HZ)})
-        self.nodes[name] = Node(name, Microphones(array, active), Link("", hello, self.clock, spool, Cable(self, name)))
+        self.nodes[name] = Node(
+            name, Microphones(array, active), Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
+        )
         if self.down[name]:
             self.down[name][-1] = (self.down[name][-1][0], self.raster)
 

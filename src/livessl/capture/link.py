@@ -18,6 +18,7 @@ from livessl import wire
 from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
 from livessl.core.types import Frame, Mark, Message
+from livessl.keys import NodeKeys
 
 BACKLOG_FRAMES: Final = 16
 """Kept frames on their way at a time: what live sound may have to wait behind, a quarter of a second at 3 MB/s."""
@@ -35,9 +36,17 @@ _log = logging.getLogger(__name__)
 
 
 class Dealer:
-    """The socket: it connects, and reconnects, by itself."""
+    """The socket: it connects, and reconnects, by itself.
 
-    def __init__(self, endpoint: str) -> None:
+    Parameters
+    ----------
+    endpoint : str
+        The server's ZeroMQ address.
+    keys : NodeKeys or None
+        Ours and the server's; None where the site uses none.
+    """
+
+    def __init__(self, endpoint: str, keys: NodeKeys | None = None) -> None:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -46,6 +55,10 @@ class Dealer:
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        if keys is not None:
+            self._socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
+            self._socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
+            self._socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
         self._socket.connect(endpoint)
 
     def send(self, data: bytes) -> bool:
@@ -87,6 +100,8 @@ class Link:
     hello : Hello
         Who we are.
     clock : Clock
+    keys : NodeKeys or None
+        Ours and the server's; None where the site uses none.
     spool : Spool or None
         Where frames are kept; None keeps them in memory. It is closed with the link.
     dealer : Dealer or None
@@ -98,6 +113,8 @@ class Link:
         endpoint: str,
         hello: wire.Hello,
         clock: Clock,
+        keys: NodeKeys | None = None,
+        *,
         spool: Spool | None = None,
         dealer: Dealer | None = None,
     ) -> None:
@@ -105,7 +122,12 @@ class Link:
         self._clock = clock
         self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
-        self._dealer = Dealer(endpoint) if dealer is None else dealer
+        self._dealer = Dealer(endpoint, keys) if dealer is None else dealer
+        self._hint = (
+            ""
+            if keys is None
+            else " And are the keys right: is this node's enrolled there, is server.public the server's?"
+        )
         self._marks: dict[str, Mark] = {}  # while the server is away
         self._live: deque[Kept | Mark] = deque()
         self._backlog = deque(self._spool.frames())
@@ -168,8 +190,9 @@ class Link:
             elif not self._missed and now_ns - self._begun_ns >= SILENT_NS:
                 self._missed = True
                 _log.warning(
-                    "no server answers at %s; keeping sound and trying on. Is `livessl serve` running there?",
+                    "no server answers at %s; keeping sound and trying on. Is `livessl serve` running there?%s",
                     self.endpoint,
+                    self._hint,
                 )
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()

@@ -19,6 +19,7 @@ from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
+from livessl.server.refusals import Refusals
 from livessl.server.store import Store, StoreError
 
 WAIT_S: Final = 0.02
@@ -100,13 +101,23 @@ class Engine:
         self.unkept = 0
         self.maps = Maps(clock)
         self.latency = Latency()
-        self._begin(site.arrays, store.settled(site.site))
+        self._begin_live()
         self._receiver = Receiver(site, clock)
 
     @property
     def endpoint(self) -> str:
         """Where nodes connect to."""
         return self._receiver.endpoint
+
+    @property
+    def refusals(self) -> Refusals:
+        """Who was turned away, by nodes' and clients' doors."""
+        return self._receiver.refusals
+
+    @property
+    def enrolled(self) -> list[str]:
+        """Nodes whose keys are let in; empty where the site uses none."""
+        return self._receiver.enrolled
 
     @property
     def failure(self) -> BaseException | None:
@@ -185,6 +196,9 @@ class Engine:
             described["reason"] = problem or "its node is there, but no sound comes from its device"
         return described
 
+    def _begin_live(self) -> None:
+        self._begin([spec.name for spec in self._site.processed], self._store.settled(self._site.site))
+
     def _begin(self, arrays: Iterable[str], settled: int | None) -> None:
         """A clean slate: nothing of another time may leak into this one."""
         self._settling = Settling(self._site.make_fusion(self._method), arrays, settled)
@@ -253,7 +267,7 @@ class Engine:
                 if hello.replay:
                     self._begin(hello.arrays, None)
                 else:
-                    self._begin(self._site.arrays, self._store.settled(self._site.site))
+                    self._begin_live()
                 self._replay_now_ns = 0 if hello.replay else None
                 self._replaying = hello.replay
                 self._replay_heard_ns = self._clock.monotonic_ns()
