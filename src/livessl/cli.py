@@ -30,6 +30,7 @@ from livessl.capture.recorded import (
     repeated,
     span_ns,
 )
+from livessl.capture.spool import SpoolError
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import (
     ConfigError,
@@ -70,6 +71,19 @@ WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
+_FAILURES: Final = (
+    BindError,
+    SinkError,
+    SpoolError,
+    StoreError,
+    UndeliveredError,
+    demo.DemoError,
+    figure.FigureError,
+    OSError,
+)
+"""What may go wrong at run time, each with a message of its own."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code.
 
@@ -90,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
+    except _FAILURES as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
