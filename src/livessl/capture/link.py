@@ -81,7 +81,9 @@ class Dealer:
         self._socket.poll(milliseconds)
 
     def close(self, linger_ms: int) -> None:
-        """End the connection; what was handed over has so long to go out."""
+        """End the connection, once; what was handed over has so long to go out."""
+        if self._socket.closed:
+            return
         self._socket.setsockopt(zmq.LINGER, linger_ms)
         self._socket.close()
         self._context.term()
