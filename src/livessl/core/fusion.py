@@ -178,6 +178,7 @@ class _OpenEvent:
     last_active: int
     closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
+    ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
 
 
 class Fusion:
@@ -214,7 +215,7 @@ class Fusion:
         self._event: _OpenEvent | None = None
         self._heard_until = -(2**63)
         self._now_ns = 0
-        self._told_until = -(2**63)
+        self._told_until = self._closing_until = -(2**63)
         self.unknown_arrays = 0
 
     def twin(self) -> Fusion:
@@ -226,9 +227,9 @@ class Fusion:
         """Take it that everything before this raster interval has been told."""
         self._heard_until = raster
 
-    def leave_out(self, raster: int) -> None:
-        """Tell no event of sound before this raster interval: another has told it."""
-        self._told_until = raster
+    def leave_out(self, told: int, closing: int) -> None:
+        """Tell no event that another fusion tells: of sound before `told`, or that comes to its end by `closing`."""
+        self._told_until, self._closing_until = told, closing
 
     @property
     def closed(self) -> int | None:
@@ -396,12 +397,14 @@ class Fusion:
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
+            event.ended = True
             return self._finish()
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
             outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
+            event.ended = True
             outputs += self._finish()
         return outputs
 
@@ -436,7 +439,7 @@ class Fusion:
         sounds: dict[str, Sound] = {}
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
-        if event.last_active < self._told_until:
+        if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
             return []
         first, last = event.last_active, event.start
         for name, stream in self._streams.items():

@@ -22,8 +22,8 @@ HOLD_NS: Final = 600_000_000_000
 HOLD_BYTES: Final = 256 * 1024 * 1024
 """Sound that waits, at most: five minutes of one array that never falls silent."""
 
-PIECE: Final = 200
-"""Intervals settled at a time: ten seconds, well within the age that a fusion accepts."""
+PIECE: Final = 40
+"""Intervals settled at a time: two seconds. After a piece with events live sound has its turn."""
 
 _NEVER: Final = -(2**62)
 _ALWAYS: Final = 2**62
@@ -112,19 +112,21 @@ class Settling:
         """Take in messages, in any order between arrays; return what there is to tell."""
         if self.settled is not None and self.settled * FRAME_NS - now_ns > LATEST_NS:
             self._begin(None)  # the server's clock was set back: what was settled lies in the future now
-            self.live.leave_out(_NEVER)
+            self.live.leave_out(_NEVER, _NEVER)
         live = [message for message in messages if self._take(message, now_ns)]
-        settled = self._settle(self._frontier(now_ns), now_ns)
-        if self.settled is not None:
-            self.live.leave_out(self.settled)
+        frontier = self._frontier(now_ns)
+        settled = self._settle(frontier, now_ns)
+        self.live.leave_out(_NEVER if self.settled is None else self.settled, frontier)
         return [*self.live.step(live, now_ns), *settled]
 
     def flush(self, now_ns: int) -> list[Output | Settled]:
         """End of the recording: settle everything without waiting for anyone."""
-        settled = self._settle(self._end(), now_ns)
-        if self.settled is not None:
-            self.live.leave_out(self.settled)
-        return [*self.live.flush(now_ns), *settled]
+        end = self._end()
+        self.live.leave_out(end, end)
+        outputs: list[Output | Settled] = [*self.live.flush(now_ns)]
+        while self._newest != _NEVER and (self._position is None or self._position < end):
+            outputs += self._settle(end, now_ns)
+        return outputs
 
     def _begin(self, settled: int | None) -> None:
         self._slow = self.live.twin()
@@ -138,6 +140,7 @@ class Settling:
         self._held: deque[tuple[int, int, int]] = deque()  # when it came, its raster index, its bytes
         self._bytes = 0
         self._late: set[int] = set()
+        self._forgotten: int | None = None
         for source in self._sources.values():
             source.seen.clear()
             source.live_until = _NEVER
@@ -208,7 +211,7 @@ class Settling:
         if self._position is None:
             self._position = min(self._waiting[0][0] if self._waiting else frontier, frontier) - 1
         events: list[Event] = []
-        while self._position < frontier:
+        while self._position < frontier and not events:
             end = min(frontier, self._piece_end(self._position))
             batch: list[Message] = []
             while self._waiting and self._waiting[0][0] <= end:
@@ -232,8 +235,9 @@ class Settling:
 
     def _forget(self) -> None:
         settled = self.settled
-        if settled is None:
+        if settled is None or settled == self._forgotten:
             return
+        self._forgotten = settled
         self._late = {raster for raster in self._late if raster >= settled}
         for source in self._sources.values():
             if source.seen:

@@ -345,12 +345,11 @@ class Engine:
 
     def _tell_settled(self, settled: Settled, messages: Messages) -> None:
         """Events that stay: those that are news are told, once they are stored."""
-        before = self._store.provisional(settled.until)
-        in_time = [None if output.late or before else self._stages(output, "event") for output in settled.events]
-        events = [
-            (messages.event(output, stages), output.start_ns)
-            for output, stages in zip(settled.events, in_time, strict=True)
-        ]
+        before = [] if self._replay_now_ns is not None else self._store.provisional(settled.until)
+        events = []
+        for output in settled.events:
+            stages = None if output.late or before else self._stages(output, "event")
+            events.append((messages.event(output, stages), output.start_ns))
         if self._replay_now_ns is not None:
             self._keep_replayed(events)
             return
