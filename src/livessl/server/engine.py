@@ -11,6 +11,7 @@ from livessl import wire
 from livessl.clock import Clock, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayStatus
+from livessl.core.search import warm_up
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
@@ -76,6 +77,7 @@ class Engine:
         self.unkept = 0
         self.maps = Maps(clock)
         self.latency = Latency()
+        warm_up()
         self._begin()
         self._receiver = Receiver(site, clock)
 
