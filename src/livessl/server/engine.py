@@ -16,6 +16,7 @@ from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Joined, Left, Receiver
+from livessl.server.refusals import Refusals
 from livessl.server.store import Store, StoreError
 
 WAIT_S: Final = 0.02
@@ -82,6 +83,16 @@ class Engine:
     def endpoint(self) -> str:
         """Where nodes connect to."""
         return self._receiver.endpoint
+
+    @property
+    def refusals(self) -> Refusals:
+        """Who was turned away, by nodes' and clients' doors."""
+        return self._receiver.refusals
+
+    @property
+    def enrolled(self) -> list[str]:
+        """Nodes whose keys are let in; empty where the site uses none."""
+        return self._receiver.enrolled
 
     @property
     def failure(self) -> BaseException | None:
