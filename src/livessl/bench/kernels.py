@@ -141,7 +141,7 @@ def measure(
     rounds: int = 200,
     arrays: Sequence[int] = (2, 4, 8),
     spacings_m: Sequence[float] = (0.1, 0.05, 0.02),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> KernelReport:
     """Time every case on one thread.
 
