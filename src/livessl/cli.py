@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from livessl import __version__, demo, progress, replay
+from livessl.bench import live as live_bench
 from livessl.capture.devices import DeviceError
 from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
 from livessl.capture.record import Recorder, record_device, record_parts
@@ -36,6 +37,7 @@ from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
 from livessl.plan import design, figure, words
+from livessl.processes import NotStartedError
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
@@ -58,6 +60,17 @@ WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
+_FAILURES: Final = (
+    BindError,
+    NotStartedError,
+    SinkError,
+    StoreError,
+    UndeliveredError,
+    demo.DemoError,
+    figure.FigureError,
+)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code.
 
@@ -78,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
+    except (*_FAILURES, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -202,6 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluation.add_arguments(sub)
 
+    _add_bench(command)
     _add_plan(command)
 
     sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
@@ -211,6 +225,24 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("devices", _devices, "list audio devices", "livessl devices")
     sub.add_argument("--json", action="store_true", help="print the list as JSON")
     return parser
+
+
+def _add_bench(command: Callable[..., Any]) -> None:
+    sub = command(
+        "bench",
+        _bench,
+        "measure how much this machine carries, and how fast it answers",
+        "livessl bench --live --arrays 64 --clients 20 --seconds 30",
+    )
+    sub.add_argument("--live", action="store_true", required=True, help="a server under the load of arrays and clients")
+    sub.add_argument("--arrays", type=_positive, default=4, help="that sound all the time (default 4)")
+    sub.add_argument("--clients", type=_positive, default=4, help="that subscribe to events and updates (default 4)")
+    sub.add_argument("--watchers", type=int, default=0, help="that watch the power map (default none)")
+    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="to measure, after a warm-up (default 20)")
+    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="of the grid (default 0.1)")
+    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="of the simulated room (default 0.3)")
+    sub.add_argument("--spin", action="store_true", help="let a foreign process spin on each core meanwhile")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_plan(command: Callable[..., Any]) -> None:
@@ -254,6 +286,22 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         metavar="ARRAY=1,2,3,4",
         help="channels of the file, from 1, in microphone order",
     )
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    demand = live_bench.Demand(
+        arrays=arguments.arrays,
+        clients=arguments.clients,
+        seconds=arguments.seconds,
+        watchers=arguments.watchers,
+        spacing_m=arguments.spacing,
+        rt60_s=arguments.rt60,
+        spin=arguments.spin,
+    )
+    with progress.counted("measuring", "s") as show:
+        outcome = live_bench.measure(demand, SystemClock(), progress=show)
+    print(json.dumps(outcome.json()) if arguments.json else live_bench.table(outcome))
+    return OK
 
 
 def _demo(arguments: argparse.Namespace) -> int:
