@@ -123,7 +123,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "grid too fine": (
         {"grid.spacing_m": 0.01},
         "grid.spacing_m",
-        r"a grid of 60,000,000 nodes and 12 pairs needs 9,600 MB, allowed are 1,024 MB; use a spacing of 0.022 m",
+        r"a grid of 60,000,000 nodes .* allowed are 50,000,000; use a spacing of 0.011 m or more",
     ),
     "grid inside out": (
         {"grid.bounds_m": [[0, 4], [5, 0], [0, 3]]},
@@ -237,13 +237,13 @@ def test_duplicate_key_names_the_second() -> None:
 
 
 def test_spacing_that_is_suggested_does_pass() -> None:
-    changes: Changes = {"grid.spacing_m": 0.004, "grid.max_memory_mb": 30.0}
+    changes: Changes = {"grid.spacing_m": 0.004}
     [(_, said)] = faults_of(text_of(changes))
     suggested = re.search(r"use a spacing of ([0-9.]+) m", said)
     assert suggested is not None
     spacing_m = float(suggested[1])
     site_of(changes | {"grid.spacing_m": spacing_m})
-    # and it is not needlessly coarse: half of it needs eight times the memory
+    # and it is not needlessly coarse: half of it has eight times the nodes
     faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
 
 
@@ -515,7 +515,7 @@ WHOLE = small(
         "temperature_c": 20.0,
         "activity": {"threshold": 0.1, "floor_factor": 4.0, "min_level_dbfs": -90.0},
         "fusion": {"method": "srp-phat", "min_arrays": 1},
-        "grid": {"spacing_m": 0.5, "bounds_m": [[0, 4], [0, 5], [0, 3]], "max_memory_mb": 100},
+        "grid": {"spacing_m": 0.5, "bounds_m": [[0, 4], [0, 5], [0, 3]]},
         "arrays.north.orientation_deg": {"yaw": 10.0},
         "arrays.west": {"microphones_m": [[1, 1, 1], [1, 2, 1]], "band_hz": [100, 5000]},
         "nodes.player": {"device": {"type": "scene", "rt60_s": 0.3}, "arrays": {"west": [1, 2]}},

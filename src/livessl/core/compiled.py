@@ -45,6 +45,11 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
                     high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
 
 
+def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
+    """What `add_power` wants of the places that nodes look up: these."""
+    return places
+
+
 @_compiled
 def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
     """Add one array's power at every node."""
@@ -53,6 +58,30 @@ def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
         for p in range(table.shape[1]):
             total += values[p, table[node, p]]
         power[node] += weight * total
+
+
+@_compiled
+def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
+    """Summed power at points off the grid."""
+    power = np.zeros(len(points_m))
+    distance = np.empty(len(microphones_m))
+    for n in range(len(points_m)):
+        for m in range(len(microphones_m)):
+            x, y = points_m[n, 0] - microphones_m[m, 0], points_m[n, 1] - microphones_m[m, 1]
+            z = points_m[n, 2] - microphones_m[m, 2]
+            distance[m] = np.sqrt((x * x + y * y) + z * z)
+        for r in range(len(pairs)):
+            lag_s = (distance[pairs[r, 1]] - distance[pairs[r, 0]]) / c_m_s
+            place = (lag_s - first_s[r]) / step_s[r]
+            left = min(max(np.int64(place), 1), last[r])
+            at = np.uint64(start[r] + left)
+            one = np.uint64(1)
+            before, here, after, beyond = values[at - one], values[at], values[at + one], values[at + one + one]
+            share = place - left
+            rest = 1.0 - share
+            curvature = rest * (after - 2.0 * here + before) + share * (beyond - 2.0 * after + here)
+            power[n] += weight[r] * (rest * here + share * after - 0.5 * rest * share * curvature)
+    return power
 
 
 @_compiled

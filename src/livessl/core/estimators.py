@@ -10,10 +10,11 @@ import numpy as np
 
 from livessl.core import peaks
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
-from livessl.core.gcc import GCCPhat, uses_envelope
+from livessl.core.gcc import GCCPhat, microphone_pairs, uses_envelope
 from livessl.core.geometry import Grid
+from livessl.core.search import PeakSearch
 from livessl.core.srp import SRPFunctional, SRPMapper, alias_free_hz
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +85,9 @@ class SrpPhat:
     c_m_s : float
     band_limit : bool or None
         Whether the band is limited per pair and node against spatial aliasing. None is "where it matters": for arrays
-        of which more than half of all pairs and nodes would lose part of the band. On a 0.1 m grid an array of 0.5 m
-        is not among them, and its answer would hardly change; on a 0.5 m grid it is.
+        of which more than half of all pairs and nodes of the map would lose part of the band. On a 0.1 m grid an array
+        of 0.5 m is not among them, and its answer would hardly change; on a 0.5 m grid it is. Where an array's band is
+        limited the peak is read from the map, else it is searched for on the grid, which may be finer.
     """
 
     name = "srp-phat"
@@ -96,43 +98,46 @@ class SrpPhat:
     ) -> None:
         self._arrays = {spec.name: spec for spec in arrays}
         self._grid = grid
+        self._map_grid = map_grid(arrays, grid)
         self._c_m_s = c_m_s
-        self._band_limit = band_limit
+        self._limited = {spec.name: self._limits_band(spec, band_limit) for spec in arrays}
+        self._search = PeakSearch(arrays, grid, c_m_s)
         self._correlators: dict[str, tuple[float, GCCPhat, Sequence[float]]] = {}
         self._mappers: dict[str, tuple[FloatArray, SRPMapper]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
-        correlate, cut_offs_hz = self._correlator(array, sample_rate_hz)
-        self._mapper(self._arrays[array], correlate.pairs, correlate.lags_s, cut_offs_hz)
+        self._correlator(array, sample_rate_hz)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        """Sum the arrays' maps, take the peak, refine it below the grid."""
+        """Find the highest places of the arrays' summed maps, refine them below the grid, take the best."""
         # float sums depend on the order: the answer must not
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
-        fused = self.power_maps(evidence, separately=()).fused
+        in_map = any(self._limited[name] for name in sounds)
+        grid = self._map_grid if in_map else self._grid
+        find = peaks.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
+        found = find(peaks.CANDIDATES)
         functional = SRPFunctional(evidence, self._c_m_s)
-        starts = np.stack([self._grid.node_m(node) for node in peaks.highest_nodes(fused, self._grid)])
-        position, _ = peaks.refine(functional, starts, self._grid)
+        position, _ = peaks.refine(functional, np.stack([grid.node_m(peak.node) for peak in found]), grid)
         return Localization(
             position,
-            peaks.laplace_covariance_m2(functional, evidence, position, self._grid),
-            peaks.confidence(fused, self._grid, position),
+            peaks.laplace_covariance_m2(functional, evidence, position, grid),
+            peaks.confidence(find, found[0], grid, position),
             evidence,
         )
 
     def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
         """Map each array's evidence onto the grid, and sum."""
-        fused = np.zeros(self._grid.size, dtype=np.float32)
+        fused = np.zeros(self._map_grid.size, dtype=np.float32)
         arrays: dict[str, Float32Array] = {}
         for heard in evidence:
-            spec, gcc = heard.spec, heard.gcc
-            cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(heard.below)]
-            power = self._mapper(spec, gcc.pairs, gcc.lags_s, cut_offs_hz)(gcc, *heard.below)
-            fused += power
-            if separately is None or spec.name in separately:
-                arrays[spec.name] = power
-        return PowerMaps(self._grid, fused, arrays)
+            mapper = self._mapper(heard)
+            if separately is None or heard.spec.name in separately:
+                arrays[heard.spec.name] = mapper(heard.gcc, *heard.below)
+                fused += arrays[heard.spec.name]
+            else:
+                mapper.add(fused, heard.gcc, *heard.below)
+        return PowerMaps(self._map_grid, fused, arrays)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)
@@ -145,27 +150,45 @@ class SrpPhat:
             return known[1:]
         spec = self._arrays[array]
         correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s, self.front_end)
-        cut_offs_hz: Sequence[float] = ()
-        if not uses_envelope(spec.band_hz) and self._limits_band(spec, correlate.pairs):
-            cut_offs_hz = third_octaves_below_hz(spec.band_hz)
+        cut_offs_hz = third_octaves_below_hz(spec.band_hz) if self._limited[array] else ()
+        if not cut_offs_hz:
+            self._search.prepare(array, correlate.lags_s)
         self._correlators[array] = (sample_rate_hz, correlate, cut_offs_hz)
         return correlate, cut_offs_hz
 
-    def _mapper(self, spec: ArraySpec, pairs: IntArray, lags_s: FloatArray, cut_offs_hz: Sequence[float]) -> SRPMapper:
+    def _mapper(self, heard: HeardBy) -> SRPMapper:
         """The mapper of an array's lags; made anew when its sampling rate, and with it the lags, have changed."""
+        spec, gcc = heard.spec, heard.gcc
         known = self._mappers.get(spec.name)
-        if known is not None and np.array_equal(known[0], lags_s):
+        if known is not None and np.array_equal(known[0], gcc.lags_s):
             return known[1]
-        mapper = SRPMapper(spec, self._grid, pairs, lags_s, self._c_m_s, cut_offs_hz)
-        self._mappers[spec.name] = (lags_s, mapper)
+        cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(heard.below)]
+        mapper = SRPMapper(spec, self._map_grid, gcc.pairs, gcc.lags_s, self._c_m_s, cut_offs_hz)
+        self._mappers[spec.name] = (gcc.lags_s, mapper)
         return mapper
 
-    def _limits_band(self, spec: ArraySpec, pairs: IntArray) -> bool:
-        if self._band_limit is not None:
-            return self._band_limit
-        some = self._grid.nodes_m(slice(None, None, max(1, self._grid.size // _NODES_ASKED)))
-        limit_hz = alias_free_hz(some, spec.microphones_m, pairs, self._grid.spacing_m, self._c_m_s)
+    def _limits_band(self, spec: ArraySpec, band_limit: bool | None) -> bool:
+        if uses_envelope(spec.band_hz):
+            return False
+        if band_limit is not None:
+            return band_limit
+        grid = self._map_grid
+        some = grid.nodes_m(slice(None, None, max(1, grid.size // _NODES_ASKED)))
+        pairs = microphone_pairs(len(spec.microphones_m))
+        limit_hz = alias_free_hz(some, spec.microphones_m, pairs, grid.spacing_m, self._c_m_s)
         return bool(np.median(limit_hz) < spec.band_hz[1])
+
+
+def map_grid(arrays: Sequence[ArraySpec], grid: Grid) -> Grid:
+    """The grid that maps are drawn on: the one that is searched, or a coarser one where that is too fine for people.
+
+    Its tables take at most `MAP_BYTES`.
+    """
+    pairs = sum(len(microphone_pairs(len(spec.microphones_m))) for spec in arrays)
+    drawn = grid if grid.spacing_m >= MAP_SPACING_M else Grid(grid.bounds_m, MAP_SPACING_M)
+    while 2 * pairs * drawn.size > MAP_BYTES:
+        drawn = Grid(grid.bounds_m, 1.1 * drawn.spacing_m)
+    return drawn
 
 
 class Cepstral(SrpPhat):
@@ -217,6 +240,12 @@ def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
     steps = np.arange(1, int(3.0 * np.log2(high / max(low, _LEAST_CUT_OFF_HZ))) + 1)
     return tuple(float(cut_off) for cut_off in high * 2.0 ** (-steps / 3.0))
 
+
+MAP_SPACING_M: Final = 0.1
+"""Maps are not drawn finer than this: a screen shows no more of a room."""
+
+MAP_BYTES: Final = 128_000_000
+"""What the tables of all arrays' maps may take."""
 
 _NODES_ASKED: Final = 4096
 """Nodes looked at to see whether a band limit matters."""
