@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from livessl import __version__, demo, progress, replay
 from livessl.bench import live as live_bench
 from livessl.capture.devices import DeviceError
@@ -82,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
     try:
-        with _sigterm_interrupts():
+        # the products are small: a second thread spins more than it works, eight times the processor's time in all
+        with _sigterm_interrupts(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except (ConfigError, DeviceError) as error:
         for line in str(error).splitlines():
