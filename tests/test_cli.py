@@ -126,6 +126,8 @@ def test_version(run: Run) -> None:
         ("locate --site s.yaml --wav =n.wav", "expected ARRAY=FILE, got '=n.wav'"),
         ("locate --site s.yaml --wav n=n.wav --channels n=1,two", "expected ARRAY=1,2,3,4, got 'n=1,two'"),
         ("locate --site s.yaml --wav n=n.wav --channels 1,2,3,4", "expected ARRAY=1,2,3,4, got '1,2,3,4'"),
+        ("locate --site s.yaml --wav n=n.wav --joint both=n", "expected NAME=ARRAY,ARRAY with two arrays or more"),
+        ("serve --site s.yaml --joint =n,s", "expected NAME=ARRAY,ARRAY with two arrays or more, got '=n,s'"),
         ("locate --site s.yaml --wav n=n.wav --method music", "invalid choice: 'music'"),
         ("replay d --speed 0", "expected a number > 0 or 'max', got '0'"),
         ("replay d --speed fast", "expected a number > 0 or 'max', got 'fast'"),

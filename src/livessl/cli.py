@@ -149,10 +149,12 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("serve", _serve, "run the fusion server with API and dashboard", "livessl serve --site site.yaml")
     _add_site(sub)
     _add_method(sub)
+    _add_joint(sub)
 
     sub = command("capture", _capture, "run a capture node", "livessl capture --site site.yaml --node lab-pc")
     _add_site(sub)
     sub.add_argument("--node", required=True, help="name of the node in the site file")
+    _add_joint(sub)
     _add_wav(sub, "play FILE at real speed instead of the device; give it for each array of the node")
     sub.add_argument("--loop", action="store_true", help="play the files again and again")
     sub.add_argument(
@@ -171,6 +173,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_site(sub)
     _add_wav(sub, "recording of an array; all begin together", required=True)
     _add_method(sub)
+    _add_joint(sub)
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
 
     sub = command("replay", _replay, "play a recorded session through a server", "livessl replay session/ --speed 2")
@@ -185,6 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
     _add_method(sub)
+    _add_joint(sub)
 
     sub = command(
         "record", _record, "record a session for replay", "livessl record --site site.yaml --node lab-pc --out session/"
@@ -275,6 +279,17 @@ def _add_site(parser: Any) -> None:
 
 def _add_method(parser: Any) -> None:
     parser.add_argument("--method", choices=sorted(ESTIMATORS), help="estimator (default: the site's)")
+
+
+def _add_joint(parser: Any) -> None:
+    parser.add_argument(
+        "--joint",
+        action="append",
+        type=_joint,
+        default=[],
+        metavar="NAME=ARRAY,ARRAY,…",
+        help="process arrays of one node as one of all their microphones, besides what the site file joins",
+    )
 
 
 def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
@@ -368,7 +383,7 @@ def _demo_json(outcome: demo.Outcome) -> str:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
     logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
@@ -384,7 +399,7 @@ def _run_server(server: Server) -> None:
 
 
 def _capture(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     config = _node(site, arguments.node, arguments.site)
     _check_played(arguments, config)
     clock = SystemClock()
@@ -447,7 +462,7 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
 
 
 def _locate(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     parts = parts_from_wavs(site, *_wavs(arguments))
     messages = Messages(site, 0, utc=False)
@@ -482,7 +497,8 @@ def _print_event(event: JsonObject, *, as_json: bool) -> None:
 
 def _replay(arguments: argparse.Namespace) -> int:
     sessions = [read_session(directory) for directory in arguments.directories]
-    site = load_site(arguments.site) if arguments.site else sessions[0].site()
+    joint = _once_each(arguments.joint, "--joint")
+    site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
     parts = parts_from_sessions(site, sessions)
     if arguments.server is not None:
         with _polite_stop() as stop:
@@ -638,7 +654,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
     else:
         _tell_warnings(site)
-        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.specs)
+        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)
         print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid nodes")
     return OK
 
@@ -700,6 +716,14 @@ def _assignment(text: str) -> tuple[str, Path]:
     if not (name and equals and path):
         raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
     return name, Path(path)
+
+
+def _joint(text: str) -> tuple[str, list[str]]:
+    name, _, members = text.partition("=")
+    arrays = members.split(",")
+    if not (name and len(arrays) > 1 and all(arrays)):
+        raise argparse.ArgumentTypeError(f"expected NAME=ARRAY,ARRAY with two arrays or more, got {text!r}")
+    return name, arrays
 
 
 def _channels(text: str) -> tuple[str, list[int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -56,9 +57,9 @@ class Session:
         """Where a piece's file lies."""
         return self.directory / piece.file
 
-    def site(self) -> Site:
-        """The site that it was recorded in."""
-        return load_site(self.directory / SITE_FILE)
+    def site(self, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+        """The site that it was recorded in; `joint` adds to its own."""
+        return load_site(self.directory / SITE_FILE, joint)
 
 
 def piece(array: str, file: str, start_ns: int) -> Piece:

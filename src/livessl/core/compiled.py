@@ -51,6 +51,13 @@ def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG
 
 
 @_compiled
+def look_up(values, places, out):  # type: ignore[no-untyped-def]
+    """Bare look-ups: how fast a map could be at best."""
+    for n in range(len(places)):
+        out[n] = values[places[n]]
+
+
+@_compiled
 def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
     """Add one array's power at every node."""
     for node in range(len(table)):
@@ -195,7 +202,7 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 @_compiled
 def highest(  # type: ignore[no-untyped-def]
     values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
-    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes,
+    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip
     """The highest node outside some boxes, by branch and bound."""
     shape = (len(x_m), len(y_m), len(z_m))
@@ -206,6 +213,7 @@ def highest(  # type: ignore[no-untyped-def]
     distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
     total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
     _bounds(0, count, top_low, top_high, rows, first_row, weight, rule, maxima, level_of, top_bound)
+    spent = 2 * count * len(rows)
     best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
     order = np.array([np.argmax(top_bound)])
     for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
@@ -222,6 +230,9 @@ def highest(  # type: ignore[no-untyped-def]
                 continue
             if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
                 continue
+            if spent > most:
+                return best_node, best, False
+            spent += 2 * children * len(rows)
             _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
             while True:
                 child = np.argmax(child_bound)
@@ -236,8 +247,11 @@ def highest(  # type: ignore[no-untyped-def]
                 if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
                     continue
                 if not _covered(first, edge, shape, boxes):
+                    if spent > most:
+                        return best_node, best, False
+                    spent += edge**3 * len(rows)
                     best, best_node = _best_of_cell(
                         first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
                         weight, rule, values, boxes, best, best_node, distance, total, fused,
                     )  # fmt: skip
-    return best_node, best
+    return best_node, best, True

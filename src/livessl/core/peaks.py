@@ -29,10 +29,11 @@ _SUBDIVISIONS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A node and the fused power there."""
+    """A node and the fused power there; and whether it is known to be the highest, or only of what was looked at."""
 
     node: int
     power: float
+    proven: bool = True
 
 
 class FindPeaks(Protocol):

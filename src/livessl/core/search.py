@@ -27,6 +27,10 @@ CELL_M: Final = 0.2
 
 MOST_CELLS: Final = 50_000
 
+MOST_LOOK_UPS: Final = 5_000_000
+"""After so many a search is given up, some 10 ms compiled. Two arrays never need so many, nor do many that hear a sound
+well; many that hear nothing but noise do."""
+
 CELLS_PER_TOP: Final = 4
 """Cells along an edge of the cubes of cells that are bounded first."""
 
@@ -95,7 +99,9 @@ class PeakSearch:
         self._high[rows], self._top_high[rows] = self._by_cube(high, np.maximum)
         self._sets.clear()
 
-    def among(self, evidence: Sequence[HeardBy], rule: Rule = Rule.SUM) -> FindPeaks:
+    def among(
+        self, evidence: Sequence[HeardBy], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
+    ) -> FindPeaks:
         """What finds the peaks of some arrays' evidence; good until the next call with the same arrays.
 
         Parameters
@@ -103,6 +109,8 @@ class PeakSearch:
         evidence : sequence of HeardBy
             At least one, in the order in which the maps are to be joined. Each array must have been prepared.
         rule : Rule
+        most_look_ups : int
+            For each peak: the search is then given up, and the peak not proven to be the highest.
         """
         rows = self._rows(tuple(heard.spec.name for heard in evidence))
         for array, heard in enumerate(evidence):
@@ -114,15 +122,15 @@ class PeakSearch:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
-                node, power = kernels.highest(
+                node, power, proven = kernels.highest(
                     rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
                     self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
-                    np.array(boxes, dtype=np.int64).reshape(-1, 3, 2),
+                    np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
                 )  # fmt: skip
                 if power == -np.inf:
                     break
-                found.append(Peak(int(node), float(power)))
+                found.append(Peak(int(node), float(power), bool(proven)))
                 boxes.append(box_around(self._grid, int(node), apart_nodes))
             return found
 

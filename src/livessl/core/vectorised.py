@@ -76,6 +76,11 @@ def cell_intervals(
             out[:, cells] = reduced.reshape(len(pairs), -1)
 
 
+def look_up(values: Float32Array, places: UInt16Array, out: Float32Array) -> None:
+    """Bare look-ups, `out = values[places]`, all (N,): how fast a map could be at best."""
+    np.take(values, places, out=out, mode="clip")
+
+
 def look_up_table(places: UInt16Array, columns: int) -> csr_array:
     """What `add_power` wants of the places (G, P) that nodes look up in a pair's values, `columns` long."""
     nodes, pairs = places.shape
@@ -174,8 +179,8 @@ def highest(
     values: Float32Array, maxima: Float32Array, level_of: UInt8Array, rows: IntArray, first_row: IntArray,
     weight: Float32Array, rule: int, low: UInt16Array, high: UInt16Array, top_low: UInt16Array, top_high: UInt16Array,
     x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int, microphones_m: Float32Array,
-    first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray,
-) -> tuple[int, float]:  # fmt: skip
+    first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray, most: int,
+) -> tuple[int, float, bool]:  # fmt: skip
     """The highest node outside some boxes, by branch and bound: the very one that the whole map would give.
 
     No node of a cell exceeds the fusion of the pairs' highest values over the cell's lags; two look-ups in the running
@@ -210,15 +215,20 @@ def highest(
     scale, offset : (A,) float32
     boxes : (E, 3, 2) int64
         First and last node along each axis of what is left out.
+    most : int
+        Look-ups after which the search gives up: where nothing stands out, and many arrays take part, there is hardly a
+        cell that can be left out.
 
     Returns
     -------
     node : int
     value : float
+    proven : bool
+        Whether it is the highest; else it is the best of what was looked at.
     """
     shape = (len(x_m), len(y_m), len(z_m))
     tops = tuple(-(-n // (per_top * edge)) for n in shape)
-    best, best_node = np.float32(-np.inf), int(np.prod(shape))
+    best, best_node, spent = np.float32(-np.inf), int(np.prod(shape)), 0
 
     def promising(which: IntArray, first: IntArray, nodes: int, table: tuple[UInt16Array, UInt16Array]) -> _Cells:
         """Of cubes with `nodes` an edge, those that may be better than what is known."""
@@ -236,11 +246,18 @@ def highest(
     every = np.arange(top_low.shape[1])
     corners = np.stack(np.unravel_index(every, tops), axis=1) * (per_top * edge)
     cubes = promising(every, corners, per_top * edge, (top_low, top_high))
+    spent += 2 * len(every) * len(rows)
     while (chosen := cubes.take(best, best_node)) is not None:
+        if spent > most:
+            return best_node, float(best), False
         which, first = chosen
         children = (which[:, None] * per_top**3 + np.arange(per_top**3)).ravel()
+        spent += 2 * len(children) * len(rows)
         cells = promising(children, (first[:, None] + inner).reshape(-1, 3), edge, (low, high))
         while (chosen := cells.take(best, best_node)) is not None:
+            if spent > most:
+                return best_node, float(best), False
+            spent += len(chosen[1]) * edge**3 * len(rows)
             at = (chosen[1][:, None] + inmost).reshape(-1, 3)
             at = at[(at < shape).all(axis=1)]
             for box in boxes:
@@ -254,7 +271,7 @@ def highest(
                 node = int(np.ravel_multi_index(tuple(at[fused == peak].T), shape).min())
                 best_node = node if peak > best else min(node, best_node)
                 best = peak
-    return best_node, float(best)
+    return best_node, float(best), True
 
 
 @dataclass

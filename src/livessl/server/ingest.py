@@ -58,8 +58,9 @@ class Ingest:
         self._acked_ns = 0
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
-        self.duplicates = dict.fromkeys(site.arrays, 0)
-        self.sequence_gaps = dict.fromkeys(site.arrays, 0)
+        names = [spec.name for spec in site.processed]
+        self.duplicates = dict.fromkeys(names, 0)
+        self.sequence_gaps = dict.fromkeys(names, 0)
 
     def problem_of(self, array: str) -> str | None:
         """What the node says is wrong with the device that an array is on."""
@@ -140,9 +141,13 @@ class Ingest:
         return Arrival(joined=None if same_run else hello, reply=_ack(peer))
 
     def _refusal(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
-        unknown = [name for name in hello.arrays if name not in self._site.arrays]
-        if unknown:
-            return f"no array {unknown[0]!r} in the server's site file; it has {', '.join(self._site.arrays)}"
+        known = [spec.name for spec in self._site.processed]
+        unknown = next((name for name in hello.arrays if name not in known), None)
+        if unknown is not None:
+            joint = next((name for name, members in self._site.joint.items() if unknown in members), None)
+            if joint is not None:
+                return f"array {unknown!r} is joined in {joint!r} at the server; give node and server the same `joint`"
+            return f"no array {unknown!r} in the server's site file; it has {', '.join(known)}"
         for name, rate_hz in hello.arrays.items():
             node = self._site.node_of(name)
             stated_hz = self._site.nodes[node].device.sample_rate_hz if node else None

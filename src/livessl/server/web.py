@@ -99,8 +99,9 @@ def describe_site(site: Site, mode: str) -> JsonObject:
                 "microphones_m": spec.microphones_m.round(4).tolist(),
                 "band_hz": list(spec.band_hz),
             }
-            for spec in site.specs
+            for spec in site.processed
         },
+        "joint": {name: list(members) for name, members in site.joint.items()},
         "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
     }
 
@@ -203,6 +204,11 @@ def _cursor(text: str | None) -> Cursor | None:
         raise HTTPException(422, f"cursor: {error}") from error
 
 
+def _mapped(site: Site) -> list[str]:
+    """Names that a map may be asked of."""
+    return [FUSED, *(spec.name for spec in site.processed)]
+
+
 def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
     @app.get(
         "/api/v1/map",
@@ -218,8 +224,8 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         format: Annotated[Literal["png", "float32"], Query()] = "png",  # noqa: A002 - the API's word
     ) -> Response:
         """The newest power map: a projection (largest value along the axis left out) or the whole volume."""
-        if array != FUSED and array not in site.arrays:
-            raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
+        if array not in _mapped(site):
+            raise HTTPException(404, f"no array {array!r}; there are {', '.join(_mapped(site))}")
         if view == "volume" and format == "png":
             raise HTTPException(422, "view=volume has no picture; use format=float32")
         drawn = engine.maps.newest(array)
@@ -294,8 +300,8 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
 
 
 def _chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
-    if array != FUSED and array not in site.arrays:
-        raise ValueError(f"array: none of that name; there are fused, {', '.join(site.arrays)}")
+    if array not in _mapped(site):
+        raise ValueError(f"array: none of that name; there are {', '.join(_mapped(site))}")
     chosen = tuple(dict.fromkeys(view.strip() for view in views.split(",")))
     if not set(chosen) <= VIEWS.keys():
         raise ValueError(f"views: expected some of {', '.join(VIEWS)}")
