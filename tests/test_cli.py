@@ -31,7 +31,7 @@ from livessl.session import read_session
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
-COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices")
+COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices", "bench")
 STOP_S = 5.0
 """How long a command may take to end on Ctrl-C or SIGTERM."""
 

@@ -19,6 +19,7 @@ from typing import Any, Final, TypeVar
 from threadpoolctl import threadpool_limits
 
 from livessl import __version__, demo, progress, replay
+from livessl.bench import kernels as kernel_bench
 from livessl.bench import live as live_bench
 from livessl.capture.devices import DeviceError
 from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
@@ -241,14 +242,14 @@ def _add_bench(command: Callable[..., Any]) -> None:
         "measure how much this machine carries, and how fast it answers",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     )
-    sub.add_argument("--live", action="store_true", required=True, help="a server under the load of arrays and clients")
-    sub.add_argument("--arrays", type=_positive, default=4, help="that sound all the time (default 4)")
-    sub.add_argument("--clients", type=_positive, default=4, help="that subscribe to events and updates (default 4)")
-    sub.add_argument("--watchers", type=int, default=0, help="that watch the power map (default none)")
-    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="to measure, after a warm-up (default 20)")
-    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="of the grid (default 0.1)")
-    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="of the simulated room (default 0.3)")
-    sub.add_argument("--spin", action="store_true", help="let a foreign process spin on each core meanwhile")
+    sub.add_argument("--live", action="store_true", help="a server under load, instead of the kernels alone")
+    sub.add_argument("--arrays", type=_positive, default=4, help="live: that sound all the time (default 4)")
+    sub.add_argument("--clients", type=_positive, default=4, help="live: that subscribe (default 4)")
+    sub.add_argument("--watchers", type=_count, default=0, help="live: that watch the power map (default none)")
+    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="live: to measure, after a warm-up (default 20)")
+    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="live: of the grid (default 0.1)")
+    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="live: of the simulated room (default 0.3)")
+    sub.add_argument("--spin", action="store_true", help="live: let a foreign process spin on each core")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -307,6 +308,11 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
+    if not arguments.live:
+        with progress.counted("measuring", "round") as show:
+            report = kernel_bench.measure(SystemClock(), progress=show)
+        print(json.dumps(report.as_json()) if arguments.json else kernel_bench.table(report))
+        return OK
     demand = live_bench.Demand(
         arrays=arguments.arrays,
         clients=arguments.clients,
@@ -755,6 +761,10 @@ def _positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
     return int(text)
+
+
+def _count(text: str) -> int:
+    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number from 0 on"))
 
 
 def _rt60(text: str) -> float:

@@ -12,7 +12,7 @@ from typing import Final
 
 from livessl.clock import Clock
 
-READY_NS: Final = 20_000_000_000
+READY_NS: Final = 60_000_000_000
 POLL_NS: Final = 50_000_000
 END_S: Final = 5.0
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from livessl import processes
-from livessl.bench import live, load
+from livessl.bench import kernels, live, load
 from livessl.bench.live import Demand, Outcome
 from livessl.cli import main
 from livessl.clock import SystemClock
@@ -115,4 +116,15 @@ def test_a_tiny_run(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_server_that_does_not_come_up_is_told() -> None:
     with pytest.raises(NotStartedError, match="did not start"):
-        live.measure(DEMAND, SystemClock(), start=lambda _: processes.start("--version"))
+        live.measure(DEMAND, SystemClock(), start=lambda _: subprocess.Popen([sys.executable, "-c", ""]))
+
+
+def test_kernels_are_measured_without_live(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    report = kernels.KernelReport("compiled", 0.25, (kernels.Timing("map, 2 arrays", 1.5, 2.5, 1.9),))
+    monkeypatch.setattr(kernels, "measure", lambda clock, progress: report)
+    assert main(["bench"]) == 0
+    told = capsys.readouterr().out
+    assert "a bare look-up takes 0.25 ns" in told
+    assert ["map,", "2", "arrays", "1.500", "2.500", "1.90"] in [line.split() for line in told.splitlines()]
+    assert main(["bench", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["timings"][0]["ratio"] == 1.9
