@@ -26,6 +26,7 @@ from livessl import __version__, cli, demo
 from livessl.capture.link import Link
 from livessl.cli import main
 from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.config import ConfigError, Fault, Site
 from livessl.server.receiver import Receiver
 from livessl.session import read_session
 from livessl.wire import Hello
@@ -699,3 +700,23 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         assert run("check", write_site(tmp_path)).code == 0
         assert threads() == {2}
     assert seen == [{1}]
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["its own site", "a site that is given"])
+def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
+    tmp_path: Path, own: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = {"server.http": {"host": "0.0.0.0", "port": 8001, "tokens": "tokens.yaml"}, "keys": "keys"}
+    path, session = write_site(tmp_path, there), tmp_path / "session"
+    made = ["simulate", "--site", str(path), "--rt60", "0", "--count", "1", "--sample-rate", str(RATE_HZ)]
+    assert main([*made, "--out", str(session)]) == 0
+
+    def refuse(site: Site, *_: object, **__: object) -> None:
+        raise ConfigError(
+            [Fault(site.server.http.host, f"{site.server.http.port} {site.server.http.tokens} {site.keys}")]
+        )
+
+    monkeypatch.setattr("livessl.cli.Server", refuse)
+    assert main(["replay", str(session), *([] if own else ["--site", str(path)])]) == 2
+    expected = "127.0.0.1: 8001 None None" if own else "0.0.0.0: 8001 tokens.yaml None"
+    assert expected in capsys.readouterr().err

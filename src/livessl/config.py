@@ -6,6 +6,7 @@ import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from ipaddress import ip_address
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -251,11 +252,27 @@ class NodeConfig(_Model):
         return check_endpoint(endpoint)
 
 
+FileName = Annotated[str, Field(min_length=1)]
+"""A file or folder, looked up from the site file's folder."""
+
+
 class HttpConfig(_Model):
-    """Where the API and the dashboard listen."""
+    """Where the API and the dashboard listen, and whom they let in."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    tokens: FileName | None = None
+    certificate: FileName | None = None
+    private_key: FileName | None = None
+
+    @model_validator(mode="after")
+    def _pair(self) -> HttpConfig:
+        if (self.certificate is None) != (self.private_key is None):
+            raise ValueError(
+                "expected certificate and private_key, got "
+                f"{'private_key' if self.certificate is None else 'certificate'} alone; add the other one"
+            )
+        return self
 
 
 class SinkConfig(_Model):
@@ -277,6 +294,12 @@ class ServerConfig(_Model):
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
         return check_endpoint(endpoint, wildcards=True)
+
+
+class StoreConfig(_Model):
+    """How long events are kept: for ever, unless told otherwise."""
+
+    retention_days: Positive | None = None
 
 
 class ActivityConfig(_Model):
@@ -330,6 +353,9 @@ class Site(_Model):
     joint: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = {}
     nodes: dict[str, NodeConfig] = {}
     server: ServerConfig = ServerConfig()
+    keys: FileName | None = None
+    privacy: Literal["positions-only", "recording"] = "recording"
+    store: StoreConfig = StoreConfig()
     activity: ActivityConfig = ActivityConfig()
     fusion: FusionConfig = FusionConfig()
     zones: dict[str, Zone] = {}
@@ -339,6 +365,8 @@ class Site(_Model):
     """The arrays as they are processed: a joint one in the place of those that it joins."""
     warnings: Annotated[tuple[str, ...], Field(exclude=True, default=())]
     """What is valid and yet unlikely to work, in words."""
+    directory: Annotated[Path, Field(exclude=True, default=Path())]
+    """The site file's folder."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
@@ -350,6 +378,10 @@ class Site(_Model):
         if self.temperature_c is not None:
             return speed_of_sound_m_s(self.temperature_c)
         return DEFAULT_SPEED_OF_SOUND_M_S
+
+    def file(self, name: str) -> Path:
+        """A file that the site file names."""
+        return self.directory / name
 
     def search_grid(self) -> Grid:
         """The shared grid: the bounds given, or the whole room."""
@@ -429,6 +461,38 @@ def check_endpoint(endpoint: str, *, wildcards: bool = False) -> str:
     return endpoint
 
 
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches what listens on `host`."""
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def open_doors(site: Site) -> list[Fault]:
+    """What would let the whole network in: addresses that others reach, without a way to tell who they are."""
+    faults = []
+    http, bind = site.server.http, site.server.bind
+    if not is_loopback(http.host) and http.tokens is None:
+        faults.append(
+            Fault(
+                "server.http.host",
+                f"{http.host!r} can be reached from other machines, and anyone there could look: set "
+                "server.http.tokens: tokens.yaml and make a token with `livessl keys token`, or use 127.0.0.1",
+            )
+        )
+    scheme, _, rest = bind.partition("://")
+    if scheme == "tcp" and not is_loopback(rest.rpartition(":")[0]) and site.keys is None:
+        faults.append(
+            Fault(
+                "server.bind",
+                f"{bind!r} can be reached from other machines, and anyone there could send: set keys: keys and make "
+                "them with `livessl keys server` and `livessl keys node`, or use tcp://127.0.0.1:PORT",
+            )
+        )
+    return faults
+
+
 def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
     """Read and check a site file; `joint` adds to its own.
 
@@ -470,7 +534,7 @@ def parse_site(
     if not isinstance(data, dict):
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
     findings = [*_duplicate_keys(root)]
-    for key in ("specs", "processed", "warnings"):
+    for key in ("specs", "processed", "warnings", "directory"):
         if key in data:
             findings.append(((key,), "unknown key; take it away"))
             del data[key]
@@ -480,7 +544,7 @@ def parse_site(
     findings += wrong
     if site is not None:
         specs, wrong = _array_specs(site, directory or Path())
-        site = site.model_copy(update={"specs": specs})
+        site = site.model_copy(update={"specs": specs, "directory": directory or Path()})
         processed, apart = _processed_specs(site)
         site = site.model_copy(update={"processed": processed})
         lost = set(data["arrays"]) - set(site.arrays)
@@ -488,7 +552,7 @@ def parse_site(
         findings += [finding for finding in _cross_faults(site) if not _follows(finding[0], lost)]
     if findings or site is None:
         raise ConfigError([at.fault(path, what) for path, what in findings])
-    return site.model_copy(update={"warnings": tuple(_wide_arrays(site))})
+    return site.model_copy(update={"warnings": (*_wide_arrays(site), *_leaks(site))})
 
 
 def read_yaml(text: str) -> Any:
@@ -814,6 +878,18 @@ def _wide_arrays(site: Site) -> Iterator[str]:
                 f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
                 f"wrong: lower the array's band_hz, or {cure}"
             )
+
+
+def _leaks(site: Site) -> Iterator[str]:
+    """What is let in or kept although the file seems to say otherwise."""
+    http, days = site.server.http, site.store.retention_days
+    if http.tokens is not None and http.certificate is None and not is_loopback(http.host):
+        yield (
+            "server.http: tokens and positions travel unencrypted; set certificate and private_key, or listen on "
+            "127.0.0.1 behind a proxy that has them"
+        )
+    if days is not None and site.server.sinks:
+        yield f"store.retention_days: {days:g} days do not reach server.sinks; rotate those files yourself"
 
 
 def _node_faults(site: Site) -> Iterator[_Finding]:

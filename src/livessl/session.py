@@ -107,8 +107,11 @@ def read_session(directory: Path) -> Session:
 
 
 def site_text(site: Site) -> str:
-    """The site as YAML that stands alone: array positions absolute, no geometry files."""
-    data: dict[str, Any] = site.model_dump(mode="json", exclude_defaults=True)
+    """The site as YAML that stands alone: array positions absolute, no geometry files, no word on secrets."""
+    http = {"tokens", "certificate", "private_key"}
+    data: dict[str, Any] = site.model_dump(
+        mode="json", exclude_defaults=True, exclude={"keys": True, "server": {"http": http}}
+    )
     for spec in site.specs:
         array = {"microphones_m": spec.microphones_m.round(6).tolist()}
         given = site.arrays[spec.name]

@@ -13,6 +13,7 @@ from livessl.capture.link import Link
 from livessl.capture.recorded import Part, lines_of
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
+from livessl.keys import node_keys
 
 DRAIN_NS: Final = 3_000_000_000
 """How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""
@@ -37,7 +38,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
     """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
     config: NodeConfig = site.nodes[name]
     line = Line(site, config.arrays, device.sample_rate_hz)
-    link = _link(name, config.server, [line], clock, run_id)
+    link = _link(site, name, config.server, [line], clock, run_id)
     problem = None
     try:
         with device:
@@ -72,7 +73,7 @@ def capture_recordings(
         Where the server has not acknowledged everything.
     """
     lines, placed = lines_of(site, parts)
-    link = _link(name, site.nodes[name].server, lines, clock, run_id)
+    link = _link(site, name, site.nodes[name].server, lines, clock, run_id)
     for end_ns in _sent(link, lines, placed, clock, stop):
         if progress is not None:
             progress(end_ns)
@@ -99,7 +100,7 @@ def send_session(
         Where the server refuses it, or has not acknowledged everything.
     """
     lines, placed = lines_of(site, parts)
-    link = _link("replay", endpoint, lines, clock, run_id, replay=True)
+    link = _link(site, "replay", endpoint, lines, clock, run_id, replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
@@ -112,9 +113,11 @@ def send_session(
     _finish(link, clock, stop)
 
 
-def _link(name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False) -> Link:
+def _link(
+    site: Site, name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False
+) -> Link:
     rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
+    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, node_keys(site, name))
 
 
 def _sent(link: Link, lines: Sequence[Line], placed: Sequence[Placed], pace: Clock, stop: Stop) -> Iterator[int]:
