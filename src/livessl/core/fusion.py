@@ -241,7 +241,7 @@ class Fusion:
             self._streams[array].left = True
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing. Another thread than `step`'s may ask: what it reads is replaced, never resized."""
+        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         return [_status(stream, now_ns) for stream in self._streams.values()]
 
     def _went_back(self, now_ns: int) -> bool:
