@@ -259,10 +259,14 @@ class Ours:
 
     def power(self, sounds: Sounds) -> Float32Array:
         """The summed map (G,), overwritten by the next call."""
+        return self.mapped(self.heard(sounds))
+
+    def mapped(self, heard: Sequence[HeardBy]) -> Float32Array:
+        """The same from the GCCs."""
         self._power[:] = 0.0
         with using(self._form):
-            for mapper, heard in zip(self._mappers, self.heard(sounds), strict=True):
-                mapper.add(self._power, heard.gcc)
+            for mapper, one in zip(self._mappers, heard, strict=True):
+                mapper.add(self._power, one.gcc)
         return self._power
 
     def peak(self, sounds: Sounds) -> int:
@@ -394,7 +398,10 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
 
 
 def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[dict[str, Any]]]:
-    """What grows with the microphones of an array, and the map with the grid; two arrays throughout."""
+    """What grows with the microphones of an array, and the map with the grid; two arrays throughout.
+
+    And the map of the fine grid alone by either form of the kernels, beside as many bare look-ups, compiled.
+    """
     shape = tetrahedron(0.5)
     parts = [
         ArraySpec(f"{place}.{turn}", posed(shape, place, yaw_deg=23.0 * turn, pitch_deg=41.0 * turn), bench.BAND_HZ)
@@ -425,10 +432,23 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
         ours = Ours(specs, room_grid(spacing_m), compiled)
         maps.append({"spacing_m": spacing_m, "nodes": room_grid(spacing_m).size})
         cases.append(bench.Case("map", _each(ours.power, [block])))
+    forms: list[dict[str, Any]] = []
+    for form in (compiled, vectorised):
+        ours = Ours(specs, room_grid(FINE_M), form)
+        forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
+        cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))
+    cases.append(bench.bare_look_ups())
     taken_ms = bench.timed_ms(SystemClock(), cases, rounds, progress)
+    of_microphones, of_maps, of_forms, floor_ms = np.split(
+        taken_ms, np.cumsum([len(microphones), len(maps), len(forms)])
+    )
+    lookup_ms = float(np.median(floor_ms)) / bench.LOOKED_UP
     return {
-        "microphones": _with_times(microphones, taken_ms[: len(microphones)]),
-        "maps": _with_times(maps, taken_ms[len(microphones) :]),
+        "microphones": _with_times(microphones, of_microphones),
+        "maps": _with_times(maps, of_maps),
+        "forms": [
+            row | {"ratio": row["median_ms"] / (row["look_ups"] * lookup_ms)} for row in _with_times(forms, of_forms)
+        ],
     }
 
 
