@@ -41,7 +41,7 @@ def compare(
     spacings_m: Sequence[float] = SPACINGS_M,
     counts: Sequence[int] = COUNTS,
     sounds: int = SOUNDS,
-    progress: Callable[[int, int], None] = lambda *_: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[dict[str, Any]]:
     """Hold the search against the map, case by case.
 

@@ -237,3 +237,12 @@ def test_joint_arrays_of_two_bands_are_refused() -> None:
     other = ArraySpec("south", SOUTH.microphones_m.copy(), (200.0, 6000.0))
     with pytest.raises(ValueError, match="arrays of one band"):
         joined([NORTH, other], {"north": "rack", "south": "rack"}, "both")
+
+
+def test_joint_arrays_of_too_many_microphones_are_refused() -> None:
+    names = ["north", "south", "east", "west", "top"]
+    arrays = [ArraySpec(name, NORTH.microphones_m + k, BAND_HZ) for k, name in enumerate(names)]
+    clocks = dict.fromkeys(names, "rack")
+    assert len(joined(arrays[:4], clocks, "most").microphones_m) == 16
+    with pytest.raises(ValueError, match="array 'all': joint processing expects 16 microphones at most, got 20; join"):
+        joined(arrays, clocks, "all")

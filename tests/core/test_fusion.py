@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
-from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
+from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat, joined
 from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.types import (
@@ -231,6 +231,24 @@ def test_one_small_array_tells_the_direction_only() -> None:
     towards, right = position_of(event) - spec.centre_m, SOURCE_M - spec.centre_m
     # the direction by 5 us of 0.06 m over sqrt(3) independent lags, 0.9 degrees; by far less in truth, at 10 dB
     assert towards @ right / np.linalg.norm(towards) / np.linalg.norm(right) > np.cos(np.radians(0.9))
+
+
+def test_wide_array_is_not_looked_from_its_centre() -> None:
+    """Half a centimetre from its middle, a place may be as uncertain as a quarter of the half width, not of that."""
+    both = joined([NORTH, SOUTH], {"north": "rack", "south": "rack"}, "both")
+
+    def judged(spread_m: float) -> Status:
+        class Uncertain(Scripted):
+            def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+                place_m = both.centre_m + np.array([0.003, -0.004, 0.0])
+                return replace(super().locate(sounds), position_m=place_m, covariance_m2=spread_m**2 * np.eye(3))
+
+        frames = [frame("both", k, samples=np.ones((8, 20), dtype=np.float32)) for k in (10, 11)]
+        return only_event(play(Fusion("site", [both], Uncertain(), updates=False), live(frames, 30), 30)).status
+
+    quarter_m = 0.25 * both.aperture_m / 2.0
+    assert judged(0.99 * quarter_m) is Status.LOCATED
+    assert judged(1.01 * quarter_m) is Status.DIRECTION_ONLY
 
 
 def test_arrays_of_different_rates_locate_together(located: SrpPhat) -> None:

@@ -25,6 +25,7 @@ from websockets.typing import Origin
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock, utc_ns, utc_text
 from livessl.core.types import FRAME_NS
+from livessl.keys import add_token
 from livessl.server import app
 from livessl.server.app import Server
 from livessl.server.web import STATIC
@@ -32,6 +33,7 @@ from small_site import SMALL, running_server, scene, scene_parts, site_of, wait_
 
 CLOCK = SystemClock()
 RUNS = count()
+PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
 ROUTES = {
     "/api/v1/site",
     "/api/v1/arrays",
@@ -40,6 +42,7 @@ ROUTES = {
     "/api/v1/tracks",
     "/api/v1/map",
     "/api/v1/health",
+    "/api/v1/access",
     "/metrics",
 }
 """The contract's, but for the WebSocket, which OpenAPI cannot tell of."""
@@ -468,8 +471,9 @@ def test_name_that_was_made_to_point_here_is_refused(server: Server, client: htt
         connect(f"ws://evil.example:{port}/api/v1/live", sock=socket.create_connection(("127.0.0.1", int(port))))
 
 
-def test_open_to_the_network_it_has_any_name() -> None:
-    with running_server(site_of({"server.http.host": "0.0.0.0"})) as server:
+def test_open_to_the_network_it_has_any_name(tmp_path: Path) -> None:
+    add_token(tmp_path / "tokens.yaml", "wall", "viewer")
+    with running_server(site_of({"server.http": PUBLIC}, tmp_path)) as server:
         url = server.url.replace("0.0.0.0", "127.0.0.1")
         assert httpx.get(f"{url}/api/v1/health", headers={"Host": "lab-pc.local:8000"}).status_code == 200
 

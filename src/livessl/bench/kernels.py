@@ -147,7 +147,7 @@ def measure(
     rounds: int = 200,
     arrays: Sequence[int] = (2, 4, 8),
     spacings_m: Sequence[float] = (0.1, 0.05, 0.02),
-    progress: Callable[[int, int], None] = lambda *_: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> KernelReport:
     """Time every case on one thread.
 
@@ -181,7 +181,7 @@ def timed_ms(
     clock: Clock,
     cases: Sequence[Case],
     rounds: int,
-    progress: Callable[[int, int], None] = lambda *_: None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> FloatArray:
     """Milliseconds (cases, rounds) that each case takes in each round, all of them once a round; warmed up before."""
     taken_ns = np.empty((len(cases), rounds))

@@ -13,6 +13,7 @@ import zmq
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import Mark, Message
+from livessl.keys import NodeKeys
 
 SPOOL_BYTES: Final = 64 * 1024 * 1024
 """Sound kept for a server that is away: half a minute of six arrays. Oldest first out, counted."""
@@ -50,9 +51,11 @@ class Link:
     hello : Hello
         Who we are.
     clock : Clock
+    keys : NodeKeys or None
+        Ours and the server's; None where the site uses none.
     """
 
-    def __init__(self, endpoint: str, hello: wire.Hello, clock: Clock) -> None:
+    def __init__(self, endpoint: str, hello: wire.Hello, clock: Clock, keys: NodeKeys | None = None) -> None:
         self.endpoint = endpoint
         self._hello = hello
         self._clock = clock
@@ -65,6 +68,12 @@ class Link:
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        self._hint = ""
+        if keys is not None:
+            self._hint = " And are the keys right: is this node's enrolled there, is server.public the server's?"
+            self._socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
+            self._socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
+            self._socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
         self._socket.connect(endpoint)
         self._unsent: deque[_Kept] = deque()
         self._unacknowledged: deque[_Kept] = deque()
@@ -120,8 +129,9 @@ class Link:
             elif not self._missed and now_ns - self._begun_ns >= SILENT_NS:
                 self._missed = True
                 _log.warning(
-                    "no server answers at %s; keeping sound and trying on. Is `livessl serve` running there?",
+                    "no server answers at %s; keeping sound and trying on. Is `livessl serve` running there?%s",
                     self.endpoint,
+                    self._hint,
                 )
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()

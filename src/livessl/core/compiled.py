@@ -200,7 +200,7 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 
 @_compiled
-def highest(  # type: ignore[no-untyped-def]
+def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
     values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
     x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip

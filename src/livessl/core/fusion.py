@@ -433,7 +433,7 @@ class Fusion:
         """Whether the estimate is a place, or only a direction, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         specs = [self._streams[name].spec for name in estimate.arrays]
-        nearest_m = min(direction_deg(spec.centre_m, estimate.position_m)[2] for spec in specs)
+        nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
             return Status.LOCATED, None
@@ -462,6 +462,11 @@ def _sound(pieces: Sequence[Sequence[Frame]]) -> Sound:
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, tuple(sounds))
+
+
+def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
+    """How far an array is from the place, or half its width: inside a wide one, its centre is nothing to look from."""
+    return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
 
 
 def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate) -> Contribution:

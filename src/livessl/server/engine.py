@@ -11,11 +11,13 @@ from livessl import wire
 from livessl.clock import Clock, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayStatus
+from livessl.core.search import warm_up
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Joined, Left, Receiver
+from livessl.server.refusals import Refusals
 from livessl.server.store import Store, StoreError
 
 WAIT_S: Final = 0.02
@@ -75,6 +77,7 @@ class Engine:
         self.unkept = 0
         self.maps = Maps(clock)
         self.latency = Latency()
+        warm_up()
         self._begin()
         self._receiver = Receiver(site, clock)
 
@@ -82,6 +85,16 @@ class Engine:
     def endpoint(self) -> str:
         """Where nodes connect to."""
         return self._receiver.endpoint
+
+    @property
+    def refusals(self) -> Refusals:
+        """Who was turned away, by nodes' and clients' doors."""
+        return self._receiver.refusals
+
+    @property
+    def enrolled(self) -> list[str]:
+        """Nodes whose keys are let in; empty where the site uses none."""
+        return self._receiver.enrolled
 
     @property
     def failure(self) -> BaseException | None:

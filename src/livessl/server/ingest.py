@@ -58,21 +58,22 @@ class Ingest:
         self._acked_ns = 0
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
-        self.duplicates = dict.fromkeys(site.arrays, 0)
-        self.sequence_gaps = dict.fromkeys(site.arrays, 0)
+        names = [spec.name for spec in site.processed]
+        self.duplicates = dict.fromkeys(names, 0)
+        self.sequence_gaps = dict.fromkeys(names, 0)
 
     def problem_of(self, array: str) -> str | None:
         """What the node says is wrong with the device that an array is on."""
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
-    def receive(self, routing_id: bytes, data: bytes, now_ns: int) -> Arrival:
-        """Take in one message from one peer."""
+    def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Arrival:
+        """Take in one message from one peer; `enrolled` is whose key it has shown, where the site uses keys."""
         try:
             message = wire.decode(data)
         except wire.WireError as error:
             return self._reject(error, now_ns)
         if isinstance(message, wire.Hello):
-            return self._greet(routing_id, message, now_ns)
+            return self._greet(routing_id, message, now_ns, enrolled)
         peer = self._peers.get(routing_id)
         if peer is None or peer.ended:
             return Arrival(reply=wire.Ack(run_id="?", sequences={}, who_are_you=True))
@@ -127,8 +128,8 @@ class Ingest:
         """Nodes heard from lately."""
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.heard_ns < GONE_NS]
 
-    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> Arrival:
-        refusal = self._refusal(routing_id, hello, now_ns)
+    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Arrival:
+        refusal = self._pretence(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
         if refusal is not None:
             return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
@@ -139,10 +140,25 @@ class Ingest:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         return Arrival(joined=None if same_run else hello, reply=_ack(peer))
 
+    def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
+        """A key speaks for the node that it was enrolled for, and for the arrays that are that node's."""
+        if enrolled is None:
+            return None
+        if hello.node != enrolled:
+            return f"node {hello.node!r} has shown the key of {enrolled!r}; give each node its own"
+        foreign = next((a for a in hello.arrays if self._site.node_of(a) not in (None, enrolled)), None)
+        if foreign is not None and not hello.replay:
+            return f"array {foreign!r} belongs to node {self._site.node_of(foreign)!r} in the server's site file"
+        return None
+
     def _refusal(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
-        unknown = [name for name in hello.arrays if name not in self._site.arrays]
-        if unknown:
-            return f"no array {unknown[0]!r} in the server's site file; it has {', '.join(self._site.arrays)}"
+        known = [spec.name for spec in self._site.processed]
+        unknown = next((name for name in hello.arrays if name not in known), None)
+        if unknown is not None:
+            joint = next((name for name, members in self._site.joint.items() if unknown in members), None)
+            if joint is not None:
+                return f"array {unknown!r} is joined in {joint!r} at the server; give node and server the same `joint`"
+            return f"no array {unknown!r} in the server's site file; it has {', '.join(known)}"
         for name, rate_hz in hello.arrays.items():
             node = self._site.node_of(name)
             stated_hz = self._site.nodes[node].device.sample_rate_hz if node else None

@@ -15,8 +15,11 @@ from livessl import wire
 from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.types import Message
+from livessl.keys import server_keys
+from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrival, Arrivals
+from livessl.server.refusals import Refusals
 
 POLL_MS: Final = 20
 """How long the thread waits for sound before it looks whether acknowledgements are due."""
@@ -67,11 +70,17 @@ class Receiver:
     ------
     BindError
         Where the address is taken.
+    ConfigError
+        Where the site uses keys that cannot be read.
     """
 
     def __init__(self, site: Site, clock: Clock) -> None:
+        keys = server_keys(site)
         self.ingest = Ingest(site)
         self.arrivals = Arrivals()
+        self.refusals = Refusals(clock)
+        self.enrolled = [] if keys is None else sorted(keys.nodes)
+        self._guarded = keys is not None
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
         self._stop = threading.Event()
@@ -81,6 +90,8 @@ class Receiver:
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        if keys is not None:
+            guard(self._context, self._socket, keys, self.refusals, self._fail)
         try:
             self._socket.bind(site.server.bind)
         except zmq.ZMQError as error:
@@ -123,18 +134,22 @@ class Receiver:
                 for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
                     self._reply(routing_id, ack)
         except BaseException as error:
-            self.failure = error
+            self._fail(error)
             _log.exception("the receiving thread has failed")
             raise
+
+    def _fail(self, error: BaseException) -> None:
+        self.failure = error
 
     def _drain(self) -> None:
         for _ in range(QUEUE_MESSAGES):
             try:
-                routing_id, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
+                address, *parts = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            data = b"".join(parts)
-            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns())
+            routing_id, data = address.bytes, b"".join(part.bytes for part in parts)
+            enrolled = str(parts[0].get("User-Id")) if self._guarded else None
+            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
             if arrival.joined is not None:
                 self._put(Joined(arrival.joined))
             if arrival.left is not None:

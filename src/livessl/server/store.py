@@ -77,6 +77,7 @@ class Store:
             self._writing = self._reading = _Connection(path or ":memory:")
             with self._writing.lock, self._writing.db as db:
                 db.execute("PRAGMA journal_mode=WAL")
+                db.execute("PRAGMA secure_delete=ON")  # what is deleted is overwritten
                 db.execute(
                     "CREATE TABLE IF NOT EXISTS events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, "
                     "time_ns INTEGER, confidence REAL, json TEXT)"
@@ -113,6 +114,24 @@ class Store:
             raise StoreError(
                 f"server.events_db: event {event['id']!r} was not kept: {error}; free space or release the file"
             ) from error
+
+    def expire(self, before_ns: int) -> int:
+        """Delete what began before a time, so that the file holds nothing of it any more; returns how many.
+
+        Raises
+        ------
+        StoreError
+            Where the file is locked.
+        """
+        try:
+            with self._writing.lock:
+                with self._writing.db as db:
+                    gone = db.execute("DELETE FROM events WHERE time_ns < ?", (before_ns,)).rowcount
+                if gone:
+                    self._writing.db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.Error as error:
+            raise StoreError(f"server.events_db: old events were not deleted: {error}; release the file") from error
+        return gone
 
     def get(self, event_id: str) -> JsonObject | None:
         """The event of that id."""

@@ -1,5 +1,6 @@
 // The wiring: what the server says goes into one state, and the panels and plans are drawn from it.
 
+import { get, onRefused, useToken } from "./access.js";
 import { ArraysPanel, effectiveState } from "./arrays.js";
 import { Readout } from "./estimate.js";
 import { EventList, verdict } from "./events.js";
@@ -128,7 +129,9 @@ const live = new Live(socketUrl(), {
     redraw();
   },
   onState: showLink,
+  onUnopened: () => getJson("site").catch(() => {}), // where a token is missing, this asks for it
 });
+
 
 function socketUrl() {
   const url = new URL("live?kinds=update,event,track,arrays", API);
@@ -137,7 +140,7 @@ function socketUrl() {
 }
 
 async function getJson(path) {
-  const response = await fetch(new URL(path, API), { cache: "no-store", signal: AbortSignal.timeout(8000) });
+  const response = await get(new URL(path, API));
   if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
   return response.json();
 }
@@ -150,6 +153,7 @@ async function loadSite(tries = 0) {
     find("floor-frame").style.setProperty("--aspect", String(x / y));
     find("side-frame").style.setProperty("--aspect", String(y / z));
     find("floor-empty").hidden = true;
+    showPrivacy(state.site.privacy);
     redraw();
   } catch (error) {
     console.warn("livessl: site:", error.message);
@@ -268,6 +272,18 @@ function setSite(name, mode) {
   find("mode").hidden = !state.mode;
   find("mode").dataset.mode = state.mode ?? "";
   write(find("mode"), state.mode ?? "");
+}
+
+function showPrivacy({ mode, retention_days: days }) {
+  const chip = find("privacy");
+  chip.hidden = mode !== "positions-only" && days === null;
+  write(chip, [mode === "positions-only" ? "positions only" : null, days === null ? null : `kept ${days} d`].filter(Boolean).join(" · "));
+  chip.title = `${mode === "positions-only" ? "No sound is stored" : "Sound may be recorded"}; events are kept ${days === null ? "for ever" : `for ${days} days`}`;
+}
+
+function askForToken(known) {
+  write(find("token-why"), known ? "The server does not know this token." : "This server tells only those who have a token.");
+  if (!find("token-dialog").open) find("token-dialog").showModal();
 }
 
 function fillMapChoice() {
@@ -427,5 +443,11 @@ followPointer(plans[0], find("floor-pointer"));
 followPointer(plans[1], find("side-pointer"));
 find("map-choice").addEventListener("change", ({ target }) => heat.choose(target.value));
 find("gap-close").addEventListener("click", closeGap);
+onRefused(askForToken);
+find("token-form").addEventListener("submit", () => {
+  useToken(find("token").value.trim());
+  find("token").value = "";
+  live.hurry();
+});
 setInterval(nextTick, TICK_MS);
 live.start();
