@@ -367,11 +367,13 @@ async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -
     """Do the work until it ends or the client is gone."""
     tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
     try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises what was wrong, if anything
 
 
 def _refuse_strangers(socket: WebSocket) -> None:
