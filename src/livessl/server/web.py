@@ -403,6 +403,8 @@ async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, 
     while await _sent(socket.send_text(told.text)):
         if told.told_ns is not None:
             latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+        if subscription.lags:  # else all of it goes out in one turn, even to a client that has left meanwhile
+            await asyncio.sleep(0)
         told = await subscription.next()
 
 
