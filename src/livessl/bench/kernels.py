@@ -21,7 +21,7 @@ from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.kernels import kernels
 from livessl.core.search import PeakSearch, Rule
 from livessl.core.srp import SRPMapper
-from livessl.core.types import ArraySpec, Float32Array, HeardBy
+from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy
 from livessl.simulate.room import impulse_responses
 from livessl.simulate.sounds import voice
 
@@ -55,15 +55,19 @@ class Timing:
     Parameters
     ----------
     name : str
-    median_ms, p99_ms : float
+    median_ms, p99_ms, least_ms : float
     ratio : float or None
         Of the median to the time that as many bare look-ups take on this machine.
+    least_ratio : float or None
+        The same of the least times: on a busy machine the steadier one.
     """
 
     name: str
     median_ms: float
     p99_ms: float
+    least_ms: float
     ratio: float | None = None
+    least_ratio: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +88,24 @@ class KernelReport:
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class Case:
+    """Something to be timed: its name, what to run with the round's number, and how many look-ups that takes."""
+
     name: str
     run: Callable[[int], object]
     look_ups: int | None = None
+
+
+def table(report: KernelReport) -> str:
+    """The report, for people."""
+    lines = [
+        f"kernels {report.kernels}; a bare look-up takes {report.lookup_ns:.2f} ns",
+        f"{'':48}{'median ms':>10}{'p99 ms':>10}{'/ look-ups':>12}",
+    ]
+    for timing in report.timings:
+        ratio = "" if timing.ratio is None else f"{timing.ratio:12.2f}"
+        lines.append(f"{timing.name:<48}{timing.median_ms:10.3f}{timing.p99_ms:10.3f}{ratio}")
+    return "\n".join(lines)
 
 
 def array_specs(count: int) -> list[ArraySpec]:
@@ -141,7 +159,7 @@ def measure(
     rounds: int = 200,
     arrays: Sequence[int] = (2, 4, 8),
     spacings_m: Sequence[float] = (0.1, 0.05, 0.02),
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> KernelReport:
     """Time every case on one thread.
 
@@ -153,35 +171,55 @@ def measure(
         How many take part, each at most `len(PLACES_M)`.
     spacings_m : sequence of float
         Of the grids that are searched.
-    progress : callable
+    progress : callable or None
         Gets the rounds done, and how many there are.
     """
     with threadpool_limits(limits=1):
         cases = list(_cases(arrays, spacings_m))
-        taken_ns = np.empty((len(cases), rounds), dtype=np.int64)
-        for case in cases:
-            case.run(0)
-            case.run(1)
-        for number in range(rounds):
-            for index, case in enumerate(cases):
-                begun_ns = clock.monotonic_ns()
-                case.run(number)
-                taken_ns[index, number] = clock.monotonic_ns() - begun_ns
-            progress(number + 1, rounds)
-    lookup_ns = float(np.median(taken_ns[0])) / LOOKED_UP
+        ms = timed_ms(clock, cases, rounds, progress)
+    floor_ms = ms[0] / LOOKED_UP
     timings = []
-    for case, ns in zip(cases[1:], taken_ns[1:], strict=True):
-        ratio = None if case.look_ups is None else float(np.median(ns)) / (case.look_ups * lookup_ns)
-        timings.append(Timing(case.name, float(np.median(ns)) / 1e6, float(np.percentile(ns, 99)) / 1e6, ratio))
-    return KernelReport(kernels.NAME, lookup_ns, tuple(timings))
+    for case, one in zip(cases[1:], ms[1:], strict=True):
+        median, least = float(np.median(one)), float(one.min())
+        ratio = least_ratio = None
+        if case.look_ups is not None:
+            ratio = median / (case.look_ups * float(np.median(floor_ms)))
+            least_ratio = least / (case.look_ups * float(floor_ms.min()))
+        timings.append(Timing(case.name, median, float(np.percentile(one, 99)), least, ratio, least_ratio))
+    return KernelReport(kernels.NAME, 1e6 * float(np.median(floor_ms)), tuple(timings))
 
 
-def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[_Case]:
+def timed_ms(
+    clock: Clock,
+    cases: Sequence[Case],
+    rounds: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> FloatArray:
+    """Milliseconds (cases, rounds) that each case takes in each round, all of them once a round; warmed up before."""
+    taken_ns = np.empty((len(cases), rounds))
+    for case in cases:
+        case.run(0)
+        case.run(1)
+    for number in range(rounds):
+        for index, case in enumerate(cases):
+            begun_ns = clock.monotonic_ns()
+            case.run(number)
+            taken_ns[index, number] = clock.monotonic_ns() - begun_ns
+        if progress is not None:
+            progress(number + 1, rounds)
+    return taken_ns / 1e6
+
+
+def bare_look_ups() -> Case:
+    """`LOOKED_UP` look-ups in tables of one array: what a map can at best be as fast as."""
     rng = np.random.default_rng(0)
     table, places = rng.standard_normal(6 * 1063, dtype=np.float32), rng.integers(0, 6 * 1063, LOOKED_UP, np.uint16)
     out = np.empty(LOOKED_UP, dtype=np.float32)
-    yield _Case("look-ups", lambda _: kernels.look_up(table, places, out))
+    return Case("look-ups", lambda _: kernels.look_up(table, places, out), LOOKED_UP)
 
+
+def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[Case]:
+    yield bare_look_ups()
     most = array_specs(max(arrays))
     blocks = Blocks(most)
     correlate = {spec.name: GCCPhat(spec, RATE_HZ, C_M_S) for spec in most}
@@ -193,8 +231,8 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[_Case
         sounds = made[kind, number % 12]
         return [HeardBy(s, correlate[s.name]([x])) for s, x in zip(most[:count], sounds, strict=False)]
 
-    yield _Case("GCC of a block, one array", lambda n: correlate[first.name]([made["voice", n % 12][0]]))
-    yield _Case("GCC of 1 s, one array", lambda n: correlate[first.name]([segments[n % 2]]))
+    yield Case("GCC of a block, one array", lambda n: correlate[first.name]([made["voice", n % 12][0]]))
+    yield Case("GCC of 1 s, one array", lambda n: correlate[first.name]([segments[n % 2]]))
     room = ((0.0, ROOM_M[0]), (0.0, ROOM_M[1]), (0.0, ROOM_M[2]))
     heard = {(kind, n): evidence(kind, n, len(most)) for kind in KINDS for n in range(12)}
     for spacing_m in spacings_m:
@@ -204,11 +242,11 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[_Case
             search.prepare(spec.name, correlate[spec.name].lags_s)
         for count in arrays:
             for kind in KINDS:
-                yield _Case(
+                yield Case(
                     f"peak, {count} arrays, {spacing_m:g} m, {kind}",
                     lambda n, kind=kind, count=count, search=search: search.among(heard[kind, n % 12][:count])(1),  # type: ignore[misc]
                 )
-        yield _Case(
+        yield Case(
             f"samples to peak, {arrays[0]} arrays, {spacing_m:g} m, voice",
             lambda n, search=search: search.among(evidence("voice", n, arrays[0]), Rule.SUM)(1),  # type: ignore[misc]
         )
@@ -223,11 +261,11 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[_Case
             mapper.add(power, one.gcc)
 
     pairs = sum(len(correlate[spec.name].pairs) for spec in specs)
-    yield _Case(f"map, {arrays[0]} arrays, 0.1 m", draw, pairs * grid.size)
+    yield Case(f"map, {arrays[0]} arrays, 0.1 m", draw, pairs * grid.size)
     estimator = SrpPhat(specs, Grid(room, 0.05), C_M_S)
 
     def locate(number: int) -> None:
         sounds = made["voice", number % 12]
         estimator.locate({s.name: Sound((x,), RATE_HZ) for s, x in zip(specs, sounds, strict=False)})
 
-    yield _Case(f"located, {arrays[0]} arrays, with covariance and confidence", locate)
+    yield Case(f"located, {arrays[0]} arrays, with covariance and confidence", locate)

@@ -19,8 +19,8 @@ from livessl.core import vectorised
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.peaks import FindPeaks, Peak, box_around
-from livessl.core.srp import LagPlaces, pair_weight
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy, IntArray, UInt8Array, UInt16Array
+from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray, UInt8Array, UInt16Array
 
 CELL_M: Final = 0.2
 """Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
@@ -195,3 +195,19 @@ class _Rows:
     pairs: IntArray
     scale: Float32Array
     offset: Float32Array
+
+
+def warm_up() -> None:
+    """Run every kernel once, so that nothing is compiled, or read from the compiler's cache, while somebody waits.
+
+    Without a cache, the first time on a machine, it takes some seconds; else a fraction of one.
+    """
+    spec = ArraySpec("warm-up", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), (100.0, 6000.0))
+    grid = Grid(((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)), 0.5)
+    lags_s = np.arange(-200, 201) / 400_000.0
+    heard = HeardBy(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
+    search = PeakSearch([spec], grid, 343.0)
+    search.prepare(spec.name, lags_s)
+    search.among([heard])(2)
+    SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
+    SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))

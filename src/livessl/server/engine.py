@@ -13,6 +13,7 @@ from livessl import wire
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
+from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
@@ -87,8 +88,7 @@ class Engine:
         self._method = method
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
-        self._lock = threading.Lock()
-        self._tracks: dict[int, JsonObject] = {}
+        self._tracks: dict[int, JsonObject] = {}  # replaced, never changed: other threads read it
         self._states: dict[str, str] = {}
         self._replay_now_ns: int | None = None
         self._replay_heard_ns = 0
@@ -99,8 +99,11 @@ class Engine:
         self._started_ns, self._began_ns = clock.now_ns(), clock.monotonic_ns()
         self.events = 0
         self.unkept = 0
+        self.unsaved = 0
+        """Events that wait for the store to take them."""
         self.maps = Maps(clock)
         self.latency = Latency()
+        warm_up()
         self._begin_live()
         self._receiver = Receiver(site, clock)
 
@@ -128,11 +131,6 @@ class Engine:
     def mode(self) -> str:
         """Live; or replay from a recorded session's first sound on, until a live node comes."""
         return "live" if self._replay_now_ns is None else "replay"
-
-    @property
-    def unsaved(self) -> int:
-        """Events that wait for the store to take them."""
-        return sum(len(unsaved.events) for unsaved in list(self._unsaved))
 
     @property
     def malformed(self) -> int:
@@ -168,15 +166,12 @@ class Engine:
         return (self._clock.monotonic_ns() - self._began_ns) / 1e9
 
     def arrays(self) -> list[JsonObject]:
-        """How every array is doing; from any thread."""
-        with self._lock:
-            statuses = self._settling.status(self.now_ns())
-        return [self._array(status) for status in statuses]
+        """How every array is doing; from any thread, and without waiting for a localization that is going on."""
+        return [self._array(status) for status in self._settling.status(self.now_ns())]
 
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
-        with self._lock:
-            return list(self._tracks.values())
+        return list(self._tracks.values())
 
     def _array(self, status: ArrayStatus) -> JsonObject:
         ingest, settling = self._receiver.ingest, self._settling
@@ -244,9 +239,8 @@ class Engine:
             return
         if isinstance(item, Joined):
             self._join(item.hello)
-        with self._lock:
-            for array in item.hello.arrays:
-                self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
+        for array in item.hello.arrays:
+            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
 
     def _watch_arrays(self, now_ns: int) -> None:
         arrays = self.arrays()
@@ -263,14 +257,13 @@ class Engine:
 
     def _join(self, hello: wire.Hello) -> None:
         if hello.replay or self._replay_now_ns is not None:
-            with self._lock:
-                if hello.replay:
-                    self._begin(hello.arrays, None)
-                else:
-                    self._begin_live()
-                self._replay_now_ns = 0 if hello.replay else None
-                self._replaying = hello.replay
-                self._replay_heard_ns = self._clock.monotonic_ns()
+            if hello.replay:
+                self._begin(hello.arrays, None)
+            else:
+                self._begin_live()
+            self._replay_now_ns = 0 if hello.replay else None
+            self._replaying = hello.replay
+            self._replay_heard_ns = self._clock.monotonic_ns()
         for array, rate_hz in hello.arrays.items():
             self._settling.live.prepare(array, rate_hz)
 
@@ -279,17 +272,13 @@ class Engine:
         if hello.replay:
             self._end_replay()
             return
-        with self._lock:
-            for array in hello.arrays:
-                self._settling.leave(array)
+        for array in hello.arrays:
+            self._settling.leave(array)
 
     def _end_replay(self) -> None:
         """Tell what is still open. Map, arrays and time stay as they were at the end, to be looked at."""
-        with self._lock:
-            outputs = self._settling.flush(self.now_ns())
-        self._tell(outputs)
-        with self._lock:
-            ended, self._tracks = list(self._tracks.values()), {}
+        self._tell(self._settling.flush(self.now_ns()))
+        ended, self._tracks = list(self._tracks.values()), {}
         for track in ended:
             self._publish({**track, "state": str(TrackState.END)})
         self._replaying = False
@@ -304,9 +293,7 @@ class Engine:
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
-        with self._lock:
-            outputs = self._settling.step(batch, self.now_ns())
-        self._tell(outputs)
+        self._tell(self._settling.step(batch, self.now_ns()))
         if not self._unsaved:
             self._receiver.ingest.settled = self._settling.settled
 
@@ -388,19 +375,19 @@ class Engine:
                 _log.error("%s", error)
                 break
             self._unsaved.popleft()
-        while self.unsaved > MAX_UNSAVED:
-            self.unkept += len(self._unsaved.popleft().events)
+        waiting = sum(len(unsaved.events) for unsaved in self._unsaved)
+        while waiting > MAX_UNSAVED:
+            lost = len(self._unsaved.popleft().events)
+            self.unkept, waiting = self.unkept + lost, waiting - lost
+        self.unsaved = waiting
 
     def _publish_event(self, event: JsonObject) -> None:
         self.events += 1
         self._publish(event)
 
     def _keep_track(self, message: JsonObject, track: Track) -> None:
-        with self._lock:
-            if track.state is TrackState.END:
-                self._tracks.pop(track.id, None)
-            else:
-                self._tracks[track.id] = message
+        others = {number: other for number, other in self._tracks.items() if number != track.id}
+        self._tracks = others if track.state is TrackState.END else {**others, track.id: message}
         self._publish(message)
 
 

@@ -115,6 +115,11 @@ class Subscription:
             return False
         return True
 
+    @property
+    def lags(self) -> bool:
+        """Whether there is more to send."""
+        return bool(self._waiting)
+
     async def next(self) -> Told:
         """The next message, waiting for one; first of all the past that was asked for, then how many were missed."""
         if self.past:
