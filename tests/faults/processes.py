@@ -86,7 +86,7 @@ class Playing:
 
     recordings: Path
     directory: Path
-    lead_s: float = 20.0
+    lead_s: float = 40.0
     seed: int = 0
     proxies: dict[str, Proxy] = field(default_factory=dict)
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
