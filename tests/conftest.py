@@ -7,8 +7,16 @@ import os
 import pytest
 from hypothesis import settings
 
+from livessl.core.search import warm_up
+
 settings.register_profile("livessl", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("livessl")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _compiled() -> None:
+    """No test's patience is spent on the compiler."""
+    warm_up()
 
 
 def require(condition: bool, reason: str) -> None:

@@ -20,17 +20,19 @@ import numpy as np
 import pytest
 import soundfile
 import yaml
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from livessl import __version__, demo
+from livessl import __version__, cli, demo
 from livessl.capture.link import Link
 from livessl.cli import main
 from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.config import ConfigError, Fault, Site
 from livessl.server.receiver import Receiver
 from livessl.session import read_session
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
-COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices")
+COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices", "bench")
 STOP_S = 5.0
 """How long a command may take to end on Ctrl-C or SIGTERM."""
 
@@ -125,6 +127,8 @@ def test_version(run: Run) -> None:
         ("locate --site s.yaml --wav =n.wav", "expected ARRAY=FILE, got '=n.wav'"),
         ("locate --site s.yaml --wav n=n.wav --channels n=1,two", "expected ARRAY=1,2,3,4, got 'n=1,two'"),
         ("locate --site s.yaml --wav n=n.wav --channels 1,2,3,4", "expected ARRAY=1,2,3,4, got '1,2,3,4'"),
+        ("locate --site s.yaml --wav n=n.wav --joint both=n", "expected NAME=ARRAY,ARRAY with two arrays or more"),
+        ("serve --site s.yaml --joint =n,s", "expected NAME=ARRAY,ARRAY with two arrays or more, got '=n,s'"),
         ("locate --site s.yaml --wav n=n.wav --method music", "invalid choice: 'music'"),
         ("replay d --speed 0", "expected a number > 0 or 'max', got '0'"),
         ("replay d --speed fast", "expected a number > 0 or 'max', got 'fast'"),
@@ -682,3 +686,37 @@ def test_demo_on_a_port_in_use_says_so_at_once(capsys: pytest.CaptureFixture[str
         taken.listen()
         assert main(["demo", "--once", "--port", str(taken.getsockname()[1])]) == 1
     assert "cannot be used: Address already in use" in capsys.readouterr().err
+
+
+def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    seen: list[set[int]] = []
+    monkeypatch.setattr(cli, "load_site", lambda _: seen.append(threads()) or site_of())  # type: ignore[func-returns-value]
+    with threadpool_limits(limits=2, user_api="blas"):
+        if threads() != {2}:
+            pytest.skip("this machine's BLAS has one thread anyway")
+        assert run("check", write_site(tmp_path)).code == 0
+        assert threads() == {2}
+    assert seen == [{1}]
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["its own site", "a site that is given"])
+def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
+    tmp_path: Path, own: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = {"server.http": {"host": "0.0.0.0", "port": 8001, "tokens": "tokens.yaml"}, "keys": "keys"}
+    path, session = write_site(tmp_path, there), tmp_path / "session"
+    made = ["simulate", "--site", str(path), "--rt60", "0", "--count", "1", "--sample-rate", str(RATE_HZ)]
+    assert main([*made, "--out", str(session)]) == 0
+
+    def refuse(site: Site, *_: object, **__: object) -> None:
+        raise ConfigError(
+            [Fault(site.server.http.host, f"{site.server.http.port} {site.server.http.tokens} {site.keys}")]
+        )
+
+    monkeypatch.setattr("livessl.cli.Server", refuse)
+    assert main(["replay", str(session), *([] if own else ["--site", str(path)])]) == 2
+    expected = "127.0.0.1: 8001 None None" if own else "0.0.0.0: 8001 tokens.yaml None"
+    assert expected in capsys.readouterr().err

@@ -46,10 +46,14 @@ def line_of(text: str, path: str) -> int | None:
 
 ARRAY = "arrays.north"
 NODE = "nodes.lab-pc"
+JOINT = "joint.both"
+WEST: Changes = {"microphones_m": [[1.0, 1.0, 1.0], [1.0, 1.2, 1.0]]}
+PI: Changes = {"device": {"name": "pi", "sample_rate_hz": 16000}, "arrays": {"south": [1, 2, 3, 4]}}
 ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "unknown key": ({"colour": "red"}, "colour", "unknown key; correct its spelling or take it away"),
     "unknown key inside": ({f"{ARRAY}.positon_m": [1, 1, 1]}, f"{ARRAY}.positon_m", "unknown key"),
     "our own key": ({"specs": []}, "specs", "unknown key"),
+    "another key of our own": ({"processed": []}, "processed", "unknown key"),
     "missing key": ({"room": ...}, "room", "missing; add it"),
     "missing key inside": ({f"{NODE}.device.name": ...}, f"{NODE}.device.name", "missing; add it"),
     "missing device": ({f"{NODE}.device": ...}, f"{NODE}.device", "missing; add it"),
@@ -123,7 +127,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "grid too fine": (
         {"grid.spacing_m": 0.01},
         "grid.spacing_m",
-        r"a grid of 60,000,000 nodes and 12 pairs needs 9,600 MB, allowed are 1,024 MB; use a spacing of 0.022 m",
+        r"a grid of 60,000,000 nodes .* allowed are 50,000,000; use a spacing of 0.011 m or more",
     ),
     "grid inside out": (
         {"grid.bounds_m": [[0, 4], [5, 0], [0, 3]]},
@@ -210,6 +214,63 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     ),
     "device type of no kind": ({f"{NODE}.device.type": ["wav"]}, f"{NODE}.device", "expected one of sound, wav, scene"),
     "device that is a name": ({f"{NODE}.device": "UMC"}, f"{NODE}.device", "expected a mapping such as .* got 'UMC'"),
+    "joint array of one": ({JOINT: ["north"]}, JOINT, "at least 2 items"),
+    "joint array of no list": ({JOINT: "north"}, JOINT, "valid tuple.*got 'north'"),
+    "joint array of nobody": ({JOINT: ["north", "west"]}, f"{JOINT}.west", "no such array; arrays are north, south"),
+    "joint array of one twice": ({JOINT: ["north", "north"]}, f"{JOINT}.north", "already joined in 'both'; take it"),
+    "array in two joint ones": (
+        {
+            JOINT: ["north", "south"],
+            "arrays.west": WEST,
+            f"{NODE}.arrays.west": [9, 10],
+            "joint.two": ["west", "north"],
+        },
+        "joint.two.north",
+        "already joined in 'both'; take it away here or there",
+    ),
+    "joint array that is called as one": ({"joint.south": ["north", "south"]}, "joint.south", "is called so already"),
+    "joint array that is called as the map of all": ({"joint.fused": ["north", "south"]}, "joint.fused", "rename it"),
+    "joint array of a bad name": ({"joint.the two": ["north", "south"]}, "joint.the two", "rename it"),
+    "joint array of two nodes": (
+        {JOINT: ["north", "south"], f"{NODE}.arrays.south": ..., "nodes.pi": PI},
+        JOINT,
+        "^joint processing expects arrays sampled by one clock, got 'north' by node 'lab-pc', 'south' by node 'pi'; "
+        "record them through one device, or let their maps be summed instead$",
+    ),
+    "joint array of a node and of none": (
+        {JOINT: ["north", "south"], f"{NODE}.arrays.south": ...},
+        JOINT,
+        "by one clock, got 'north' by node 'lab-pc', 'south' by no node; record them",
+    ),
+    "joint array of two bands": (
+        {JOINT: ["north", "south"], f"{ARRAY}.band_hz": [100, 3000]},
+        JOINT,
+        r"expects arrays of one band, got \[\(100.0, 3000.0\), \(100.0, 6000.0\)\] Hz; give them one band_hz",
+    ),
+    "joint array of two beginnings": (
+        {JOINT: ["north", "south"], f"{ARRAY}.wav_offset_s": 0.5},
+        JOINT,
+        "expected arrays of one wav_offset_s, since they are recorded together, got 0, 0.5",
+    ),
+    "joint array of eighteen microphones": (
+        {
+            f"{ARRAY}.geometry": {"line": {"spacing_m": 0.05, "count": 14}},
+            f"{NODE}.arrays": {"north": list(range(1, 15)), "south": list(range(15, 19))},
+            JOINT: ["north", "south"],
+        },
+        JOINT,
+        "expects 16 microphones at most, got 18; join fewer arrays",
+    ),
+    "joint arrays at one place": (
+        {"arrays.south.position_m": [1.9, 1.3, 1.4], JOINT: ["north", "south"]},
+        JOINT,
+        r"microphone 1 of 'north' and microphone 1 of 'south' are at one place \(1.9, 1.3, 1.5837\); correct one",
+    ),
+    "min_arrays of joint ones": (
+        {"fusion.min_arrays": 2, JOINT: ["north", "south"]},
+        "fusion.min_arrays",
+        r"at most the number of arrays, 1 \(joint ones are one\), got 2",
+    ),
     "level above full scale": ({"activity.min_level_dbfs": 1e6}, "activity.min_level_dbfs", "less than or equal to 0"),
 }
 
@@ -237,13 +298,13 @@ def test_duplicate_key_names_the_second() -> None:
 
 
 def test_spacing_that_is_suggested_does_pass() -> None:
-    changes: Changes = {"grid.spacing_m": 0.004, "grid.max_memory_mb": 30.0}
+    changes: Changes = {"grid.spacing_m": 0.004}
     [(_, said)] = faults_of(text_of(changes))
     suggested = re.search(r"use a spacing of ([0-9.]+) m", said)
     assert suggested is not None
     spacing_m = float(suggested[1])
     site_of(changes | {"grid.spacing_m": spacing_m})
-    # and it is not needlessly coarse: half of it needs eight times the memory
+    # and it is not needlessly coarse: half of it has eight times the nodes
     faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
 
 
@@ -271,8 +332,9 @@ def test_several_faults_come_at_once() -> None:
 
 def test_one_array_that_is_wrong_accuses_nobody_else() -> None:
     changes: Changes = {f"{ARRAY}.position_m": "here", "fusion.min_arrays": 2, "arrays.south.position_m": [9, 9, 9]}
-    places = [where.rpartition(": ")[2] for where, _ in faults_of(text_of(changes))]
-    assert places == [f"{ARRAY}.position_m", "arrays.south"]
+    for more in ({}, {JOINT: ["north", "south"]}):
+        places = [where.rpartition(": ")[2] for where, _ in faults_of(text_of(changes | more))]
+        assert places == [f"{ARRAY}.position_m", "arrays.south"]
 
 
 @pytest.mark.parametrize(
@@ -462,6 +524,11 @@ def test_what_is_suggested_against_wide_arrays_helps() -> None:
     assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [4000, 16000]}}}).warnings == ()
 
 
+def test_joint_array_too_wide_for_the_grid_is_warned_of() -> None:
+    [said] = site_of({JOINT: ["north", "south"]}).warnings
+    assert re.search("array 'both' is 2.8 m wide: .*; positions may be wrong: .* or take joint.both away", said)
+
+
 def test_usual_arrays_are_not_warned_of() -> None:
     half_a_metre = {"geometry": {"tetrahedron": {"edge_m": 0.5}}}
     assert site_of({"grid.spacing_m": 0.1, f"{ARRAY}.geometry": half_a_metre["geometry"]}).warnings == ()
@@ -515,10 +582,11 @@ WHOLE = small(
         "temperature_c": 20.0,
         "activity": {"threshold": 0.1, "floor_factor": 4.0, "min_level_dbfs": -90.0},
         "fusion": {"method": "srp-phat", "min_arrays": 1},
-        "grid": {"spacing_m": 0.5, "bounds_m": [[0, 4], [0, 5], [0, 3]], "max_memory_mb": 100},
+        "grid": {"spacing_m": 0.5, "bounds_m": [[0, 4], [0, 5], [0, 3]]},
         "arrays.north.orientation_deg": {"yaw": 10.0},
         "arrays.west": {"microphones_m": [[1, 1, 1], [1, 2, 1]], "band_hz": [100, 5000]},
         "nodes.player": {"device": {"type": "scene", "rt60_s": 0.3}, "arrays": {"west": [1, 2]}},
+        JOINT: ["north", "south"],
     }
 )
 
@@ -558,3 +626,4 @@ def assert_usable(site: Site) -> None:
     assert site.activity_parameters().min_power >= 0
     assert site.c_m_s > 0
     assert len(site.specs) == len(site.arrays)
+    assert {name for spec in site.processed for name in site.members(spec.name)} == set(site.arrays)

@@ -11,7 +11,7 @@ import pytest
 
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.types import ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
-from livessl.messages import JsonObject, Messages, array_status, dbfs
+from livessl.messages import JsonObject, Messages, Stages, array_status, dbfs
 from small_site import site_of
 
 ORIGIN_NS = 1_767_225_600_000_000_000
@@ -36,6 +36,7 @@ EVENT = Event(
     late_frames=2,
     latency_s=0.31234567,
 )
+UPDATE = Update("small-1", Status.DIRECTION_ONLY, ESTIMATE, 0.001, EVENT.contributions, ORIGIN_NS + 1_350_000_000)
 TRACK = Track(3, TrackState.NEW, ORIGIN_NS, np.array([0.5, 0.5, 1.0]), np.array([0.1, 0.0, -0.2]), np.eye(3) * 0.01)
 
 PROMISED: dict[str, type | tuple[type, ...]] = {
@@ -122,16 +123,26 @@ def test_refused_event_is_nowhere() -> None:
 
 
 def test_update() -> None:
-    told = messages().update(Update("small-1", Status.DIRECTION_ONLY, ESTIMATE, 0.001, EVENT.contributions))
+    told = messages().update(UPDATE)
     assert told["kind"] == "update"
     assert told["event_id"] == "small-1"
     assert told["status"] == "direction-only"
     assert [contribution["array"] for contribution in told["contributions"]] == ["north"]
     assert (told["time_utc"], told["start_s"]) == ("2026-01-01T00:00:01.250000Z", 1.25)
+    assert told["end_utc"] == "2026-01-01T00:00:01.350000Z"
     assert told["position_m"] == [0.5123, 0.7, 1.1]
     assert told["level_dbfs"] == -30.0
+    assert told["latency_s"] is told["latency_stages_s"] is None  # unknown, as in a replay
     assert told["zones"] == ["door"]
     assert strict_json(told) == told
+
+
+def test_latency_by_stages() -> None:
+    stages = Stages(waited=0.3, sent=0.0123, received=-0.0004, located=0.00567)
+    told = {"waited": 0.3, "sent": 0.0123, "received": -0.0004, "located": 0.0057}
+    for message in (messages().event(EVENT, stages), messages().update(UPDATE, stages)):
+        assert message["latency_stages_s"] == told
+        assert message["latency_s"] == 0.3176  # measured after all, not what the event says of itself
 
 
 @pytest.mark.parametrize("state", list(TrackState))

@@ -107,3 +107,12 @@ def test_session_whose_site_is_gone(tmp_path: Path) -> None:
     (tmp_path / "site.yaml").unlink()
     with pytest.raises(ConfigError, match=r"site\.yaml: cannot be read: No such file"):
         read_session(tmp_path).site()
+
+
+def test_session_says_nothing_of_where_secrets_are() -> None:
+    """It goes elsewhere, and is played there without them."""
+    secrets = {"tokens": "tokens.yaml", "certificate": "site.crt", "private_key": "site.key"}
+    site = site_of({"keys": "keys", "server.http": {"host": "0.0.0.0", "port": 8001, **secrets}})
+    written = yaml.safe_load(site_text(site))
+    assert "keys" not in written
+    assert written["server"]["http"] == {"host": "0.0.0.0", "port": 8001}

@@ -62,11 +62,15 @@ HELLOS = st.builds(
     arrays=st.dictionaries(NAMES, RATES, max_size=6),
     replay=st.booleans(),
     problem=TEXTS,
+    backlog=st.dictionaries(
+        NAMES, st.lists(RASTERS, min_size=2, max_size=2, unique=True).map(lambda ends: tuple(sorted(ends))), max_size=6
+    ),
 )
 ACKS = st.builds(
     Ack,
     run_id=NAMES,
-    sequences=st.dictionaries(NAMES, st.integers(0, 2**63 - 1), max_size=6),
+    received=st.dictionaries(NAMES, RASTERS, max_size=6),
+    settled=st.none() | RASTERS,
     who_are_you=st.booleans(),
     refused=TEXTS,
 )
@@ -75,8 +79,8 @@ BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
 EXAMPLES: list[WireMessage] = [
     frame(),
     mark(),
-    Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged"),
-    Ack("run", {"north": 7}),
+    Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged", backlog={"north": (7, 9)}),
+    Ack("run", {"north": 7}, 5),
     Bye("lab-pc", "run"),
 ]
 
@@ -142,7 +146,7 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
 @given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
 @settings(max_examples=500, deadline=None)
 def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
-    for data in (body, struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + body):
+    for data in (body, struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + body):
         with contextlib.suppress(WireError):
             decode(data)
 
@@ -161,22 +165,26 @@ JSON_VALUES = st.recursive(
 
 
 @given(
-    st.sampled_from([(3, "node run_id arrays replay problem"), (4, "run_id sequences who_are_you refused")]), st.data()
+    st.sampled_from(
+        [(3, "node run_id arrays replay problem backlog"), (4, "run_id received settled who_are_you refused")]
+    ),
+    st.data(),
 )
 @settings(max_examples=300, deadline=None)
 def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
     kind, names = form
     fields = {name: data.draw(JSON_VALUES) for name in names.split()}
     try:
-        message = decode(struct.pack("<4sBB", b"LSSL", wire.VERSION, kind) + json.dumps(fields).encode())
+        message = decode(struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + json.dumps(fields).encode())
     except WireError:
         return
     encode(message)
 
 
 def hello_with(**fields: Any) -> bytes:
-    whole = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None, **fields}
-    return encode(EXAMPLES[2])[:6] + json.dumps(whole).encode()
+    whole: dict[str, Any] = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None}
+    whole |= {"backlog": {}, **fields}
+    return encode(EXAMPLES[2])[: struct.calcsize("<4sBBq")] + json.dumps(whole).encode()
 
 
 def test_hello_of_plain_json_is_taken() -> None:
@@ -206,6 +214,12 @@ def test_hello_of_plain_json_is_taken() -> None:
         {"problem": 3},
         {"problem": "p" * 1001},
         {"problem": "half a pair: \udc00"},
+        {"backlog": None},
+        {"backlog": {"n": 7}},
+        {"backlog": {"n": [7]}},
+        {"backlog": {"n": [7, 7]}},
+        {"backlog": {"n": [7, 8.5]}},
+        {"backlog": {"n": [7, 2**62]}},
         {"extra": 1},
     ],
     ids=str,
@@ -215,11 +229,21 @@ def test_field_of_a_wrong_value_is_refused(fields: dict[str, Any]) -> None:
     assert said.startswith("hello: ")
 
 
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_message_says_when_it_was_sent(message: WireMessage) -> None:
+    data = encode(message)
+    assert wire.sent_ns(data) == 0
+    sent = wire.stamped(wire.stamped(data, 7), 1_767_225_600_123_456_789)
+    assert wire.sent_ns(sent) == 1_767_225_600_123_456_789
+    assert wire.stamped(sent, 0) == data
+    assert encode(decode(sent)) == data
+
+
 def test_wrong_head_says_what_was_expected() -> None:
     data = encode(EXAMPLES[1])
     assert "at least a header" in refusal(data[:5])
     assert "beginning with b'LSSL', got b'HTTP'" in refusal(b"HTTP" + data[4:])
-    assert "expected wire version 1, got 2; run the same livessl" in refusal(data[:4] + b"\2" + data[5:])
+    assert "expected wire version 2, got 1; run the same livessl" in refusal(data[:4] + b"\1" + data[5:])
     assert "known kind of message, got 9" in refusal(data[:5] + b"\x09" + data[6:])
 
 

@@ -16,7 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from livessl import __version__, demo, progress, replay
+from livessl import keys as keyring
+from livessl.bench import kernels as kernel_bench
+from livessl.bench import live as live_bench
 from livessl.capture.devices import DeviceError
 from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
 from livessl.capture.record import Recorder, record_device, record_parts
@@ -29,13 +34,26 @@ from livessl.capture.recorded import (
     repeated,
     span_ns,
 )
+from livessl.capture.spool import SpoolError
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
-from livessl.config import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig, check_endpoint, load_site
+from livessl.config import (
+    ConfigError,
+    Fault,
+    HttpConfig,
+    NodeConfig,
+    Site,
+    SoundDeviceConfig,
+    StoreConfig,
+    check_endpoint,
+    load_site,
+    open_doors,
+)
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
 from livessl.plan import design, figure, words
+from livessl.processes import NotStartedError
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
@@ -58,6 +76,18 @@ WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
+_FAILURES: Final = (
+    BindError,
+    NotStartedError,
+    SinkError,
+    SpoolError,
+    StoreError,
+    UndeliveredError,
+    demo.DemoError,
+    figure.FigureError,
+)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code.
 
@@ -69,7 +99,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
     try:
-        with _sigterm_interrupts():
+        # the products are small: a second thread spins more than it works, eight times the processor's time in all
+        with _sigterm_interrupts(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except (ConfigError, DeviceError) as error:
         for line in str(error).splitlines():
@@ -78,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
+    except (*_FAILURES, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -133,10 +164,12 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("serve", _serve, "run the fusion server with API and dashboard", "livessl serve --site site.yaml")
     _add_site(sub)
     _add_method(sub)
+    _add_joint(sub)
 
     sub = command("capture", _capture, "run a capture node", "livessl capture --site site.yaml --node lab-pc")
     _add_site(sub)
     sub.add_argument("--node", required=True, help="name of the node in the site file")
+    _add_joint(sub)
     _add_wav(sub, "play FILE at real speed instead of the device; give it for each array of the node")
     sub.add_argument("--loop", action="store_true", help="play the files again and again")
     sub.add_argument(
@@ -155,6 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_site(sub)
     _add_wav(sub, "recording of an array; all begin together", required=True)
     _add_method(sub)
+    _add_joint(sub)
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
 
     sub = command("replay", _replay, "play a recorded session through a server", "livessl replay session/ --speed 2")
@@ -169,6 +203,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
     _add_method(sub)
+    _add_joint(sub)
 
     sub = command(
         "record", _record, "record a session for replay", "livessl record --site site.yaml --node lab-pc --out session/"
@@ -202,7 +237,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluation.add_arguments(sub)
 
+    _add_bench(command)
     _add_plan(command)
+
+    _add_keys(command)
 
     sub = command("check", _check, "validate a site file, all faults at once", "livessl check site.yaml")
     sub.add_argument("site", type=Path)
@@ -211,6 +249,24 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("devices", _devices, "list audio devices", "livessl devices")
     sub.add_argument("--json", action="store_true", help="print the list as JSON")
     return parser
+
+
+def _add_bench(command: Callable[..., Any]) -> None:
+    sub = command(
+        "bench",
+        _bench,
+        "measure how much this machine carries, and how fast it answers",
+        "livessl bench --live --arrays 64 --clients 20 --seconds 30",
+    )
+    sub.add_argument("--live", action="store_true", help="a server under load, instead of the kernels alone")
+    sub.add_argument("--arrays", type=_positive, default=4, help="live: that sound all the time (default 4)")
+    sub.add_argument("--clients", type=_positive, default=4, help="live: that subscribe (default 4)")
+    sub.add_argument("--watchers", type=_count, default=0, help="live: that watch the power map (default none)")
+    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="live: to measure, after a warm-up (default 20)")
+    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="live: of the grid (default 0.1)")
+    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="live: of the simulated room (default 0.3)")
+    sub.add_argument("--spin", action="store_true", help="live: let a foreign process spin on each core")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_plan(command: Callable[..., Any]) -> None:
@@ -234,12 +290,54 @@ def _add_plan(command: Callable[..., Any]) -> None:
     sub.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
 
 
+def _add_keys(command: Callable[..., Any]) -> None:
+    example = "livessl keys token --site site.yaml --name wall"
+    keys = command("keys", _keys_list, "make and enrol keys and tokens", example)
+    deeds = keys.add_subparsers(title="what to do", metavar="WHAT", required=True)
+
+    def deed(name: str, run: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
+        sub = deeds.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + ".", epilog=f"example: livessl keys {example}"
+        )
+        sub.set_defaults(run=run)
+        _add_site(sub)
+        return sub
+
+    deed("server", _keys_server, "make the server's key pair", "server --site site.yaml")
+    sub = deed("node", _keys_node, "make a node's key pair, on the node", "node lab-pc --site site.yaml --server 4f8a…")
+    sub.add_argument("name", help="of the node in the site file; `replay` for who plays sessions to a server")
+    sub.add_argument("--server", type=_key, metavar="KEY", help="the server's public key, as `keys server` told it")
+    sub = deed("enrol", _keys_enrol, "let a node in, on the server", "enrol lab-pc 9c01… --site site.yaml")
+    sub.add_argument("name", help="of the node in the site file")
+    sub.add_argument("key", type=_key, help="the node's public key, as `keys node` told it")
+    sub = deed("token", _keys_token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
+    sub.add_argument("--name", required=True, help="of the client, to revoke it by")
+    sub.add_argument("--role", choices=[str(role) for role in keyring.Role], default="viewer", help="default viewer")
+    sub = deed("revoke", _keys_revoke, "let a node or a client in no longer", "revoke --site site.yaml --token wall")
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument("--node", metavar="NAME")
+    which.add_argument("--token", metavar="NAME")
+    sub = deed("list", _keys_list, "tell who may connect", "list --site site.yaml")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+
+
 def _add_site(parser: Any) -> None:
     parser.add_argument("--site", type=Path, required=True, help="site file")
 
 
 def _add_method(parser: Any) -> None:
     parser.add_argument("--method", choices=sorted(ESTIMATORS), help="estimator (default: the site's)")
+
+
+def _add_joint(parser: Any) -> None:
+    parser.add_argument(
+        "--joint",
+        action="append",
+        type=_joint,
+        default=[],
+        metavar="NAME=ARRAY,ARRAY,…",
+        help="process arrays of one node as one of all their microphones, besides what the site file joins",
+    )
 
 
 def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
@@ -254,6 +352,27 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         metavar="ARRAY=1,2,3,4",
         help="channels of the file, from 1, in microphone order",
     )
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    if not arguments.live:
+        with progress.counted("measuring", "round") as show:
+            report = kernel_bench.measure(SystemClock(), progress=show)
+        print(json.dumps(report.as_json()) if arguments.json else kernel_bench.table(report))
+        return OK
+    demand = live_bench.Demand(
+        arrays=arguments.arrays,
+        clients=arguments.clients,
+        seconds=arguments.seconds,
+        watchers=arguments.watchers,
+        spacing_m=arguments.spacing,
+        rt60_s=arguments.rt60,
+        spin=arguments.spin,
+    )
+    with progress.counted("measuring", "s") as show:
+        outcome = live_bench.measure(demand, SystemClock(), progress=show)
+    print(json.dumps(outcome.json()) if arguments.json else live_bench.table(outcome))
+    return OK
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -317,7 +436,7 @@ def _demo_json(outcome: demo.Outcome) -> str:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
     logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
@@ -333,7 +452,7 @@ def _run_server(server: Server) -> None:
 
 
 def _capture(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     config = _node(site, arguments.node, arguments.site)
     _check_played(arguments, config)
     clock = SystemClock()
@@ -396,7 +515,7 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
 
 
 def _locate(arguments: argparse.Namespace) -> int:
-    site = load_site(arguments.site)
+    site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     parts = parts_from_wavs(site, *_wavs(arguments))
     messages = Messages(site, 0, utc=False)
@@ -431,14 +550,17 @@ def _print_event(event: JsonObject, *, as_json: bool) -> None:
 
 def _replay(arguments: argparse.Namespace) -> int:
     sessions = [read_session(directory) for directory in arguments.directories]
-    site = load_site(arguments.site) if arguments.site else sessions[0].site()
+    joint = _once_each(arguments.joint, "--joint")
+    site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
     parts = parts_from_sessions(site, sessions)
     if arguments.server is not None:
         with _polite_stop() as stop:
             _send(site, arguments.server, parts, arguments.speed, stop)
         return OK
-    here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "events_db": None, "sinks": ()})
-    site = site.model_copy(update={"server": here})
+    # keys and history are the real server's; a session's own site says nothing of who may look here
+    http = site.server.http if arguments.site else HttpConfig(port=site.server.http.port)
+    here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "http": http, "events_db": None, "sinks": ()})
+    site = site.model_copy(update={"server": here, "keys": None, "store": StoreConfig()})
     show: Callable[[JsonObject], None] = lambda event: _print_event(event, as_json=arguments.json)  # noqa: E731
     server = Server(site, SystemClock(), method=arguments.method, on_event=show)
     logging.info("dashboard on %s", server.url)
@@ -476,6 +598,9 @@ def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: 
 
 def _record(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
+    if site.privacy == "positions-only":
+        what = "positions-only: no sound may be stored, so nothing is recorded; change it if everyone there agrees"
+        raise ConfigError([Fault(f"{arguments.site}: privacy", what)])
     config = _node(site, arguments.node, arguments.site)
     _check_played(arguments, config)
     _refuse_recordings(arguments.out)
@@ -575,6 +700,9 @@ def _plan(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     try:
         site = load_site(arguments.site)
+        doors = open_doors(site)
+        if doors:
+            raise ConfigError([Fault(f"{arguments.site}: {door.where}", door.what) for door in doors])
     except ConfigError as error:
         if arguments.json:
             faults = [{"where": fault.where, "what": fault.what} for fault in error.faults]
@@ -587,8 +715,77 @@ def _check(arguments: argparse.Namespace) -> int:
         print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
     else:
         _tell_warnings(site)
-        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.specs)
+        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)
         print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid nodes")
+    return OK
+
+
+def _keys_folder(arguments: argparse.Namespace) -> Path:
+    site = load_site(arguments.site)
+    if site.keys is None:
+        what = "expected the folder that holds the keys, got none; add keys: keys to the site file"
+        raise ConfigError([Fault(f"{arguments.site}: keys", what)])
+    return site.file(site.keys)
+
+
+def _tokens_file(arguments: argparse.Namespace) -> Path:
+    site = load_site(arguments.site)
+    if site.server.http.tokens is None:
+        what = "expected the file that holds the tokens, got none; add tokens: tokens.yaml to server.http"
+        raise ConfigError([Fault(f"{arguments.site}: server.http.tokens", what)])
+    return site.file(site.server.http.tokens)
+
+
+def _keys_server(arguments: argparse.Namespace) -> int:
+    key = keyring.make_server_keys(_keys_folder(arguments))
+    print(key.hex())
+    logging.info("the server's public key; on each node: livessl keys node NAME --site SITE --server %s", key.hex())
+    return OK
+
+
+def _keys_node(arguments: argparse.Namespace) -> int:
+    key = keyring.make_node_keys(_keys_folder(arguments), arguments.name, arguments.server)
+    print(key.hex())
+    logging.info(
+        "the node's public key; on the server: livessl keys enrol %s %s --site SITE", arguments.name, key.hex()
+    )
+    return OK
+
+
+def _keys_enrol(arguments: argparse.Namespace) -> int:
+    keyring.enrol(_keys_folder(arguments), arguments.name, arguments.key)
+    logging.info("node %r is enrolled; a running server knows it once it is restarted", arguments.name)
+    return OK
+
+
+def _keys_token(arguments: argparse.Namespace) -> int:
+    print(keyring.add_token(_tokens_file(arguments), arguments.name, arguments.role))
+    logging.info("this is the only time that the token is shown; a running server knows it once it is restarted")
+    return OK
+
+
+def _keys_revoke(arguments: argparse.Namespace) -> int:
+    if arguments.node is not None:
+        keyring.dismiss(_keys_folder(arguments), arguments.node)
+    else:
+        keyring.revoke_token(_tokens_file(arguments), arguments.token)
+    logging.info("a running server forgets it once it is restarted")
+    return OK
+
+
+def _keys_list(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    nodes = {} if site.keys is None else keyring.enrolled(site.file(site.keys))
+    tokens = site.server.http.tokens
+    clients = () if tokens is None else keyring.read_tokens(site.file(tokens)).clients
+    if arguments.json:
+        told = [{"name": client.name, "role": str(client.role)} for client in clients]
+        print(json.dumps({"nodes": {name: key.hex() for name, key in nodes.items()}, "clients": told}))
+        return OK
+    for name, key in nodes.items():
+        print(f"node    {name:<20} {key.hex()}")
+    for client in clients:
+        print(f"client  {client.name:<20} {client.role}")
     return OK
 
 
@@ -651,6 +848,14 @@ def _assignment(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
+def _joint(text: str) -> tuple[str, list[str]]:
+    name, _, members = text.partition("=")
+    arrays = members.split(",")
+    if not (name and len(arrays) > 1 and all(arrays)):
+        raise argparse.ArgumentTypeError(f"expected NAME=ARRAY,ARRAY with two arrays or more, got {text!r}")
+    return name, arrays
+
+
 def _channels(text: str) -> tuple[str, list[int]]:
     name, equals, numbers = text.partition("=")
     try:
@@ -669,6 +874,13 @@ def _endpoint(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+def _key(text: str) -> bytes:
+    try:
+        return keyring.as_key(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _time(text: str) -> int:
     try:
         return utc_ns(text)
@@ -680,6 +892,10 @@ def _positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
     return int(text)
+
+
+def _count(text: str) -> int:
+    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number from 0 on"))
 
 
 def _rt60(text: str) -> float:

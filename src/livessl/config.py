@@ -6,6 +6,8 @@ import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from ipaddress import ip_address
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -14,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from livessl.core.activity import ActivityParameters
-from livessl.core.estimators import ESTIMATORS
+from livessl.core.estimators import ESTIMATORS, joined
 from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.gcc import microphone_pairs, uses_envelope
 from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
@@ -25,11 +27,8 @@ DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 COINCIDENT_M: Final = 1e-3
 """Two microphones nearer than this are a slip of the pen: no capsule is that small."""
 
-MAP_BYTES_PER_PAIR_AND_NODE: Final = 8
-"""A sparse-matrix entry: float32 weight and int32 column."""
-
-MAP_BYTES_PER_NODE: Final = 64
-"""Coordinates, delays while they are worked out, and the maps themselves."""
+MOST_NODES: Final = 50_000_000
+"""Of a grid: the search would take more, but every node is looked at once when a node joins, some tens of ns each."""
 
 SAMPLED_NODES: Final = 500
 """Nodes, about, at which the grid is held against an array: enough for a median."""
@@ -81,9 +80,8 @@ class Room(_Model):
 class GridConfig(_Model):
     """The search grid."""
 
-    spacing_m: Annotated[Positive, Field(ge=1e-4)] = 0.1
+    spacing_m: Annotated[Positive, Field(ge=1e-4)] = 0.05
     bounds_m: Bounds | None = None
-    max_memory_mb: Positive = 1024.0
 
     @field_validator("bounds_m")
     @classmethod
@@ -218,11 +216,24 @@ class SceneDeviceConfig(_Model):
 DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
+FileName = Annotated[str, Field(min_length=1)]
+"""A file or folder, looked up from the site file's folder."""
+
+
+class SpoolConfig(_Model):
+    """Where a node keeps the sound that the server may still need; without a folder in memory, never on a disk."""
+
+    directory: FileName | None = None
+    max_mb: Positive = 512.0
+    max_age_s: Positive = 3600.0
+
+
 class NodeConfig(_Model):
     """A capture node: one device, one or more arrays on its channels (counted from 1)."""
 
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
+    spool: SpoolConfig = SpoolConfig()
     arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
 
     @model_validator(mode="before")
@@ -255,10 +266,22 @@ class NodeConfig(_Model):
 
 
 class HttpConfig(_Model):
-    """Where the API and the dashboard listen."""
+    """Where the API and the dashboard listen, and whom they let in."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    tokens: FileName | None = None
+    certificate: FileName | None = None
+    private_key: FileName | None = None
+
+    @model_validator(mode="after")
+    def _pair(self) -> HttpConfig:
+        if (self.certificate is None) != (self.private_key is None):
+            raise ValueError(
+                "expected certificate and private_key, got "
+                f"{'private_key' if self.certificate is None else 'certificate'} alone; add the other one"
+            )
+        return self
 
 
 class SinkConfig(_Model):
@@ -280,6 +303,12 @@ class ServerConfig(_Model):
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
         return check_endpoint(endpoint, wildcards=True)
+
+
+class StoreConfig(_Model):
+    """How long events are kept: for ever, unless told otherwise."""
+
+    retention_days: Positive | None = None
 
 
 class ActivityConfig(_Model):
@@ -330,14 +359,23 @@ class Site(_Model):
     band_hz: BandHz = (100.0, 6000.0)
     grid: GridConfig = GridConfig()
     arrays: Annotated[dict[str, ArrayConfig], Field(min_length=1)]
+    joint: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = {}
     nodes: dict[str, NodeConfig] = {}
     server: ServerConfig = ServerConfig()
+    keys: FileName | None = None
+    privacy: Literal["positions-only", "recording"] = "recording"
+    store: StoreConfig = StoreConfig()
     activity: ActivityConfig = ActivityConfig()
     fusion: FusionConfig = FusionConfig()
     zones: dict[str, Zone] = {}
     specs: Annotated[tuple[ArraySpec, ...], Field(exclude=True, default=())]
+    """The arrays as they stand in the room, and are recorded."""
+    processed: Annotated[tuple[ArraySpec, ...], Field(exclude=True, default=())]
+    """The arrays as they are processed: a joint one in the place of those that it joins."""
     warnings: Annotated[tuple[str, ...], Field(exclude=True, default=())]
     """What is valid and yet unlikely to work, in words."""
+    directory: Annotated[Path, Field(exclude=True, default=Path())]
+    """The site file's folder."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
@@ -350,14 +388,31 @@ class Site(_Model):
             return speed_of_sound_m_s(self.temperature_c)
         return DEFAULT_SPEED_OF_SOUND_M_S
 
+    def file(self, name: str) -> Path:
+        """A file that the site file names."""
+        return self.directory / name
+
     def search_grid(self) -> Grid:
         """The shared grid: the bounds given, or the whole room."""
         x, y, z = self.room.size_m
         return Grid(self.grid.bounds_m or ((0.0, x), (0.0, y), (0.0, z)), self.grid.spacing_m)
 
     def array(self, name: str) -> ArraySpec:
-        """The array of that name, with absolute positions."""
-        return next(spec for spec in self.specs if spec.name == name)
+        """The array of that name, joint or not, with absolute positions."""
+        return next(spec for spec in (*self.specs, *self.processed) if spec.name == name)
+
+    def members(self, array: str) -> tuple[str, ...]:
+        """Names of the arrays that one joins: of one that is not joint, its own."""
+        return self.joint.get(array, (array,))
+
+    def joined_channels(self, channels: Mapping[str, Sequence[int]]) -> dict[str, list[int]]:
+        """Channels of the arrays as they are processed, from those of the arrays as they stand, or of joint ones."""
+        found = {}
+        for name in (spec.name for spec in self.processed):
+            given = [name] if name in channels else self.members(name)
+            if not set(given).isdisjoint(channels):
+                found[name] = [number for array in given for number in channels[array]]
+        return found
 
     def activity_parameters(self) -> ActivityParameters:
         """The activity rule's numbers, for the core."""
@@ -375,7 +430,7 @@ class Site(_Model):
     def make_fusion(self, method: str | None = None, *, updates: bool = True) -> Fusion:
         """A new fusion of this site's arrays, by the site's method or another of `ESTIMATORS`."""
         f, a = self.fusion, self.activity
-        estimator = ESTIMATORS[method or f.method](self.specs, self.search_grid(), self.c_m_s)
+        estimator = ESTIMATORS[method or f.method](self.processed, self.search_grid(), self.c_m_s)
         parameters = FusionParameters(
             deadline_s=f.deadline_s,
             window_s=f.window_s,
@@ -386,11 +441,12 @@ class Site(_Model):
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,
         )
-        return Fusion(self.site, self.specs, estimator, parameters, updates=updates)
+        return Fusion(self.site, self.processed, estimator, parameters, updates=updates)
 
     def node_of(self, array: str) -> str | None:
-        """Name of the node that captures an array."""
-        return next((name for name, node in self.nodes.items() if array in node.arrays), None)
+        """Name of the node that captures an array; a joint one's arrays are all on one."""
+        first = self.members(array)[0]
+        return next((name for name, node in self.nodes.items() if first in node.arrays), None)
 
     def zones_of(self, position_m: Sequence[float] | None) -> list[str]:
         """Names of the zones that hold a position."""
@@ -414,8 +470,40 @@ def check_endpoint(endpoint: str, *, wildcards: bool = False) -> str:
     return endpoint
 
 
-def load_site(path: Path) -> Site:
-    """Read and check a site file.
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches what listens on `host`."""
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def open_doors(site: Site) -> list[Fault]:
+    """What would let the whole network in: addresses that others reach, without a way to tell who they are."""
+    faults = []
+    http, bind = site.server.http, site.server.bind
+    if not is_loopback(http.host) and http.tokens is None:
+        faults.append(
+            Fault(
+                "server.http.host",
+                f"{http.host!r} can be reached from other machines, and anyone there could look: set "
+                "server.http.tokens: tokens.yaml and make a token with `livessl keys token`, or use 127.0.0.1",
+            )
+        )
+    scheme, _, rest = bind.partition("://")
+    if scheme == "tcp" and not is_loopback(rest.rpartition(":")[0]) and site.keys is None:
+        faults.append(
+            Fault(
+                "server.bind",
+                f"{bind!r} can be reached from other machines, and anyone there could send: set keys: keys and make "
+                "them with `livessl keys server` and `livessl keys node`, or use tcp://127.0.0.1:PORT",
+            )
+        )
+    return faults
+
+
+def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+    """Read and check a site file; `joint` adds to its own.
 
     Raises
     ------
@@ -426,11 +514,16 @@ def load_site(path: Path) -> Site:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([Fault(str(path), f"cannot be read: {_reason(error)}")]) from error
-    return parse_site(text, str(path), path.parent)
+    return parse_site(text, str(path), path.parent, joint)
 
 
-def parse_site(text: str, source: str = "site file", directory: Path | None = None) -> Site:
-    """Check the text of a site file; geometry files are looked up from `directory`.
+def parse_site(
+    text: str,
+    source: str = "site file",
+    directory: Path | None = None,
+    joint: Mapping[str, Sequence[str]] | None = None,
+) -> Site:
+    """Check the text of a site file; geometry files are looked up from `directory`, and `joint` adds to its own.
 
     Raises
     ------
@@ -450,21 +543,25 @@ def parse_site(text: str, source: str = "site file", directory: Path | None = No
     if not isinstance(data, dict):
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
     findings = [*_duplicate_keys(root)]
-    for key in ("specs", "warnings"):
+    for key in ("specs", "processed", "warnings", "directory"):
         if key in data:
             findings.append(((key,), "unknown key; take it away"))
             del data[key]
+    if joint and isinstance(data.setdefault("joint", {}), dict):
+        data["joint"] |= {name: list(members) for name, members in joint.items()}
     site, wrong = _valid_part(data)
     findings += wrong
     if site is not None:
         specs, wrong = _array_specs(site, directory or Path())
-        site = site.model_copy(update={"specs": specs})
+        site = site.model_copy(update={"specs": specs, "directory": directory or Path()})
+        processed, apart = _processed_specs(site)
+        site = site.model_copy(update={"processed": processed})
         lost = set(data["arrays"]) - set(site.arrays)
-        findings += wrong
+        findings += [*wrong, *(finding for finding in apart if not _follows(finding[0], lost))]
         findings += [finding for finding in _cross_faults(site) if not _follows(finding[0], lost)]
     if findings or site is None:
         raise ConfigError([at.fault(path, what) for path, what in findings])
-    return site.model_copy(update={"warnings": tuple(_wide_arrays(site))})
+    return site.model_copy(update={"warnings": (*_wide_arrays(site), *_leaks(site))})
 
 
 def read_yaml(text: str) -> Any:
@@ -520,7 +617,10 @@ def _valid_part(data: Mapping[str, Any]) -> tuple[Site | None, list[_Finding]]:
 
 def _part(path: _Place, unknown_key: bool) -> _Place:
     """The smallest part of the file that can be left out for a fault at `path`."""
-    return path if unknown_key else path[: 2 if path[:1] in (("arrays",), ("nodes",), ("zones",)) else 1]
+    return path if unknown_key else path[: 2 if path[:1] in _NAMED_PARTS else 1]
+
+
+_NAMED_PARTS: Final = (("arrays",), ("joint",), ("nodes",), ("zones",))
 
 
 def _take_away(data: dict[str, Any], path: _Place) -> bool:
@@ -606,6 +706,44 @@ def _array_specs(site: Site, directory: Path) -> tuple[tuple[ArraySpec, ...], li
     return tuple(specs), wrong
 
 
+def _processed_specs(site: Site) -> tuple[tuple[ArraySpec, ...], list[_Finding]]:
+    """The arrays as they are processed; where a joint one is wrong, those that it joins stay apart."""
+    known = {spec.name: spec for spec in site.specs}
+    wrong = [*_joint_faults(site)]
+    at_fault = {path[1] for path, _ in wrong}
+    joint: list[ArraySpec] = []
+    for name, members in site.joint.items():
+        if name in at_fault or not set(members) <= set(known):
+            continue
+        nodes = {member: site.node_of(member) for member in members}
+        clocks = {member: f"node {node!r}" if node else "no node" for member, node in nodes.items()}
+        try:
+            joint.append(joined([known[member] for member in members], clocks, name))
+        except ValueError as error:
+            wrong.append((("joint", name), str(error).removeprefix(f"array {name!r}: ")))
+    taken = {member for spec in joint for member in site.joint[spec.name]}
+    return (*(spec for spec in site.specs if spec.name not in taken), *joint), wrong
+
+
+def _joint_faults(site: Site) -> Iterator[_Finding]:
+    """What is wrong with joint arrays before their microphones are looked at."""
+    used: dict[str, str] = {}
+    for name, members in site.joint.items():
+        if name in site.arrays:
+            yield ("joint", name), "expected another name: an array is called so already; rename it"
+        for member in members:
+            here: _Place = ("joint", name, member)
+            if member not in site.arrays:
+                yield here, f"no such array; arrays are {', '.join(site.arrays)}"
+            elif member in used:
+                yield here, f"already joined in {used[member]!r}; take it away here or there"
+            used[member] = name
+        offsets_s = {site.arrays[member].wav_offset_s for member in members if member in site.arrays}
+        if len(offsets_s) > 1:
+            each = ", ".join(f"{offset_s:g}" for offset_s in sorted(offsets_s))
+            yield ("joint", name), f"expected arrays of one wav_offset_s, since they are recorded together, got {each}"
+
+
 def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
     if array.microphones_m is not None:
         return as_positions_m(array.microphones_m)
@@ -648,24 +786,32 @@ def _cross_faults(site: Site) -> Iterator[_Finding]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
     if site.fusion.method not in ESTIMATORS:
         yield ("fusion", "method"), f"expected one of {', '.join(ESTIMATORS)}, got {site.fusion.method!r}"
-    for kind, names in (("arrays", site.arrays), ("nodes", site.nodes), ("zones", site.zones)):
-        for name in names:
-            if not _NAME.fullmatch(name):
-                yield (kind, name), "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
-    if site.fusion.min_arrays > len(site.arrays):
+    yield from _name_faults(site)
+    count = len(site.arrays) + len(site.processed) - len(site.specs)
+    if site.fusion.min_arrays > count:
         yield (
             ("fusion", "min_arrays"),
-            f"expected at most the number of arrays, {len(site.arrays)}, got {site.fusion.min_arrays}",
+            f"expected at most the number of arrays, {count}{' (joint ones are one)' if site.joint else ''}, "
+            f"got {site.fusion.min_arrays}",
         )
-    if "fused" in site.arrays:
-        yield ("arrays", "fused"), "expected another name: 'fused' is the map of all arrays together; rename it"
     boxes = {("zones", name, "bounds_m"): zone.bounds_m for name, zone in site.zones.items()}
     for place, bounds in ((("grid", "bounds_m"), site.grid.bounds_m), *boxes.items()):
         yield from ((place, what) for what in _outside(site, bounds))
     for spec in site.specs:
         yield from _array_faults(site, spec)
+    for name in {spec.name for spec in site.processed} & set(site.joint):
+        yield from ((("joint", name), what) for what in _touching(site, site.joint[name]))
     yield from _grid_faults(site)
     yield from _node_faults(site)
+
+
+def _name_faults(site: Site) -> Iterator[_Finding]:
+    for kind, names in (("arrays", site.arrays), ("joint", site.joint), ("nodes", site.nodes), ("zones", site.zones)):
+        for name in names:
+            if not _NAME.fullmatch(name):
+                yield (kind, name), "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
+            elif name == "fused" and kind in ("arrays", "joint"):
+                yield (kind, name), "expected another name: 'fused' is the map of all arrays together; rename it"
 
 
 def _outside(site: Site, bounds: Bounds | None) -> Iterator[str]:
@@ -697,17 +843,26 @@ def _array_faults(site: Site, spec: ArraySpec) -> Iterator[_Finding]:
         )
 
 
+def _touching(site: Site, members: Sequence[str]) -> Iterator[str]:
+    for one, other in combinations(members, 2):
+        between_m = site.array(one).microphones_m[:, None] - site.array(other).microphones_m
+        apart_m = np.linalg.norm(between_m, axis=2)
+        if apart_m.min() < COINCIDENT_M:
+            i, k = np.unravel_index(apart_m.argmin(), apart_m.shape)
+            yield (
+                f"microphone {i + 1} of {one!r} and microphone {k + 1} of {other!r} are at one place "
+                f"{_xyz(site.array(one).microphones_m[i])}; correct one of them"
+            )
+
+
 def _grid_faults(site: Site) -> Iterator[_Finding]:
     grid = site.search_grid()
-    pairs = sum(len(spec.microphones_m) * (len(spec.microphones_m) - 1) // 2 for spec in site.specs)
-    need_mb = grid.size * (pairs * MAP_BYTES_PER_PAIR_AND_NODE + MAP_BYTES_PER_NODE) / 1e6
-    if need_mb > site.grid.max_memory_mb:
-        fits = site.grid.spacing_m * (need_mb / site.grid.max_memory_mb) ** (1 / max(1, len(grid.free_axes)))
+    if grid.size > MOST_NODES:
+        fits = site.grid.spacing_m * (grid.size / MOST_NODES) ** (1 / max(1, len(grid.free_axes)))
         yield (
             ("grid", "spacing_m"),
-            f"a grid of {grid.size:,} nodes and {pairs} pairs needs {need_mb:,.0f} MB, allowed are "
-            f"{site.grid.max_memory_mb:,.0f} MB; use a spacing of {np.ceil(fits * 1000) / 1000:g} m or more, "
-            "smaller bounds_m, or raise grid.max_memory_mb",
+            f"a grid of {grid.size:,} nodes takes too long to set up, allowed are {MOST_NODES:,}; use a spacing of "
+            f"{np.ceil(fits * 1000) / 1000:g} m or more, or smaller bounds_m",
         )
 
 
@@ -720,23 +875,41 @@ def _wide_arrays(site: Site) -> Iterator[str]:
     grid = site.search_grid()
     nodes = grid.nodes_m(slice(0, grid.size, grid.size // SAMPLED_NODES | 1))
     reach_m = grid.spacing_m * len(grid.free_axes) ** 0.5 / 2.0
-    for spec in site.specs:
+    for spec in site.processed:
         if reach_m == 0.0 or uses_envelope(spec.band_hz):
             continue
         pairs, high = microphone_pairs(len(spec.microphones_m)), spec.band_hz[1]
         kept = float(np.median(alias_free_hz(nodes, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        cure = f"take joint.{spec.name} away" if spec.name in site.joint else "make arrays smaller"
         if kept < high:
             yield (
                 f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high:g} Hz needs a "
                 f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
-                "wrong: lower the array's band_hz, or make arrays smaller"
+                f"wrong: lower the array's band_hz, or {cure}"
             )
+
+
+def _leaks(site: Site) -> Iterator[str]:
+    """What is let in or kept although the file seems to say otherwise."""
+    http, days = site.server.http, site.store.retention_days
+    if http.tokens is not None and http.certificate is None and not is_loopback(http.host):
+        yield (
+            "server.http: tokens and positions travel unencrypted; set certificate and private_key, or listen on "
+            "127.0.0.1 behind a proxy that has them"
+        )
+    if days is not None and site.server.sinks:
+        yield f"store.retention_days: {days:g} days do not reach server.sinks; rotate those files yourself"
 
 
 def _node_faults(site: Site) -> Iterator[_Finding]:
     claimed: dict[str, str] = {}
     for node_name, node in site.nodes.items():
         used: dict[int, str] = {}
+        if site.privacy == "positions-only" and node.spool.directory is not None:
+            yield (
+                ("nodes", node_name, "spool", "directory"),
+                "with privacy: positions-only no sound is kept on a disk; take it away, and it is kept in memory",
+            )
         for name, channels in node.arrays.items():
             here: _Place = ("nodes", node_name, "arrays", name)
             if name not in site.arrays:

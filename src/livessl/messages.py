@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
 from typing import Any, Final
+
+import orjson
 
 from livessl.clock import utc_text
 from livessl.config import Site
@@ -13,6 +16,38 @@ from livessl.core.types import Contribution, Estimate, Event, Track, Update
 API_VERSION: Final = 1
 
 JsonObject = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Where an answer's time went, from the end of its sound on; seconds, which add up.
+
+    Parameters
+    ----------
+    waited : float
+        For the quiet that ends an event; 0 for an update.
+    sent : float
+        Until the node had sent the last message that the answer needs: by the node's clock.
+    received : float
+        Until the server had it: between two clocks, unless node and server share a machine.
+    located : float
+        Until the answer was there: by the server's clock.
+    """
+
+    waited: float
+    sent: float
+    received: float
+    located: float
+
+    @property
+    def ours(self) -> float:
+        """From when all had happened that the answer needs until it was there."""
+        return self.sent + self.received + self.located
+
+    @property
+    def total(self) -> float:
+        """From the end of the sound to the answer."""
+        return self.waited + self.ours
 
 
 class Messages:
@@ -33,7 +68,7 @@ class Messages:
         self._origin_ns = origin_ns
         self._utc = utc
 
-    def event(self, event: Event) -> JsonObject:
+    def event(self, event: Event, stages: Stages | None = None) -> JsonObject:
         """An event: the contract's fields first."""
         position, covariance, confidence, arrays = self._where(event.estimate)
         return {
@@ -53,16 +88,20 @@ class Messages:
             "contributions": [_contribution(c) for c in event.contributions],
             "zones": self._site.zones_of(position),
             "late_frames": event.late_frames,
-            "latency_s": round(event.latency_s, 4),
+            "latency_s": round(event.latency_s if stages is None else stages.total, 4),
+            "latency_stages_s": _stages(stages),
+            "late": event.late,
+            "replaces": [],
         }
 
-    def update(self, update: Update) -> JsonObject:
+    def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
         """Where a sound that still lasts seems to be."""
         position, covariance, confidence, arrays = self._where(update.estimate)
         return {
             "kind": "update",
             "event_id": update.event_id,
             **self._when(update.estimate.time_ns),
+            "end_utc": utc_text(update.complete_ns) if self._utc else None,
             "position_m": position,
             "covariance_m2": covariance,
             "confidence": confidence,
@@ -71,6 +110,8 @@ class Messages:
             "contributions": [_contribution(c) for c in update.contributions],
             "zones": self._site.zones_of(position),
             "level_dbfs": dbfs(update.power),
+            "latency_s": None if stages is None else round(stages.total, 4),
+            "latency_stages_s": _stages(stages),
         }
 
     def track(self, track: Track) -> JsonObject:
@@ -121,6 +162,11 @@ def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
     }
 
 
+def json_text(message: JsonObject) -> str:
+    """The message as JSON, without blanks."""
+    return orjson.dumps(message).decode()
+
+
 def dbfs(power: float | None) -> float | None:
     """Level of a power in full scale squared; null for none, and for digital silence, which has no level."""
     return round(10.0 * math.log10(power), 1) if power else None
@@ -135,6 +181,10 @@ def _contribution(contribution: Contribution) -> JsonObject:
         "elevation_deg": round(contribution.elevation_deg, 2),
         "distance_m": round(contribution.distance_m, 3),
     }
+
+
+def _stages(stages: Stages | None) -> JsonObject | None:
+    return None if stages is None else {name: round(value, 4) for name, value in asdict(stages).items()}
 
 
 def _metres(values: Any) -> list[float]:

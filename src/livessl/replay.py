@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from livessl import wire
 from livessl.capture.line import played_messages
-from livessl.capture.recorded import Part
+from livessl.capture.recorded import Part, lines_of
 from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.types import Frame, Mark, Message, Output
@@ -20,11 +20,16 @@ def run(
     method: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[Output]:
-    """Localize everything in the recordings, without sockets: events in order of time."""
+    """Localize everything in the recordings, without sockets: events in order of time.
+
+    Raises
+    ------
+    DeviceError
+        Where recordings of arrays that the site joins do not belong together.
+    """
     fusion = site.make_fusion(method, updates=False)
     now_ns = 0
-    placed = [part.placed for part in parts]
-    for now_ns, batch in played_messages([part.line(site) for part in parts], placed, clock):
+    for now_ns, batch in played_messages(*lines_of(site, parts), clock):
         yield from fusion.step(_over_the_wire(batch), now_ns)
         if progress is not None:
             progress(now_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -56,9 +57,9 @@ class Session:
         """Where a piece's file lies."""
         return self.directory / piece.file
 
-    def site(self) -> Site:
-        """The site that it was recorded in."""
-        return load_site(self.directory / SITE_FILE)
+    def site(self, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+        """The site that it was recorded in; `joint` adds to its own."""
+        return load_site(self.directory / SITE_FILE, joint)
 
 
 def piece(array: str, file: str, start_ns: int) -> Piece:
@@ -106,8 +107,11 @@ def read_session(directory: Path) -> Session:
 
 
 def site_text(site: Site) -> str:
-    """The site as YAML that stands alone: array positions absolute, no geometry files."""
-    data: dict[str, Any] = site.model_dump(mode="json", exclude_defaults=True)
+    """The site as YAML that stands alone: array positions absolute, no geometry files, no word on secrets."""
+    http = {"tokens", "certificate", "private_key"}
+    data: dict[str, Any] = site.model_dump(
+        mode="json", exclude_defaults=True, exclude={"keys": True, "server": {"http": http}}
+    )
     for spec in site.specs:
         array = {"microphones_m": spec.microphones_m.round(6).tolist()}
         given = site.arrays[spec.name]

@@ -1,7 +1,7 @@
 """Messages to bytes and back: version, limits, validation. It knows no socket.
 
-One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind), then the body of its kind. Sound
-travels as float32, so that a replayed or live frame is the very frame that was cut.
+One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, when it was sent), then the body of
+its kind. Sound travels as float32, so that a replayed or live frame is the very frame that was cut.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROPHONES, ClockState, Frame, Mark
 
-VERSION: Final = 1
+VERSION: Final = 2
 
 MAX_NAME_BYTES: Final = 64
 """Longest array or node name: the site file allows no longer site, and a header must stay a header."""
@@ -40,7 +40,9 @@ MAX_MESSAGE_BYTES: Final = 256 + 4 * MAX_MICROPHONES * MAX_FRAME_SAMPLES
 """The largest message there can be: a frame of 16 channels."""
 
 _MAGIC: Final = b"LSSL"
-_HEAD: Final = struct.Struct("<4sBB")
+_HEAD: Final = struct.Struct("<4sBBq")
+_SENT: Final = struct.Struct("<q")
+_SENT_AT: Final = _HEAD.size - _SENT.size
 _FRAME: Final = struct.Struct("<BQqqdd?BI")  # name length, sequence, raster, time, rate, power, active, channels, n
 _MARK: Final = struct.Struct("<BQqddQQdBB")  # name length, sequence, raster, powers, overflows, lost, drift, clock, K
 _CLOCK_STATES: Final = tuple(ClockState)
@@ -66,6 +68,10 @@ class Hello:
         The frames carry past times; the server shall follow them instead of its clock.
     problem : str or None
         What is wrong with its device now, in words.
+    backlog : dict of str to (int, int)
+        Of the arrays that have kept frames from before this connection: their oldest raster index, and the one from
+        which on frames are live. What lies between comes in order of time, as the live sound leaves room; another
+        greeting says when all of it has been sent.
     """
 
     node: str
@@ -73,14 +79,31 @@ class Hello:
     arrays: dict[str, float]
     replay: bool = False
     problem: str | None = None
+    backlog: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The server's answer and heartbeat: the last sequence number it holds of each array of this node's run."""
+    """The server's answer and heartbeat.
+
+    Parameters
+    ----------
+    run_id : str
+        Of the node's greeting.
+    received : dict of str to int
+        Raster index, of each array, up to which the server has all frames that the node sent: they need not be sent
+        again while this server lives.
+    settled : int or None
+        Raster index before which everything has become events, and these are stored: no frame of it is needed again.
+    who_are_you : bool
+        The server does not know this connection, or misses frames of it: greet, and send again.
+    refused : str or None
+        Why the node may not join.
+    """
 
     run_id: str
-    sequences: dict[str, int]
+    received: dict[str, int]
+    settled: int | None = None
     who_are_you: bool = False
     refused: str | None = None
 
@@ -121,7 +144,7 @@ def decode(data: bytes) -> WireMessage:
         raise WireError(f"message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
     if len(data) < _HEAD.size:
         raise WireError(f"message of {len(data)} bytes: expected at least a header of {_HEAD.size}")
-    magic, version, kind = _HEAD.unpack_from(data)
+    magic, version, kind, _ = _HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise WireError(f"expected a message of livessl beginning with {_MAGIC!r}, got {magic!r}")
     if version != VERSION:
@@ -136,8 +159,18 @@ def decode(data: bytes) -> WireMessage:
     raise WireError(f"expected a known kind of message, got {kind}")
 
 
+def stamped(data: bytes, sent_ns: int) -> bytes:
+    """The same message, sent at that site time by the sender's clock; 0, as encoded, says nothing."""
+    return b"".join([data[:_SENT_AT], _SENT.pack(sent_ns), data[_HEAD.size :]])
+
+
+def sent_ns(data: bytes) -> int:
+    """When a message that decodes was sent, by the sender's clock; 0 where it does not say."""
+    return int(_SENT.unpack_from(data, _SENT_AT)[0])
+
+
 def _head(kind: int) -> bytes:
-    return _HEAD.pack(_MAGIC, VERSION, kind)
+    return _HEAD.pack(_MAGIC, VERSION, kind, 0)
 
 
 def _encode_frame(frame: Frame) -> bytes:
@@ -229,6 +262,8 @@ def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
     for name, valid in checks.items():
         if not valid(fields[name]):
             raise WireError(f"{what}: field {name!r} has a wrong type or value")
+    if type_ is Hello:
+        fields["backlog"] = {array: tuple(rasters) for array, rasters in fields["backlog"].items()}
     return type_(**fields)
 
 
@@ -254,8 +289,12 @@ def _is_rate(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_RATE_HZ
 
 
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+def _is_raster(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_RASTER
+
+
+def _is_span(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_raster, value)) and value[0] < value[1]
 
 
 def _is_flag(value: Any) -> bool:
@@ -273,8 +312,15 @@ _FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
         "arrays": _is_map_of(_is_rate),
         "replay": _is_flag,
         "problem": _is_text,
+        "backlog": _is_map_of(_is_span),
     },
-    Ack: {"run_id": _is_name, "sequences": _is_map_of(_is_sequence), "who_are_you": _is_flag, "refused": _is_text},
+    Ack: {
+        "run_id": _is_name,
+        "received": _is_map_of(_is_raster),
+        "settled": lambda value: value is None or _is_raster(value),
+        "who_are_you": _is_flag,
+        "refused": _is_text,
+    },
     Bye: {"node": _is_name, "run_id": _is_name},
 }
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
-from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
+from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat, joined
 from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetGCC
@@ -200,6 +200,7 @@ def test_two_arrays_locate_together(located: SrpPhat) -> None:
     # out when the hang-over has been seen to be quiet: the interval 15 + 6 ends at 22
     assert when == 16 + HANG_OVER
     assert event.latency_s == pytest.approx(HANG_OVER * 0.05)
+    assert event.complete_ns - event.end_ns == HANG_OVER * FRAME_NS
     for contribution, spec in zip(event.contributions, (NORTH, SOUTH), strict=True):
         assert contribution.array == spec.name
         assert contribution.active_s == pytest.approx(0.3)
@@ -234,6 +235,24 @@ def test_one_small_array_tells_the_direction_only() -> None:
     towards, right = position_of(event) - spec.centre_m, SOURCE_M - spec.centre_m
     # the direction by 5 us of 0.06 m over sqrt(3) independent lags, 0.9 degrees; by far less in truth, at 10 dB
     assert towards @ right / np.linalg.norm(towards) / np.linalg.norm(right) > np.cos(np.radians(0.9))
+
+
+def test_wide_array_is_not_looked_from_its_centre() -> None:
+    """Half a centimetre from its middle, a place may be as uncertain as a quarter of the half width, not of that."""
+    both = joined([NORTH, SOUTH], {"north": "rack", "south": "rack"}, "both")
+
+    def judged(spread_m: float) -> Status:
+        class Uncertain(Scripted):
+            def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+                place_m = both.centre_m + np.array([0.003, -0.004, 0.0])
+                return replace(super().locate(sounds), position_m=place_m, covariance_m2=spread_m**2 * np.eye(3))
+
+        frames = [frame("both", k, samples=np.ones((8, 20), dtype=np.float32)) for k in (10, 11)]
+        return only_event(play(Fusion("site", [both], Uncertain(), updates=False), live(frames, 30), 30)).status
+
+    quarter_m = 0.25 * both.aperture_m / 2.0
+    assert judged(0.99 * quarter_m) is Status.LOCATED
+    assert judged(1.01 * quarter_m) is Status.DIRECTION_ONLY
 
 
 def test_arrays_of_different_rates_locate_together(located: SrpPhat) -> None:
@@ -461,6 +480,7 @@ def test_updates_come_only_while_there_is_sound() -> None:
     assert [update.estimate.arrays for _, update in updates] == [("north",)] * 2 + [("north", "south")] * 3
     # windows of 0.2 s, their middle 0.1 s ago; before the sound there is nothing to use
     assert [update.estimate.time_ns for _, update in updates] == [now_ns(when - 2) for when, _ in updates]
+    assert [update.complete_ns for _, update in updates] == [now_ns(when) for when, _ in updates]
     assert [call["north"] for call in scripted.calls[:-1]] == [[40], [80], [80], [80], [80]]
     windows = [(when, output) for when, output in said if isinstance(output, Window)]
     assert [(when, window.time_ns) for when, window in windows] == [(w, u.estimate.time_ns) for w, u in updates]
@@ -542,9 +562,9 @@ def test_array_starts_then_is_healthy_then_lost() -> None:
     assert status.age_s == pytest.approx(0.1)
     assert (status.power, status.noise_power, status.clock) == (1e-7, 1e-7, ClockState.LOCKED)
     assert status.counters["marks"] == 10
-    assert status_of(fusion, "north", 49).state is ArrayState.HEALTHY
-    status = status_of(fusion, "north", 50)  # two seconds later
-    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 2 s")
+    assert status_of(fusion, "north", 39).state is ArrayState.HEALTHY
+    status = status_of(fusion, "north", 40)  # one and a half seconds later
+    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 1.5 s")
     play(fusion, node("north", (), range(60, 62)), 62, start=61)
     assert status_of(fusion, "north", 62).state is ArrayState.HEALTHY
     assert status_of(fusion, "south", 62).state is ArrayState.STARTING
@@ -729,3 +749,17 @@ def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None
     assert (event.status, event.reason, event.estimate is None) == (expected, refused, refused is not None)
     assert {output.status for output in said if isinstance(output, Update)} == {expected}
     assert any(isinstance(output, Track) for output in said) == (refused is None)
+
+
+def test_microphone_that_dies_amid_sound_is_found_too() -> None:
+    """While there is sound no mark comes; a frame's samples tell the same."""
+    fusion = fusion_of()
+    samples = np.full((4, 20), 0.1, np.float32)
+    samples[2] = 0.0
+    arrivals: Arrivals = [(k + 1.0, frame("north", k, samples=samples.copy())) for k in range(30)]
+    play(fusion, arrivals, 19)
+    assert status_of(fusion, "north", 20).state is ArrayState.HEALTHY
+    play(fusion, arrivals[20:], 30, start=20)
+    status = status_of(fusion, "north", 30)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"

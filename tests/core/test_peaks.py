@@ -64,7 +64,7 @@ def brute_force(power: Float32Array, grid: Grid, count: int) -> list[int]:
     smooth=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_highest_nodes_are_those_of_brute_force(
+def test_peaks_of_a_map_are_those_of_brute_force(
     cells: tuple[int, int, int], count: int, smooth: bool, seed: int
 ) -> None:
     x, y, z = cells
@@ -74,7 +74,9 @@ def test_highest_nodes_are_those_of_brute_force(
         power = -np.linalg.norm(grid.nodes_m() - rng.uniform(0, 6, 3), axis=1).astype(np.float32)
     else:
         power = rng.permutation(grid.size).astype(np.float32)
-    nodes = peaks.highest_nodes(power, grid, count)
+    found = peaks.in_map(power, grid)(count)
+    nodes = [peak.node for peak in found]
+    assert [peak.power for peak in found] == [power[node] for node in nodes]
     assert nodes == brute_force(power, grid, count)
     cell = np.stack(np.unravel_index(nodes, grid.shape), axis=1)
     assert all(np.abs(cell[a] - cell[b]).max() > 1 for a in range(len(nodes)) for b in range(a))
@@ -146,23 +148,28 @@ def hills(*tops: tuple[tuple[float, float, float], float]) -> Float32Array:
 FIRST_M, SECOND_M = (1.05, 3.05, 1.25), (3.05, 2.05, 1.25)
 
 
+def stands_out(power: Float32Array, at_m: FloatArray) -> float:
+    find = peaks.in_map(power, GRID)
+    return peaks.confidence(find, find(1)[0], GRID, at_m)
+
+
 def test_confidence_is_how_far_the_peak_stands_out() -> None:
     at_m = np.array(FIRST_M)
-    assert peaks.confidence(hills((FIRST_M, 2.0)), GRID, at_m) > 0.99
-    assert peaks.confidence(hills((FIRST_M, 2.0), (SECOND_M, 2.0)), GRID, at_m) < 0.01
-    assert peaks.confidence(hills((FIRST_M, 2.0), (SECOND_M, 0.5)), GRID, at_m) == pytest.approx(0.75, abs=0.01)
+    assert stands_out(hills((FIRST_M, 2.0)), at_m) > 0.99
+    assert stands_out(hills((FIRST_M, 2.0), (SECOND_M, 2.0)), at_m) < 0.01
+    assert stands_out(hills((FIRST_M, 2.0), (SECOND_M, 0.5)), at_m) == pytest.approx(0.75, abs=0.01)
     # what is within a metre along every axis is the same place
     near_m, far_m = (1.05 + 0.7, 3.05, 1.25), (1.05 + 1.2, 3.05, 1.25)
-    assert peaks.confidence(hills((FIRST_M, 2.0), (near_m, 2.0)), GRID, at_m) > 0.9
-    assert peaks.confidence(hills((FIRST_M, 2.0), (far_m, 2.0)), GRID, at_m) < 0.01
+    assert stands_out(hills((FIRST_M, 2.0), (near_m, 2.0)), at_m) > 0.9
+    assert stands_out(hills((FIRST_M, 2.0), (far_m, 2.0)), at_m) < 0.01
     # louder arrays make no surer ones
-    assert peaks.confidence(100 * hills((FIRST_M, 2.0), (SECOND_M, 0.5)), GRID, at_m) == pytest.approx(0.75, abs=0.01)
+    assert stands_out(100 * hills((FIRST_M, 2.0), (SECOND_M, 0.5)), at_m) == pytest.approx(0.75, abs=0.01)
 
 
 def test_confidence_of_nothing_is_none() -> None:
-    assert peaks.confidence(np.zeros(GRID.size, dtype=np.float32), GRID, np.array(FIRST_M)) == 0.0
-    assert peaks.confidence(np.full(GRID.size, -1.0, dtype=np.float32), GRID, np.array(FIRST_M)) == 0.0
-    assert peaks.confidence(hills((SECOND_M, 1.0)), GRID, np.array(FIRST_M)) == 0.0  # the peak is elsewhere
+    assert stands_out(np.zeros(GRID.size, dtype=np.float32), np.array(FIRST_M)) == 0.0
+    assert stands_out(np.full(GRID.size, -1.0, dtype=np.float32), np.array(FIRST_M)) == 0.0
+    assert stands_out(hills((SECOND_M, 1.0)), np.array(FIRST_M)) == 0.0  # the peak is elsewhere
 
 
 @settings(deadline=None, max_examples=50)

@@ -18,7 +18,7 @@ from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.evaluate.campaign import read_clips
 from livessl.evaluate.maps import PairMatrices, PairTables, reach_samples
 from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, pair, tetrahedron_in_cube
-from livessl.evaluate.unit import Position, active_segment, t30_s
+from livessl.evaluate.unit import Position, active_segment, recorded, t30_s
 from livessl.simulate.room import impulse_responses
 
 RATE_HZ = 16000.0
@@ -52,7 +52,7 @@ def summed_directly(spec: ArraySpec, samples: Float32Array, *, band_limit: bool)
         for node in range(GRID.size):
             kept = frequency_hz <= (limit_hz[p, node] if band_limit else np.inf)
             turned = phase[kept] * np.exp(2j * np.pi * frequency_hz[kept] * delay_s[p, node])
-            power[node] += turned.real.sum() / (high - low)
+            power[node] += 2.0 / 4.0 * turned.real.sum() / (high - low)
     return power
 
 
@@ -72,9 +72,9 @@ def test_matrices_give_the_sum_that_they_stand_for(edge_m: float, budget: float)
         wanted = summed_directly(spec, samples, band_limit=band_limit)
         assert np.linalg.norm(found[band_limit] - wanted) < budget * np.linalg.norm(wanted)
     assert np.linalg.norm(found[True] - found[False]) > 0.1 * np.linalg.norm(found[False])  # the limit does something
-    # tables weigh an array of four by 2/4, and look the nearest eighth of a sample up: 8 degrees at 6 kHz
+    # tables look the nearest eighth of a sample up: 8 degrees at 6 kHz
     tables = PairTables(GRID, RATE_HZ, C_M_S, band_limit=False).power(spec, pairs, lags)[:, 0]
-    assert np.linalg.norm(2.0 * tables - found[False]) < 0.05 * np.linalg.norm(found[False])
+    assert np.linalg.norm(tables - found[False]) < 0.05 * np.linalg.norm(found[False])
 
 
 def test_a_position_is_one_row_per_event_condition_and_method(tmp_path: Path) -> None:
@@ -128,6 +128,61 @@ def test_eight_microphones_are_the_vertices_of_a_cube() -> None:
         for system in experiment.systems:
             assert (system.microphones_m > 0.0).all()
             assert (system.microphones_m < experiment.room_m).all()
+
+
+KEY = np.random.SeedSequence(5, spawn_key=(3, 1))
+
+
+def noise_of(wet: Float32Array, snr_db: float, key: tuple[int, int] = (1, 0)) -> tuple[FloatArray, FloatArray]:
+    """What a recording holds besides the sound, (K, n), and the sound as it holds it: the least-squares share."""
+    samples = recorded(wet, snr_db, KEY, key).astype(np.float64)
+    sound = wet.astype(np.float64)
+    sound *= (samples * sound).sum() / (sound**2).sum()
+    return samples - sound, sound
+
+
+@pytest.mark.parametrize("snr_db", [40.0, 20.0, 0.0, -6.0])
+def test_noise_is_added_at_the_ratio_stated(snr_db: float) -> None:
+    # unequal channels, and half of it silent: the ratio is of the means over all microphones and the whole recording
+    wet = noise() * np.array([[1.0], [0.5], [2.0], [0.1]], dtype=np.float32)
+    wet[:, 3000:] = 0.0
+    added, sound = noise_of(wet, snr_db)
+    found_db = 10.0 * np.log10((sound**2).mean() / (added**2).mean())
+    # the power of n = 24000 normal samples scatters by sqrt(2 / n) = 0.9 %, 0.04 dB; so does the share taken away.
+    # Rounding to 16 bits is 90 dB below full scale.
+    assert found_db == pytest.approx(snr_db, abs=3 * 0.06)
+    # independent at each microphone, as strong at the soft one as at the loud one, and in silence; and white
+    correlation = np.corrcoef(added) - np.eye(4)
+    assert np.abs(correlation).max() < 4.0 / np.sqrt(6000)
+    np.testing.assert_allclose(added.std(axis=1) / added.std(), 1.0, atol=0.05)
+    np.testing.assert_allclose(added[:, 3000:].std() / added[:, :3000].std(), 1.0, atol=0.05)
+    halves = np.split(np.abs(np.fft.rfft(added, axis=1)[:, 1:]) ** 2, 2, axis=1)
+    assert halves[0].mean() / halves[1].mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_noise_is_the_keys_own() -> None:
+    first, _ = noise_of(noise(), 10.0)
+    again, _ = noise_of(noise(), 10.0)
+    other, _ = noise_of(noise(), 10.0, (2, 0))
+    np.testing.assert_array_equal(first, again)
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 4.0 / np.sqrt(24000)
+    # without noise there is the sound alone, its peak at half of full scale, rounded to 16 bits and float32
+    without = recorded(noise(), None, KEY, (1, 0)) - 0.5 / np.abs(noise()).max() * noise()
+    assert np.abs(without).max() < 0.51 / 32768
+
+
+def test_noise_moves_what_is_found(tmp_path: Path) -> None:
+    clips = small_job(tmp_path).clips
+    errors = []
+    for snr_db in (None, 40.0, -20.0):
+        position = Position(Settings("one-array", 4, (0.0,), seed=5, spacing_m=1.0, snr_db=snr_db), clips)
+        rows = [row for number in range(4) for row in position.rows(number)]
+        errors.append([row["error_m"] for row in rows if (row["system"], row["method"]) == ("small", "srp-phat")])
+    quiet, soft, loud = (np.array(each) for each in errors)
+    assert (soft == quiet).mean() >= 0.75  # of eight: the same nodes, but for a close call
+    # 20 dB of noise above the sound leave nothing of it: uniform in 8 x 10 x 4 m, the median distance is metres
+    assert np.median(loud) > 2.0
+    assert np.median(quiet) < 2.0
 
 
 def test_segment_is_the_longest_or_the_loudest() -> None:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import Any
 
 import pytest
 
 from livessl.messages import API_VERSION, JsonObject
-from livessl.server.hub import BACKLOG, Filter, Hub, Subscription
+from livessl.server.hub import BACKLOG, LAGGING, PAST, Filter, Hub, Subscription
 
 
-def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> JsonObject:
-    return {"kind": "update", "n": n, "confidence": confidence, "zones": list(zones)}
+def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = (), sound: int | None = None) -> JsonObject:
+    """An update of a sound, by default of one of its own."""
+    event_id = f"lab-{n if sound is None else sound}"
+    return {"kind": "update", "n": n, "event_id": event_id, "confidence": confidence, "zones": list(zones)}
 
 
 def event(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> JsonObject:
-    return {**update(n, confidence, zones), "kind": "event"}
+    return {"kind": "event", "id": f"lab-{n}", "n": n, "confidence": confidence, "zones": list(zones)}
 
 
 async def waiting(subscription: Subscription) -> list[JsonObject]:
@@ -24,7 +27,7 @@ async def waiting(subscription: Subscription) -> list[JsonObject]:
     messages: list[JsonObject] = []
     while True:
         try:
-            messages.append(await asyncio.wait_for(subscription.next(), 0.02))
+            messages.append(json.loads((await asyncio.wait_for(subscription.next(), 0.02)).text))
         except TimeoutError:
             return messages
 
@@ -147,7 +150,7 @@ def test_slow_reader_hinders_nobody() -> None:
         got = []
         for k in range(3 * BACKLOG):
             hub.publish(update(k))
-            got.append((await quick.next())["n"])
+            got.append((await quick.next()).message["n"])
         return got
 
     assert asyncio.run(both()) == list(range(3 * BACKLOG))
@@ -162,6 +165,83 @@ def test_next_waits_for_news() -> None:
         await asyncio.sleep(0)
         assert not reading.done()
         hub.publish(update(7))
-        return await asyncio.wait_for(reading, 1.0)
+        return (await asyncio.wait_for(reading, 1.0)).message
 
     assert asyncio.run(wait())["n"] == 7
+
+
+def test_slow_reader_gets_every_event_and_the_newest_of_everything_else() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    events = [5, 700, 701, 2000]
+    for k in range(3000):
+        hub.publish(event(k) if k in events else update(k, sound=k % 3))
+        if k % 10 == 0:
+            hub.publish({"kind": "track", "id": 1, "n": k})
+            hub.publish({"kind": "arrays", "n": k})
+    got = drained(subscription)
+    assert len(got) < BACKLOG
+    assert [message["n"] for message in got if message["kind"] == "event"] == events
+    numbers = [message["seq"] for message in got]
+    assert numbers == sorted(numbers)
+    by_sound = {message["event_id"]: message["n"] for message in got if message["kind"] == "update"}
+    assert by_sound == {"lab-0": 2997, "lab-1": 2998, "lab-2": 2999}
+    assert [message["n"] for message in got if message["kind"] in ("track", "arrays")][-2:] == [2990, 2990]
+    assert "gap" not in {message["kind"] for message in got}  # nothing is missing that is not told again
+    assert hub.superseded == 3000 + 600 - len(got)
+
+
+def test_reader_who_keeps_up_gets_everything() -> None:
+    hub = Hub()
+    subscription = hub.subscribe(Filter())
+    for k in range(LAGGING):
+        hub.publish(update(k, sound=0))
+    assert [message["n"] for message in drained(subscription)] == list(range(LAGGING))
+    late = hub.subscribe(Filter())
+    for k in range(LAGGING + 1):
+        hub.publish(update(k, sound=0))
+    assert [message["n"] for message in drained(late)] == [*range(LAGGING - 1), LAGGING]
+
+
+def test_text_is_made_once_for_all() -> None:
+    hub = Hub()
+    one, two = hub.subscribe(Filter()), hub.subscribe(Filter())
+    hub.publish(event(1))
+
+    async def texts() -> list[str]:
+        return [(await subscription.next()).text for subscription in (one, two)]
+
+    first, second = asyncio.run(texts())
+    assert first is second
+
+
+def numbers(subscription: Subscription) -> list[Any]:
+    return [message.get("seq", message) for message in drained(subscription)]
+
+
+def test_client_that_comes_back_gets_what_it_missed_in_order() -> None:
+    hub = Hub(first_seq=100)
+    for k in range(10):
+        hub.publish(update(k) if k % 2 else event(k))
+    back = hub.subscribe(Filter(), since_seq=104)
+    events_only = hub.subscribe(Filter(frozenset({"event"})), since_seq=104)
+    hub.publish(event(11))
+    assert numbers(back) == [105, 106, 107, 108, 109, 110, 111]
+    assert numbers(events_only) == [105, 107, 109, 111]
+    assert numbers(hub.subscribe(Filter(), since_seq=111)) == []
+    assert numbers(hub.subscribe(Filter())) == []
+
+
+def test_client_that_comes_back_is_told_what_is_gone() -> None:
+    hub = Hub(first_seq=100)
+    for k in range(PAST + 50):
+        hub.publish(event(k))
+    gap, *rest = drained(hub.subscribe(Filter(), since_seq=110))
+    assert (gap["kind"], gap["missed"]) == ("gap", 40)
+    assert "after number 110 are gone, up to 150; GET events" in gap["reason"]
+    assert [message["seq"] for message in rest] == list(range(151, 101 + PAST + 50))
+    gap, *rest = drained(hub.subscribe(Filter(), since_seq=7))  # of the server's life before
+    assert (gap["kind"], gap["missed"], len(rest)) == ("gap", None, PAST)
+    (gap,) = drained(hub.subscribe(Filter(), since_seq=10**6))
+    assert gap["missed"] is None
+    assert "number 1000000 has not been told" in gap["reason"]

@@ -9,7 +9,7 @@ import socket
 import sqlite3
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from websockets.typing import Origin
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock, utc_ns, utc_text
 from livessl.core.types import FRAME_NS
+from livessl.keys import add_token
 from livessl.server import app
 from livessl.server.app import Server
 from livessl.server.web import STATIC
@@ -32,6 +33,7 @@ from small_site import SMALL, running_server, scene, scene_parts, site_of, wait_
 
 CLOCK = SystemClock()
 RUNS = count()
+PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
 ROUTES = {
     "/api/v1/site",
     "/api/v1/arrays",
@@ -40,6 +42,7 @@ ROUTES = {
     "/api/v1/tracks",
     "/api/v1/map",
     "/api/v1/health",
+    "/api/v1/access",
     "/metrics",
 }
 """The contract's, but for the WebSocket, which OpenAPI cannot tell of."""
@@ -50,7 +53,7 @@ def server() -> Iterator[Server]:
     """A server that has just heard the scene, live."""
     with running_server(site_of({"zones.room": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})) as server:
         node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
-        start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
+        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events")
         yield server
@@ -319,7 +322,7 @@ def test_watchers_get_new_windows() -> None:
         for _ in range(2):
             play(server)
             assert len(socket.recv(timeout=5)) == 48 + 16 * 20
-            with pytest.raises(TimeoutError):
+            with suppress(TimeoutError):
                 while True:
                     socket.recv(timeout=0.3)
 
@@ -374,6 +377,10 @@ def test_metrics(client: httpx.Client) -> None:
     assert value("livessl_sink_failures_total") == 0
     assert value("livessl_messages_refused_total") == 0
     assert value("livessl_uptime_seconds") > 0
+    for stage in ("sent", "received", "located"):
+        assert value("livessl_latency_seconds_count", kind="event", stage=stage) == 2
+        assert value("livessl_latency_seconds_count", kind="update", stage=stage) > 2
+    assert value("livessl_latency_seconds_count", kind="event", stage="delivered") == 0  # nobody listened
     for array in ("north", "south"):
         assert value("livessl_array_up", array=array) == 0
         assert value("livessl_array_age_seconds", array=array) >= 0
@@ -425,10 +432,25 @@ def test_live_begins_with_a_greeting(server: Server) -> None:
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 
+def test_live_goes_on_where_a_client_was(server: Server) -> None:
+    with live(server) as socket:
+        hello, first, second = (json.loads(socket.recv(timeout=5)) for _ in range(3))
+    with live(server, f"?since_seq={first['seq']}") as socket:
+        greeting, following = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert greeting["kind"] == "hello"
+    assert following == second
+    assert hello["last_seq"] > 1_600_000_000_000  # above all numbers of an earlier life
+    with live(server, "?since_seq=5") as socket:
+        _, gap = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert (gap["kind"], gap["missed"]) == ("gap", None)
+
+
 @pytest.mark.parametrize(
     ("query", "said"),
     [
         ("?kinds=events", "kinds: expected some of arrays, event, track, update"),
+        ("?since_seq=-1", "since_seq: expected the seq of a message"),
+        ("?since_seq=x", "since_seq: expected the seq of a message"),
         ("?zone=hall", "zone: none of that name; zones are door, room"),
     ],
 )
@@ -464,8 +486,9 @@ def test_name_that_was_made_to_point_here_is_refused(server: Server, client: htt
         connect(f"ws://evil.example:{port}/api/v1/live", sock=socket.create_connection(("127.0.0.1", int(port))))
 
 
-def test_open_to_the_network_it_has_any_name() -> None:
-    with running_server(site_of({"server.http.host": "0.0.0.0"})) as server:
+def test_open_to_the_network_it_has_any_name(tmp_path: Path) -> None:
+    add_token(tmp_path / "tokens.yaml", "wall", "viewer")
+    with running_server(site_of({"server.http": PUBLIC}, tmp_path)) as server:
         url = server.url.replace("0.0.0.0", "127.0.0.1")
         assert httpx.get(f"{url}/api/v1/health", headers={"Host": "lab-pc.local:8000"}).status_code == 200
 
@@ -487,6 +510,32 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):
             assert httpx.get(f"{server.url}/api/v1/health").status_code == 503
+
+
+def test_answers_say_where_their_time_went() -> None:
+    """One machine, one clock: every stage is positive, and they add up to what the client sees at least."""
+    with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
+        node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
+        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
+        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        wait_until(lambda: server.engine.events == 2, "both events")
+        told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
+        now_ns = CLOCK.now_ns()
+        metrics = httpx.get(f"{server.url}/metrics").text
+    answers = [message for message in told if message["kind"] in ("event", "update")]
+    assert {message["kind"] for message in answers} == {"event", "update"}
+    for message in answers:
+        stages = message["latency_stages_s"]
+        assert set(stages) == {"waited", "sent", "received", "located"}
+        assert min(stages.values()) >= 0
+        assert sum(stages.values()) == pytest.approx(message["latency_s"], abs=3e-4)  # each is rounded to 0.1 ms
+        if message["kind"] == "update":
+            assert stages["waited"] == 0
+            assert message["latency_s"] <= (now_ns - utc_ns(message["end_utc"])) / 1e9
+        else:
+            assert stages["waited"] == pytest.approx(0.3)
+    [delivered] = re.findall(r'^livessl_latency_seconds_count{kind="update",stage="delivered"} (\S+)$', metrics, re.M)
+    assert float(delivered) >= sum(message["kind"] == "update" for message in answers)
 
 
 def test_live_filters_kinds(server: Server) -> None:

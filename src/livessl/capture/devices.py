@@ -269,6 +269,51 @@ class Spliced:
                 yield Block(block.first_index + skipped, block.samples, block.stamp_ns)
 
 
+@dataclass(frozen=True)
+class Stacked:
+    """Recordings that one device made at one time, side by side: all channels of the first, then the second's, …."""
+
+    recordings: tuple[Recording, ...]
+
+    @property
+    def name(self) -> str:
+        """All their names."""
+        return " + ".join(recording.name for recording in self.recordings)
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """The first one's."""
+        return self.recordings[0].sample_rate_hz
+
+    @property
+    def channels(self) -> int:
+        """Number of all channels."""
+        return sum(recording.channels for recording in self.recordings)
+
+    @property
+    def duration_s(self) -> float:
+        """The first one's."""
+        return self.recordings[0].duration_s
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """Blocks of all channels.
+
+        Raises
+        ------
+        DeviceError
+            Where the recordings do not run together to the sample.
+        """
+        for blocks in zip(*(recording.blocks(start_ns) for recording in self.recordings), strict=True):
+            first = blocks[0]
+            if len({(block.first_index, block.samples.shape[1]) for block in blocks}) > 1:
+                at_s = (min(block.stamp_ns for block in blocks) - start_ns) / 1e9
+                raise DeviceError(
+                    f"{self.name}: expected recordings that run together to the sample, got a gap or an end in one of "
+                    f"them only, {at_s:.3f} s after they begin; record them through one device"
+                )
+            yield Block(first.first_index, np.concatenate([block.samples for block in blocks]), first.stamp_ns)
+
+
 def _blocks(pieces: Iterable[Float32Array], rate_hz: float, start_ns: int) -> Iterator[Block]:
     """Blocks with ideal stamps from (n, channels) pieces."""
     index = 0

@@ -21,7 +21,8 @@ class Line:
     ----------
     site : Site
     channels : mapping of array name to channels
-        Device channels counted from 1, in the order of the array's microphones.
+        Device channels counted from 1, in the order of the array's microphones. Arrays that the site joins are
+        processed as one.
     sample_rate_hz : float
         Nominal rate of the device.
     """
@@ -31,7 +32,7 @@ class Line:
         self.framer = Framer(sample_rate_hz)
         self._segmenters = [
             Segmenter(site.array(name), np.array(numbers) - 1, sample_rate_hz, site.activity_parameters())
-            for name, numbers in channels.items()
+            for name, numbers in site.joined_channels(channels).items()
         ]
 
     @property
@@ -100,6 +101,9 @@ def recording_channels(site: Site, array: str, recording: Recording, wanted: Seq
             f"{recording.name}: expected {expected} channels, one for each microphone of array {array!r}, "
             f"got {recording.channels}"
         )
-    if recording.channels > expected and node and max(site.nodes[node].arrays[array]) <= recording.channels:
-        return list(site.nodes[node].arrays[array])
+    if recording.channels > expected and node:
+        captured = site.nodes[node].arrays
+        numbers = [number for member in site.members(array) for number in captured[member]]
+        if max(numbers) <= recording.channels:
+            return numbers
     return list(range(1, expected + 1))

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from livessl import wire
-from livessl.capture.devices import Device
+from livessl.capture.devices import Device, Placed
 from livessl.capture.line import Line, played_messages
 from livessl.capture.link import Link
-from livessl.capture.recorded import Part
+from livessl.capture.recorded import Part, lines_of
+from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
+from livessl.keys import node_keys
 
 DRAIN_NS: Final = 3_000_000_000
 """How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""
@@ -37,7 +39,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
     """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
     config: NodeConfig = site.nodes[name]
     line = Line(site, config.arrays, device.sample_rate_hz)
-    link = _link(name, config.server, [line], clock, run_id)
+    link = _link(site, name, config.server, [line], clock, run_id, _spool(site, name))
     problem = None
     try:
         with device:
@@ -66,12 +68,14 @@ def capture_recordings(
 
     Raises
     ------
+    DeviceError
+        Where recordings of arrays that the site joins do not belong together.
     UndeliveredError
         Where the server has not acknowledged everything.
     """
-    lines = [part.line(site) for part in parts]
-    link = _link(name, site.nodes[name].server, lines, clock, run_id)
-    for end_ns in _sent(link, lines, parts, clock, stop):
+    lines, placed = lines_of(site, parts)
+    link = _link(site, name, site.nodes[name].server, lines, clock, run_id, _spool(site, name))
+    for end_ns in _sent(link, lines, placed, clock, stop):
         if progress is not None:
             progress(end_ns)
     _finish(link, clock, stop)
@@ -91,16 +95,18 @@ def send_session(
 
     Raises
     ------
+    DeviceError
+        Where recordings of arrays that the site joins do not belong together.
     UndeliveredError
         Where the server refuses it, or has not acknowledged everything.
     """
-    lines = [part.line(site) for part in parts]
-    link = _link("replay", endpoint, lines, clock, run_id, replay=True)
+    lines, placed = lines_of(site, parts)
+    link = _link(site, "replay", endpoint, lines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
         raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
-    for end_ns in _sent(link, lines, parts, pace, lambda: stop() or link.refused is not None):
+    for end_ns in _sent(link, lines, placed, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while link.pending > MAX_PENDING and not (stop() or link.refused):
@@ -108,14 +114,33 @@ def send_session(
     _finish(link, clock, stop)
 
 
-def _link(name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False) -> Link:
+def _spool(site: Site, name: str) -> Spool:
+    spool = site.nodes[name].spool
+    directory = None if spool.directory is None else site.file(spool.directory) / name
+    kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s)
+    if len(kept):
+        _log.info("the spool holds %d frames of an earlier run; they are sent again", len(kept))
+    return kept
+
+
+def _link(
+    site: Site,
+    name: str,
+    endpoint: str,
+    lines: Sequence[Line],
+    clock: Clock,
+    run_id: str,
+    spool: Spool,
+    *,
+    replay: bool = False,
+) -> Link:
     rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock)
+    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, node_keys(site, name), spool=spool)
 
 
-def _sent(link: Link, lines: Sequence[Line], parts: Sequence[Part], pace: Clock, stop: Stop) -> Iterator[int]:
+def _sent(link: Link, lines: Sequence[Line], placed: Sequence[Placed], pace: Clock, stop: Stop) -> Iterator[int]:
     """Send what the lines make of their recordings, block by block; yields the site time reached."""
-    for end_ns, batch in played_messages(lines, [part.placed for part in parts], pace):
+    for end_ns, batch in played_messages(lines, placed, pace):
         if stop():
             return
         link.send(batch)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from livessl.capture.devices import ArrayRecording, DeviceError, Looped, Placed, Spliced, WavRecording
+from livessl.capture.devices import ArrayRecording, DeviceError, Looped, Placed, Spliced, Stacked, WavRecording
 from livessl.capture.line import Line, recording_channels
 from livessl.config import SceneDeviceConfig, Site, WavDeviceConfig
+from livessl.core.estimators import require_one_clock
 from livessl.core.types import FRAME_NS
 from livessl.session import Session
 from livessl.simulate.scene import make_scene, render, synthesised_sounds
@@ -26,9 +27,77 @@ class Part:
     placed: Placed
     channels: tuple[int, ...]
 
-    def line(self, site: Site) -> Line:
-        """The line that cuts it into messages."""
-        return Line(site, {self.array: self.channels}, self.placed.recording.sample_rate_hz)
+
+def lines_of(site: Site, parts: Iterable[Part]) -> tuple[list[Line], list[Placed]]:
+    """The lines that cut recordings into messages, and what each of them plays.
+
+    Recordings of arrays that the site joins are played side by side, as one device recorded them.
+
+    Raises
+    ------
+    DeviceError
+        Where some of them are missing, or were not recorded so.
+    """
+    given = {part.array: part for part in parts}
+    lines: list[Line] = []
+    placed: list[Placed] = []
+    for spec in site.processed:
+        played = _played_together(site, spec.name, given)
+        if not played:
+            continue
+        first = played[0].placed
+        channels: dict[str, list[int]] = {}
+        before = 0
+        for part in played:
+            channels[part.array] = [before + number for number in part.channels]
+            before += part.placed.recording.channels
+        lines.append(Line(site, channels, first.recording.sample_rate_hz))
+        together = tuple(part.placed.recording for part in played)
+        placed.append(first if len(played) == 1 else Placed(Stacked(together), first.start_ns))
+    return lines, placed
+
+
+def _played_together(site: Site, name: str, given: Mapping[str, Part]) -> list[Part]:
+    """The recordings that make up one array as it is processed; none where none is given."""
+    members = site.members(name)
+    played = [given[member] for member in members if member in given]
+    if name in given and name in site.joint:
+        if played:
+            raise DeviceError(
+                f"array {name!r}: expected its recording or {played[0].array!r}'s, got both; take one away"
+            )
+        return [given[name]]
+    if len(played) not in (0, len(members)):
+        missing = next(member for member in members if member not in given)
+        raise DeviceError(
+            f"array {name!r}: joint processing expects a recording of each of {', '.join(members)}, got none of "
+            f"{missing!r}; add it, or take joint.{name} away"
+        )
+    if len(played) > 1:
+        _require_together(site, name, played)
+    return played
+
+
+def _require_together(site: Site, name: str, played: Sequence[Part]) -> None:
+    nodes = {part.array: site.node_of(part.array) for part in played}
+    try:  # without a node, one file is known to have one clock
+        require_one_clock(name, {part.array: nodes[part.array] or part.placed.recording.name for part in played})
+    except ValueError as error:
+        raise DeviceError(str(error)) from error
+    first_ns = played[0].placed.start_ns
+    spans = [
+        (part.placed.start_ns - first_ns, part.placed.recording.duration_s, part.placed.recording.sample_rate_hz)
+        for part in played
+    ]
+    if len(set(spans)) > 1:
+        each = ", ".join(
+            f"{part.placed.recording.name} ({start_ns / 1e9:g} s, {duration_s:g} s, {rate_hz:g} Hz)"
+            for part, (start_ns, duration_s, rate_hz) in zip(played, spans, strict=True)
+        )
+        raise DeviceError(
+            f"array {name!r}: joint processing expects recordings of one beginning, length and sampling rate, "
+            f"got {each}; record them through one device, or take joint.{name} away"
+        )
 
 
 def parts_from_wavs(
@@ -49,12 +118,15 @@ def parts_from_wavs(
         )
     return _parts(
         site,
-        [
-            (name, path, start_ns + (round(site.arrays[name].wav_offset_s * 1e9) if name in site.arrays else 0))
-            for name, path in wavs.items()
-        ],
+        [(name, path, start_ns + (round(_wav_offset_s(site, name) * 1e9))) for name, path in wavs.items()],
         wanted,
     )
+
+
+def _wav_offset_s(site: Site, array: str) -> float:
+    """Of a joint array, that of those it joins: they have one; 0 for an array that is not there."""
+    config = site.arrays.get(site.members(array)[0])
+    return config.wav_offset_s if config else 0.0
 
 
 def parts_from_sessions(site: Site, sessions: Iterable[Session]) -> list[Part]:
@@ -162,8 +234,9 @@ def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping
     chosen: dict[str, tuple[int, ...]] = {}
     faults: list[str] = []
     for array, path, start_ns in files:
-        if array not in site.arrays:
-            faults.append(f"{array}={path}: no such array; arrays are {', '.join(site.arrays)}")
+        known = (*site.arrays, *site.joint)
+        if array not in known:
+            faults.append(f"{array}={path}: no such array; arrays are {', '.join(known)}")
             continue
         try:
             recording = WavRecording(path)

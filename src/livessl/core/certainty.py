@@ -25,6 +25,9 @@ LEAST_CONFIDENCE: Final = 0.8
 _LOGISTIC: Final = (-3.34, 2.69, 1.03)
 """Intercept, weight of the margin and of the standing in the log-odds of a right place."""
 
+_DELAYS: Final = 3.0
+"""Independent delays of the arrays of four microphones that the numbers were fitted with."""
+
 _INFLATION: Final = 1.6
 """What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
 
@@ -39,7 +42,7 @@ class Signs:
         How far the place stands out from the best other one: 1 - (power there) / (power here), 0 to 1.
     standing : float
         Sum over the arrays of the mean height of an array's GCCs at the place over their root mean square, never below
-        0: an array that disagrees, or hears only noise, adds nothing.
+        0, in proportion to its independent delays: an array that disagrees, or hears only noise, adds nothing.
     """
 
     margin: float
@@ -112,4 +115,5 @@ def judge(
 
 def _standing(heard: HeardBy, term: PairTerms) -> float:
     noise = float(np.sqrt(np.square(heard.gcc.values).mean(dtype=np.float64)))
-    return max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0
+    delays = len(heard.spec.microphones_m) - 1
+    return delays / _DELAYS * max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0

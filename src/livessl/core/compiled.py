@@ -45,6 +45,18 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
                     high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
 
 
+def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
+    """What `add_power` wants of the places that nodes look up: these."""
+    return places
+
+
+@_compiled
+def look_up(values, places, out):  # type: ignore[no-untyped-def]
+    """Bare look-ups: how fast a map could be at best."""
+    for n in range(len(places)):
+        out[n] = values[places[n]]
+
+
 @_compiled
 def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
     """Add one array's power at every node."""
@@ -53,6 +65,30 @@ def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
         for p in range(table.shape[1]):
             total += values[p, table[node, p]]
         power[node] += weight * total
+
+
+@_compiled
+def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
+    """Summed power at points off the grid."""
+    power = np.zeros(len(points_m))
+    distance = np.empty(len(microphones_m))
+    for n in range(len(points_m)):
+        for m in range(len(microphones_m)):
+            x, y = points_m[n, 0] - microphones_m[m, 0], points_m[n, 1] - microphones_m[m, 1]
+            z = points_m[n, 2] - microphones_m[m, 2]
+            distance[m] = np.sqrt((x * x + y * y) + z * z)
+        for r in range(len(pairs)):
+            lag_s = (distance[pairs[r, 1]] - distance[pairs[r, 0]]) / c_m_s
+            place = (lag_s - first_s[r]) / step_s[r]
+            left = min(max(np.int64(place), 1), last[r])
+            at = np.uint64(start[r] + left)
+            one = np.uint64(1)
+            before, here, after, beyond = values[at - one], values[at], values[at + one], values[at + one + one]
+            share = place - left
+            rest = 1.0 - share
+            curvature = rest * (after - 2.0 * here + before) + share * (beyond - 2.0 * after + here)
+            power[n] += weight[r] * (rest * here + share * after - 0.5 * rest * share * curvature)
+    return power
 
 
 @_compiled
@@ -164,9 +200,9 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 
 @_compiled
-def highest(  # type: ignore[no-untyped-def]
+def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
     values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
-    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes,
+    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip
     """The highest node outside some boxes, by branch and bound."""
     shape = (len(x_m), len(y_m), len(z_m))
@@ -177,6 +213,7 @@ def highest(  # type: ignore[no-untyped-def]
     distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
     total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
     _bounds(0, count, top_low, top_high, rows, first_row, weight, rule, maxima, level_of, top_bound)
+    spent = 2 * count * len(rows)
     best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
     order = np.array([np.argmax(top_bound)])
     for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
@@ -193,6 +230,9 @@ def highest(  # type: ignore[no-untyped-def]
                 continue
             if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
                 continue
+            if spent > most:
+                return best_node, best, False
+            spent += 2 * children * len(rows)
             _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
             while True:
                 child = np.argmax(child_bound)
@@ -207,8 +247,11 @@ def highest(  # type: ignore[no-untyped-def]
                 if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
                     continue
                 if not _covered(first, edge, shape, boxes):
+                    if spent > most:
+                        return best_node, best, False
+                    spent += edge**3 * len(rows)
                     best, best_node = _best_of_cell(
                         first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
                         weight, rule, values, boxes, best, best_node, distance, total, fused,
                     )  # fmt: skip
-    return best_node, best
+    return best_node, best, True

@@ -16,7 +16,7 @@ from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.search import PeakSearch
 from livessl.core.srp import SRPFunctional, SRPMapper, alias_free_hz
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import GCC, MAX_MICROPHONES, ArraySpec, Float32Array, FloatArray, HeardBy
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +31,16 @@ class Sound:
 
 @dataclass(frozen=True, slots=True)
 class Localization:
-    """A place, how sure, and what it was read from: the arrays' evidence, in the order of their names."""
+    """A place, how sure, and what it was read from: the arrays' evidence, in the order of their names.
+
+    `proven` says that no node of the grid is higher; else the search was given up, for nothing stood out.
+    """
 
     position_m: FloatArray
     covariance_m2: FloatArray
     confidence: float
     evidence: tuple[HeardBy, ...]
+    proven: bool = True
     signs: Signs | None = None
     """What the confidence was worked out from, where it is a probability."""
     refused: str | None = None
@@ -97,8 +101,9 @@ class SrpPhat:
     c_m_s : float
     band_limit : bool or None
         Whether the band is limited per pair and node against spatial aliasing. None is "where it matters": for arrays
-        of which more than half of all pairs and nodes would lose part of the band. On a 0.1 m grid an array of 0.5 m
-        is not among them, and its answer would hardly change; on a 0.5 m grid it is.
+        of which more than half of all pairs and nodes of the map would lose part of the band. On a 0.1 m grid an array
+        of 0.5 m is not among them, and its answer would hardly change; on a 0.5 m grid it is. Where an array's band is
+        limited the peak is read from the map, else it is searched for on the grid, which may be finer.
     """
 
     name = "srp-phat"
@@ -109,47 +114,51 @@ class SrpPhat:
     ) -> None:
         self._arrays = {spec.name: spec for spec in arrays}
         self._grid = grid
+        self._map_grid = map_grid(arrays, grid)
         self._c_m_s = c_m_s
-        self._band_limit = band_limit
+        self._limited = {spec.name: self._limits_band(spec, band_limit) for spec in arrays}
+        self._search = PeakSearch(arrays, grid, c_m_s)
         self._correlators: dict[str, tuple[float, GCCPhat, Sequence[float]]] = {}
         self._mappers: dict[str, tuple[FloatArray, SRPMapper]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
-        correlate, cut_offs_hz = self._correlator(array, sample_rate_hz)
-        self._mapper(self._arrays[array], correlate.pairs, correlate.lags_s, cut_offs_hz)
+        self._correlator(array, sample_rate_hz)
 
     def listener(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:  # noqa: ARG002 - an Estimator
         """None: segments are all it needs."""
         return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        """Sum the arrays' maps, take the peak, refine it below the grid."""
+        """Find the highest places of the arrays' summed maps, refine them below the grid, take the best."""
         # float sums depend on the order: the answer must not
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
-        fused = self.power_maps(evidence, separately=()).fused
+        in_map = any(self._limited[name] for name in sounds)
+        grid = self._map_grid if in_map else self._grid
+        find = peaks.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
+        found = find(peaks.CANDIDATES)
         functional = SRPFunctional(evidence, self._c_m_s)
-        starts = np.stack([self._grid.node_m(node) for node in peaks.highest_nodes(fused, self._grid)])
-        position, _ = peaks.refine(functional, starts, self._grid)
+        position, _ = peaks.refine(functional, np.stack([grid.node_m(peak.node) for peak in found]), grid)
         return Localization(
             position,
-            peaks.laplace_covariance_m2(functional, evidence, position, self._grid),
-            peaks.confidence(fused, self._grid, position),
+            peaks.laplace_covariance_m2(functional, evidence, position, grid),
+            peaks.confidence(find, found[0], grid, position),
             evidence,
+            found[0].proven,
         )
 
     def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
         """Map each array's evidence onto the grid, and sum."""
-        fused = np.zeros(self._grid.size, dtype=np.float32)
+        fused = np.zeros(self._map_grid.size, dtype=np.float32)
         arrays: dict[str, Float32Array] = {}
         for heard in evidence:
-            spec, gcc = heard.spec, heard.gcc
-            cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(heard.below)]
-            power = self._mapper(spec, gcc.pairs, gcc.lags_s, cut_offs_hz)(gcc, *heard.below)
-            fused += power
-            if separately is None or spec.name in separately:
-                arrays[spec.name] = power
-        return PowerMaps(self._grid, fused, arrays)
+            mapper = self._mapper(heard)
+            if separately is None or heard.spec.name in separately:
+                arrays[heard.spec.name] = mapper(heard.gcc, *heard.below)
+                fused += arrays[heard.spec.name]
+            else:
+                mapper.add(fused, heard.gcc, *heard.below)
+        return PowerMaps(self._map_grid, fused, arrays)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)
@@ -162,27 +171,45 @@ class SrpPhat:
             return known[1:]
         spec = self._arrays[array]
         correlate = GCCPhat(spec, sample_rate_hz, self._c_m_s, self.front_end)
-        cut_offs_hz: Sequence[float] = ()
-        if not uses_envelope(spec.band_hz) and self._limits_band(spec, correlate.pairs):
-            cut_offs_hz = third_octaves_below_hz(spec.band_hz)
+        cut_offs_hz = third_octaves_below_hz(spec.band_hz) if self._limited[array] else ()
+        if not cut_offs_hz:
+            self._search.prepare(array, correlate.lags_s)
         self._correlators[array] = (sample_rate_hz, correlate, cut_offs_hz)
         return correlate, cut_offs_hz
 
-    def _mapper(self, spec: ArraySpec, pairs: IntArray, lags_s: FloatArray, cut_offs_hz: Sequence[float]) -> SRPMapper:
+    def _mapper(self, heard: HeardBy) -> SRPMapper:
         """The mapper of an array's lags; made anew when its sampling rate, and with it the lags, have changed."""
+        spec, gcc = heard.spec, heard.gcc
         known = self._mappers.get(spec.name)
-        if known is not None and np.array_equal(known[0], lags_s):
+        if known is not None and np.array_equal(known[0], gcc.lags_s):
             return known[1]
-        mapper = SRPMapper(spec, self._grid, pairs, lags_s, self._c_m_s, cut_offs_hz)
-        self._mappers[spec.name] = (lags_s, mapper)
+        cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(heard.below)]
+        mapper = SRPMapper(spec, self._map_grid, gcc.pairs, gcc.lags_s, self._c_m_s, cut_offs_hz)
+        self._mappers[spec.name] = (gcc.lags_s, mapper)
         return mapper
 
-    def _limits_band(self, spec: ArraySpec, pairs: IntArray) -> bool:
-        if self._band_limit is not None:
-            return self._band_limit
-        some = self._grid.nodes_m(slice(None, None, max(1, self._grid.size // _NODES_ASKED)))
-        limit_hz = alias_free_hz(some, spec.microphones_m, pairs, self._grid.spacing_m, self._c_m_s)
+    def _limits_band(self, spec: ArraySpec, band_limit: bool | None) -> bool:
+        if uses_envelope(spec.band_hz):
+            return False
+        if band_limit is not None:
+            return band_limit
+        grid = self._map_grid
+        some = grid.nodes_m(slice(None, None, max(1, grid.size // _NODES_ASKED)))
+        pairs = microphone_pairs(len(spec.microphones_m))
+        limit_hz = alias_free_hz(some, spec.microphones_m, pairs, grid.spacing_m, self._c_m_s)
         return bool(np.median(limit_hz) < spec.band_hz[1])
+
+
+def map_grid(arrays: Sequence[ArraySpec], grid: Grid) -> Grid:
+    """The grid that maps are drawn on: the one that is searched, or a coarser one where that is too fine for people.
+
+    Its tables take at most `MAP_BYTES`.
+    """
+    pairs = sum(len(microphone_pairs(len(spec.microphones_m))) for spec in arrays)
+    drawn = grid if grid.spacing_m >= MAP_SPACING_M else Grid(grid.bounds_m, MAP_SPACING_M)
+    while 2 * pairs * drawn.size > MAP_BYTES:
+        drawn = Grid(grid.bounds_m, 1.1 * drawn.spacing_m)
+    return drawn
 
 
 class Cepstral(SrpPhat):
@@ -216,9 +243,7 @@ class Onset(SrpPhat):
     name = "onset"
 
     def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
-        super().__init__(arrays, grid, c_m_s, band_limit=False)
-        self._fine = Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M))
-        self._search = PeakSearch(arrays, self._fine, c_m_s)
+        super().__init__(arrays, Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M)), c_m_s, band_limit=False)
         self._samplings: dict[str, tuple[float, LagSampling]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
@@ -232,16 +257,16 @@ class Onset(SrpPhat):
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Find the highest place of the summed maps, refine it, and judge it."""
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
-        gccs = {heard.spec.name: heard.gcc for heard in evidence}
-        tops = self._search.peaks(gccs, count=_STARTS, apart_nodes=1)
+        find = self._search.among(evidence)
+        found = find(_STARTS)
         functional = SRPFunctional(evidence, self._c_m_s)
-        starts = np.stack([self._fine.node_m(top.node) for top in tops])
-        position, power = peaks.refine(functional, starts, self._fine)
-        rivals = self._search.peaks(gccs, without=[certainty.neighbourhood(position, self._fine)])
+        starts_m = np.stack([self._grid.node_m(peak.node) for peak in found])
+        position, power = peaks.refine(functional, starts_m, self._grid)
+        rivals = find(1, without=[certainty.neighbourhood(position, self._grid)])
         rival_power = rivals[0].power if rivals else 0.0
-        judged = certainty.judge(functional, evidence, position, power, rival_power, self._fine)
-        confidence = judged.signs.confidence
-        return Localization(position, judged.covariance_m2, confidence, evidence, judged.signs, judged.refused)
+        judged = certainty.judge(functional, evidence, position, power, rival_power, self._grid)
+        confidence, proven = judged.signs.confidence, found[0].proven
+        return Localization(position, judged.covariance_m2, confidence, evidence, proven, judged.signs, judged.refused)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         onsets = sound.onsets
@@ -267,6 +292,8 @@ class Onset(SrpPhat):
 def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) -> ArraySpec:
     """One array of all the microphones of several, to be processed jointly: every pair counts, across arrays too.
 
+    Its channels are theirs, array by array.
+
     Parameters
     ----------
     arrays : sequence of ArraySpec
@@ -278,19 +305,40 @@ def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) ->
     Raises
     ------
     ValueError
-        Where clocks differ or are unknown: delays across arrays are good only if one clock samples both.
+        Where clocks differ or are unknown: delays across arrays are good only if one clock samples both. Where bands
+        differ, or there are more microphones than an array may have.
     """
-    known = {spec.name: clocks.get(spec.name) for spec in arrays}
-    if None in known.values() or len(set(known.values())) != 1:
-        each = ", ".join(f"{array!r} by {clock or 'an unknown clock'}" for array, clock in known.items())
+    require_one_clock(name, {spec.name: clocks.get(spec.name) for spec in arrays})
+    bands_hz = {spec.band_hz for spec in arrays}
+    if len(bands_hz) != 1:
+        raise ValueError(
+            f"array {name!r}: joint processing expects arrays of one band, got {sorted(bands_hz)} Hz; "
+            "give them one band_hz, or let their maps be summed instead"
+        )
+    count = sum(len(spec.microphones_m) for spec in arrays)
+    if count > MAX_MICROPHONES:
+        raise ValueError(
+            f"array {name!r}: joint processing expects {MAX_MICROPHONES} microphones at most, got {count}; "
+            "join fewer arrays, or let their maps be summed instead"
+        )
+    microphones_m = np.ascontiguousarray(np.vstack([spec.microphones_m for spec in arrays]))  # sums depend on the order
+    return ArraySpec(name, microphones_m, bands_hz.pop())
+
+
+def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:
+    """Refuse to join arrays, into one of that name, which one clock does not sample; None is an unknown clock.
+
+    Raises
+    ------
+    ValueError
+        Then.
+    """
+    if None in clocks.values() or len(set(clocks.values())) != 1:
+        each = ", ".join(f"{array!r} by {clock or 'an unknown clock'}" for array, clock in clocks.items())
         raise ValueError(
             f"array {name!r}: joint processing expects arrays sampled by one clock, got {each}; "
             "record them through one device, or let their maps be summed instead"
         )
-    bands_hz = {spec.band_hz for spec in arrays}
-    if len(bands_hz) != 1:
-        raise ValueError(f"array {name!r}: joint processing expects arrays of one band, got {sorted(bands_hz)} Hz")
-    return ArraySpec(name, np.vstack([spec.microphones_m for spec in arrays]), bands_hz.pop())
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
@@ -305,6 +353,11 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
+MAP_SPACING_M: Final = 0.1
+"""Maps are not drawn finer than this: a screen shows no more of a room."""
+
+MAP_BYTES: Final = 128_000_000
+"""What the tables of all arrays' maps may take."""
 
 _NODES_ASKED: Final = 4096
 """Nodes looked at to see whether a band limit matters."""

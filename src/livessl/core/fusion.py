@@ -7,7 +7,7 @@ being waited for has reached it, or at its deadline; who is late or missing cont
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import reduce
@@ -40,8 +40,8 @@ from livessl.core.types import (
     Window,
 )
 
-LOST_NS: Final = 2_000_000_000
-"""An array not heard from for so long is lost; marks come every 50 ms."""
+LOST_NS: Final = 1_500_000_000
+"""An array not heard from for so long is lost: marks come every 50 ms, and everyone shall know within 2 s."""
 
 TROUBLE_NS: Final = 10_000_000_000
 """How long a fault keeps an array degraded after it was last seen."""
@@ -71,6 +71,7 @@ class ArrayState(StrEnum):
 
     STARTING = "starting"
     HEALTHY = "healthy"
+    QUIET = "quiet"
     DEGRADED = "degraded"
     LOST = "lost"
 
@@ -136,7 +137,8 @@ class _Stream:
     power: float | None = None
     active: bool = False
     rate_hz: float | None = None
-    silent_since_ns: int | None = None
+    dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
+    dead_since_ns: int = 0
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
@@ -148,6 +150,13 @@ class _Stream:
 
     def worry(self, now_ns: int, what: str) -> None:
         self.trouble_ns, self.trouble = now_ns, what
+
+    def find_dead(self, now_ns: int, alive: Iterable[bool]) -> None:
+        """Take note of the channels that had anything but zeros."""
+        dead = tuple(k for k, lives in enumerate(alive, start=1) if not lives)
+        if dead and not self.dead:
+            self.dead_since_ns = now_ns
+        self.dead = dead
 
     def has_active(self, raster: int) -> bool:
         frame = self.frames.get(raster)
@@ -197,6 +206,7 @@ class _OpenEvent:
     last_active: int
     closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
+    ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
 
 
 class Fusion:
@@ -233,7 +243,44 @@ class Fusion:
         self._event: _OpenEvent | None = None
         self._heard_until = -(2**63)
         self._now_ns = 0
+        self._told_until = self._closing_until = -(2**63)
         self.unknown_arrays = 0
+
+    def twin(self) -> Fusion:
+        """Another of the same site around the same estimator, at its beginning, that makes events only."""
+        specs = [stream.spec for stream in self._streams.values()]
+        return Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+
+    def begin(self, raster: int) -> None:
+        """Take it that everything before this raster interval has been told."""
+        self._heard_until = raster
+
+    def leave_out(self, told: int, closing: int) -> None:
+        """Tell no event that another fusion tells: of sound before `told`, or that comes to its end by `closing`."""
+        self._told_until, self._closing_until = told, closing
+
+    @property
+    def closed(self) -> int | None:
+        """The last raster interval that was closed; None before the first."""
+        return None if self._next is None else self._next - 1
+
+    @property
+    def hears(self) -> bool:
+        """Whether a sound goes on."""
+        return self._event is not None
+
+    @property
+    def needed_from(self) -> int | None:
+        """Before this raster interval no frame will be looked at again; None at the beginning."""
+        if self._next is None:
+            return None
+        begin = self._next if self._event is None else self._event.start
+        return max(self._heard_until, begin - round(self._parameters.pre_roll_s / FRAME_S))
+
+    @property
+    def parameters(self) -> FusionParameters:
+        """How arrays are joined."""
+        return self._parameters
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
@@ -269,7 +316,7 @@ class Fusion:
             self._streams[array].left = True
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing."""
+        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         return [_status(stream, now_ns) for stream in self._streams.values()]
 
     def _went_back(self, now_ns: int) -> bool:
@@ -327,6 +374,7 @@ class Fusion:
         stream.counters["frames"] += 1
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
+            stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -379,12 +427,14 @@ class Fusion:
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
+            event.ended = True
             return self._finish()
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
             outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
+            event.ended = True
             outputs += self._finish()
         return outputs
 
@@ -406,12 +456,13 @@ class Fusion:
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds: dict[str, Sound] = {}
+        sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
-                sounds[name] = _sound(pieces, stream.onsets_at(window))
+                sounds.pieces[name] = pieces
+                sounds.onsets[name] = stream.onsets_at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
@@ -420,7 +471,9 @@ class Fusion:
         estimate = _estimate(found, middle_ns, sounds)
         status, _ = self._judge(estimate, found.refused)
         loudest = max(float(power.max()) for power in powers.values())
-        update = Update(self._id(event.start), status, estimate, loudest, self._contributions(powers, estimate))
+        contributions = self._contributions(powers, estimate)
+        complete_ns = window.stop * FRAME_NS
+        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
         trusted = [] if status is Status.REFUSED else [estimate]
         tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
@@ -430,14 +483,19 @@ class Fusion:
         assert event is not None
         parameters = self._parameters
         span = range(self._span_start(event.start), event.closed + 1)
-        sounds: dict[str, Sound] = {}
+        sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
+        if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
+            return []
         first, last = event.last_active, event.start
         for name, stream in self._streams.items():
-            if not any(stream.has_active(raster) for raster in span):
+            active = [raster for raster in span if stream.has_active(raster)]
+            if not active:
                 continue
-            _, there = stream.segments(span)
+            # beyond its hang-over may lie the run-up to its next sound, which comes when that begins
+            own_end = active[-1] + round(parameters.hang_over_s / FRAME_S) + 1
+            _, there = stream.segments(range(span.start, min(span.stop, own_end)))
             power = np.array([stream.frames[raster].power for raster in there])
             mask = exact_mask(power, parameters.threshold)
             rasters = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
@@ -447,8 +505,8 @@ class Fusion:
             if any(raster not in stream.onsets for raster in there):  # some came late
                 stream.forget()
                 stream.listen(span, self._estimator)
-            heard = range(span.start, rasters[-1] + 1)
-            sounds[name], powers[name] = _sound(pieces, stream.onsets_at(heard)), power[mask]
+            sounds.pieces[name], powers[name] = pieces, power[mask]
+            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
             first, last = min(first, rasters[0]), max(last, rasters[-1])
         if not sounds:
             return []
@@ -476,6 +534,7 @@ class Fusion:
                 heard_by=tuple(sounds),
                 late_frames=event.late_frames,
                 latency_s=(self._now_ns - end_ns) / 1e9,
+                complete_ns=(event.closed + 1) * FRAME_NS,
             )
         ]
 
@@ -483,7 +542,7 @@ class Fusion:
         """Whether the estimate is a place, only a direction, or neither, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         specs = [self._streams[name].spec for name in estimate.arrays]
-        nearest_m = min(direction_deg(spec.centre_m, estimate.position_m)[2] for spec in specs)
+        nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
             return (Status.LOCATED, None) if refused is None else (Status.REFUSED, refused)
@@ -505,13 +564,32 @@ class Fusion:
                 del stream.frames[first]
 
 
-def _sound(pieces: Sequence[Sequence[Frame]], onsets: OnsetGCC | None) -> Sound:
-    segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-    return Sound(segments, pieces[0][0].sample_rate_hz, onsets)
+class _Sounds(Mapping[str, Sound]):
+    """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
+
+    def __init__(self) -> None:
+        self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
+        self.onsets: dict[str, OnsetGCC | None] = {}
+
+    def __getitem__(self, array: str) -> Sound:
+        pieces = self.pieces[array]
+        segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
+        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.pieces)
+
+    def __len__(self) -> int:
+        return len(self.pieces)
 
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, tuple(sounds))
+
+
+def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
+    """How far an array is from the place, or half its width: inside a wide one, its centre is nothing to look from."""
+    return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
 
 
 def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate) -> Contribution:
@@ -531,10 +609,7 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
     stream.counters["overflows"], stream.counters["lost_frames"] = mark.overflows, mark.lost_frames
     if stream.watermark is None or mark.raster >= stream.watermark:
         stream.mark, stream.power, stream.active = mark, mark.power, False
-        if min(mark.channel_power, default=1.0) > 0.0:
-            stream.silent_since_ns = None
-        elif stream.silent_since_ns is None:
-            stream.silent_since_ns = now_ns
+        stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
 def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
@@ -572,11 +647,11 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
     if stream.left:
         return ArrayState.LOST, "its node has ended"
     if age_ns >= LOST_NS:
-        silence = f"nothing heard from it for {age_ns / 1e9:.0f} s"
+        silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
         return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
-    if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
-        dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]
-        which = "all channels are" if len(dead) == len(stream.mark.channel_power) else f"microphone {dead} is"
+    if stream.dead and now_ns - stream.dead_since_ns >= SILENT_NS:
+        every = len(stream.dead) == len(stream.spec.microphones_m)
+        which = "all channels are" if every else f"microphone {list(stream.dead)} is"
         return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
     if troubled:
         return ArrayState.DEGRADED, stream.trouble

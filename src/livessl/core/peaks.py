@@ -2,52 +2,83 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Protocol
 
 import numpy as np
 
 from livessl.core.gcc import mean_square_angular_frequency
 from livessl.core.geometry import Grid
-from livessl.core.srp import PairTerms, SRPFunctional
-from livessl.core.types import Float32Array, FloatArray, HeardBy
+from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
+from livessl.core.types import Float32Array, FloatArray, HeardBy, IntArray
 
-CANDIDATES: Final = 8
-"""Nodes looked at more closely: between two nodes a lower one on the grid may be the higher one in truth."""
-
-CLIMBED: Final = 2
-"""Of them, how many are followed to the top."""
+CANDIDATES: Final = 2
+"""Nodes followed to the top: between two nodes a lower one on the grid may be the higher one in truth."""
 
 RIVAL_DISTANCE_M: Final = 1.0
 """A second peak is another place if it is further away than this."""
 
 _NEWTON_STEPS: Final = 30
-_CONVERGED_M: Final = 1e-5
-"""Steps below a hundredth of a millimetre change nothing that anyone could measure."""
+_CONVERGED_M: Final = 1e-4
+"""Steps below a tenth of a millimetre change nothing that anyone could measure."""
 
 _SUBDIVISIONS: Final = 4
 
 
-def highest_nodes(power: Float32Array, grid: Grid, count: int = CANDIDATES) -> list[int]:
-    """Indices of the highest nodes, best first, no two of them neighbours (not even at a corner)."""
-    pool = min(len(power), 64 * count)
-    best = np.argpartition(power, len(power) - pool)[-pool:]
-    best = best[np.lexsort((best, -power[best]))]  # by power, ties by index: the same on every machine
-    cells = np.stack(np.unravel_index(best, grid.shape), axis=1)
-    chosen: list[int] = []
-    for candidate in range(len(best)):
-        if all(np.abs(cells[candidate] - cells[other]).max() > 1 for other in chosen):
-            chosen.append(candidate)
-        if len(chosen) == count:
-            break
-    return [int(best[candidate]) for candidate in chosen]
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A node and the fused power there; and whether it is known to be the highest, or only of what was looked at."""
+
+    node: int
+    power: float
+    proven: bool = True
+
+
+class FindPeaks(Protocol):
+    """Finds the highest nodes, best first: each the highest of those far enough from the ones before it."""
+
+    def __call__(self, count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        """Up to `count` peaks that differ by more than `apart_nodes` along some axis, none of them in a box.
+
+        Boxes (3, 2) are the first and last node along each axis. Of equal nodes the first in the grid's order is taken.
+        """
+        ...
+
+
+def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
+    """What finds the peaks of a whole map (G,)."""
+
+    def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        left = power.reshape(grid.shape).copy()
+        for box in without:
+            left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
+        found: list[Peak] = []
+        for _ in range(count):
+            node = int(left.argmax())
+            highest = float(left.flat[node])
+            if highest == -np.inf:
+                break
+            found.append(Peak(node, highest))
+            box = box_around(grid, node, apart_nodes)
+            left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
+        return found
+
+    return find
+
+
+def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
+    """First and last node along each axis (3, 2) of what lies at most so many nodes from one."""
+    at = np.array(np.unravel_index(node, grid.shape))
+    return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
 
 
 def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
     """From nodes to the highest top near any of them.
 
-    A finer local grid around every start, all looked at in one go; from the best of them Newton steps that only ever
-    go up.
+    A finer local grid around every start, all looked at in one go; from the best place on each, Newton steps that only
+    ever go up.
 
     Parameters
     ----------
@@ -64,9 +95,8 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple
     """
     near = np.atleast_2d(starts_m)[:, None] + _offsets_m(grid)
     values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
-    highest = values.argmax(axis=1)
-    order = np.argsort(-values.max(axis=1), kind="stable")[:CLIMBED]
-    tops = [_climb(functional, near[k, highest[k]], float(values[k, highest[k]]), grid) for k in order]
+    best = values.argmax(axis=1)
+    tops = [_climb(functional, near[n, k], float(values[n, k]), grid) for n, k in enumerate(best)]
     return max(tops, key=lambda top: top[1])
 
 
@@ -79,20 +109,24 @@ def _offsets_m(grid: Grid) -> FloatArray:
 
 def _climb(functional: SRPFunctional, position_m: FloatArray, value: float, grid: Grid) -> tuple[FloatArray, float]:
     axes = list(grid.free_axes)
+    across = np.ix_(axes, axes)
+    lower_m, upper_m = grid.lower_m, grid.upper_m
     reach = float(grid.cell_m.max()) / _SUBDIVISIONS
     for _ in range(_NEWTON_STEPS):
         gradient, hessian = functional.derivatives(position_m)
         step = np.zeros(3)
-        step[axes] = _ascent(gradient[axes], hessian[np.ix_(axes, axes)])
-        step *= min(1.0, reach / max(float(np.linalg.norm(step)), 1e-12))
+        step[axes] = _ascent(gradient[axes], hessian[across])
+        length = math.sqrt(step @ step)
+        if length > reach:
+            step, length = step * (reach / length), reach
         climbed = False
-        while np.linalg.norm(step) > _CONVERGED_M:
-            trial = np.clip(position_m + step, grid.lower_m, grid.upper_m)
+        while length > _CONVERGED_M:
+            trial = np.minimum(np.maximum(position_m + step, lower_m), upper_m)
             trial_value = float(functional.value(trial[None])[0])
             if trial_value > value:
                 position_m, value, climbed = trial, trial_value, True
                 break
-            step /= 2.0
+            step, length = step / 2.0, length / 2.0
         if not climbed:
             break
     return position_m, value
@@ -105,20 +139,19 @@ def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
     return np.asarray(eigenvectors @ ((eigenvectors.T @ gradient) / strength))
 
 
-def confidence(power: Float32Array, grid: Grid, position_m: FloatArray) -> float:
+def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
     """How far the peak stands out: 1 - (highest power elsewhere) / (highest power), 0 to 1.
 
     Elsewhere is more than `RIVAL_DISTANCE_M` away along some axis (a quarter of the volume's size where that is less).
     """
     reach = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
-    box = []
+    box = np.empty((3, 2), dtype=np.int64)
     for axis in range(3):
         near = np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach)
-        box.append(slice(int(near[0]), int(near[-1]) + 1) if len(near) else slice(0, 0))
-    elsewhere = power.reshape(grid.shape).copy()
-    elsewhere[tuple(box)] = -np.inf
-    first, second = float(power.max()), float(elsewhere.max())
-    return 0.0 if first <= 0 else float(np.clip(1.0 - max(second, 0.0) / first, 0.0, 1.0))
+        box[axis] = (near[0], near[-1]) if len(near) else (1, 0)
+    rivals = find(1, without=[box])
+    second = rivals[0].power if rivals else 0.0
+    return 0.0 if first.power <= 0 else float(np.clip(1.0 - max(second, 0.0) / first.power, 0.0, 1.0))
 
 
 def laplace_covariance_m2(
@@ -136,7 +169,8 @@ def laplace_covariance_m2(
     information = np.diag(12.0 / np.maximum(grid.upper_m - grid.lower_m, 1e-9) ** 2)
     for heard, term in zip(evidence, functional.pair_terms(position_m), strict=True):
         hill = np.maximum(-term.curvature, 0.0)
-        curvature = term.weight * (term.gradient_s_m.T * hill) @ term.gradient_s_m
+        weight = pair_weight(len(heard.spec.microphones_m))
+        curvature = weight * (term.gradient_s_m.T * hill) @ term.gradient_s_m
         information += _scale(heard, term) * curvature
     covariance = np.zeros((3, 3))
     if axes:

@@ -11,24 +11,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from types import ModuleType
 from typing import Final
 
 import numpy as np
 
 from livessl.core import vectorised
 from livessl.core.geometry import Grid
-from livessl.core.srp import pair_weight
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray, UInt8Array, UInt16Array
-
-kernels: ModuleType
-try:
-    from livessl.core import compiled as kernels
-except ImportError:  # without numba
-    kernels = vectorised
+from livessl.core.kernels import kernels
+from livessl.core.peaks import FindPeaks, Peak, box_around
+from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray, UInt8Array, UInt16Array
 
 CELL_M: Final = 0.2
-"""Edge of a cell, about."""
+"""Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
+
+MOST_CELLS: Final = 50_000
+
+MOST_LOOK_UPS: Final = 5_000_000
+"""After so many a search is given up, some 10 ms compiled. Two arrays never need so many, nor do many that hear a sound
+well; many that hear nothing but noise do."""
 
 CELLS_PER_TOP: Final = 4
 """Cells along an edge of the cubes of cells that are bounded first."""
@@ -41,23 +42,6 @@ class Rule(IntEnum):
     PRODUCT = vectorised.PRODUCT
     """Of the positive parts."""
     MINIMUM = vectorised.MINIMUM
-
-
-@dataclass(frozen=True, slots=True)
-class Peak:
-    """A node and the fused power there."""
-
-    node: int
-    power: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Lags:
-    """One array's way from differences of distances to places on its lag axis."""
-
-    count: int
-    scale: np.float32
-    offset: np.float32
 
 
 class PeakSearch:
@@ -75,7 +59,8 @@ class PeakSearch:
         self._grid = grid
         self._c_m_s = c_m_s
         self._axes = [grid.axis_m(axis).astype(np.float32) for axis in range(3)]
-        self._edge = max(1, round(CELL_M / grid.spacing_m))
+        volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
+        self._edge = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / grid.spacing_m))
         self._cells = [-(-n // self._edge) for n in grid.shape]
         self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
         self._specs = {spec.name: spec for spec in arrays}
@@ -86,7 +71,7 @@ class PeakSearch:
         tops = int(np.prod(self._tops))
         self._low, self._high = (np.zeros((total, tops * CELLS_PER_TOP**3), np.uint16) for _ in range(2))
         self._top_low, self._top_high = (np.zeros((total, tops), np.uint16) for _ in range(2))
-        self._lags: dict[str, _Lags] = {}
+        self._places: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Rows] = {}
 
     def prepare(self, array: str, lags_s: FloatArray) -> None:
@@ -104,57 +89,52 @@ class PeakSearch:
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         rows = slice(first, first + len(pairs))
-        scale = np.float32(1.0 / ((lags_s[1] - lags_s[0]) * self._c_m_s))
-        known = self._lags[array] = _Lags(len(lags_s), scale, np.float32(len(lags_s) // 2 + 0.5))
+        places = self._places[array] = LagPlaces.on(lags_s, self._c_m_s)
         low, high = (np.empty((len(pairs), int(np.prod(self._cells))), np.uint16) for _ in range(2))
         microphones_m = spec.microphones_m.astype(np.float32)
         kernels.cell_intervals(
-            *self._axes, microphones_m, pairs.astype(np.int32), known.scale, known.offset, self._edge, low, high
+            *self._axes, microphones_m, pairs.astype(np.int32), places.scale, places.offset, self._edge, low, high
         )
         self._low[rows], self._top_low[rows] = self._by_cube(low, np.minimum)
         self._high[rows], self._top_high[rows] = self._by_cube(high, np.maximum)
         self._sets.clear()
 
-    def peaks(
-        self,
-        gccs: dict[str, GCC],
-        count: int = 1,
-        apart_nodes: int = 0,
-        rule: Rule = Rule.SUM,
-        without: Sequence[IntArray] = (),
-    ) -> list[Peak]:
-        """The highest nodes, best first: each the highest of those far enough from the ones before it.
+    def among(
+        self, evidence: Sequence[HeardBy], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
+    ) -> FindPeaks:
+        """What finds the peaks of some arrays' evidence; good until the next call with the same arrays.
 
         Parameters
         ----------
-        gccs : dict of array name to GCC
-            At least one; in the order in which the maps are to be joined. Each array must have been prepared.
-        count : int
-        apart_nodes : int
-            Two peaks differ by more than so many nodes along some axis.
+        evidence : sequence of HeardBy
+            At least one, in the order in which the maps are to be joined. Each array must have been prepared.
         rule : Rule
-        without : sequence of (3, 2) int64
-            Boxes, first and last node along each axis, in which no peak is wanted.
+        most_look_ups : int
+            For each peak: the search is then given up, and the peak not proven to be the highest.
         """
-        rows = self._rows(tuple(gccs))
-        for array, gcc in enumerate(gccs.values()):
-            rows.values[rows.first_row[array] : rows.first_row[array + 1], : gcc.values.shape[1]] = gcc.values
+        rows = self._rows(tuple(heard.spec.name for heard in evidence))
+        for array, heard in enumerate(evidence):
+            values = heard.gcc.values
+            rows.values[rows.first_row[array] : rows.first_row[array + 1], : values.shape[1]] = values
         kernels.running_maxima(rows.values, rows.maxima)
-        boxes = list(without)
-        found: list[Peak] = []
-        for _ in range(count):
-            stacked = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
-            node, power = kernels.highest(
-                rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
-                self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
-                rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset, stacked,
-            )  # fmt: skip
-            if power == -np.inf:
-                break
-            found.append(Peak(int(node), float(power)))
-            at = np.array(np.unravel_index(node, self._grid.shape))
-            boxes.append(np.stack([at - apart_nodes, at + apart_nodes], axis=1))
-        return found
+
+        def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+            boxes = list(without)
+            found: list[Peak] = []
+            for _ in range(count):
+                node, power, proven = kernels.highest(
+                    rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
+                    self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
+                    rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
+                    np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
+                )  # fmt: skip
+                if power == -np.inf:
+                    break
+                found.append(Peak(int(node), float(power), bool(proven)))
+                boxes.append(box_around(self._grid, int(node), apart_nodes))
+            return found
+
+        return find
 
     def _by_cube(self, cells: UInt16Array, extreme: np.ufunc) -> tuple[UInt16Array, UInt16Array]:
         """Intervals' ends (P, C) of cells in the grid's order: cube after cube, filled up with zeros; and of cubes."""
@@ -176,10 +156,10 @@ class PeakSearch:
         return self._sets[arrays]
 
     def _new_rows(self, arrays: tuple[str, ...]) -> _Rows:
-        specs, lags = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
+        specs, places = [self._specs[name] for name in arrays], [self._places[name] for name in arrays]
         first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
         rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
-        length = max(one.count for one in lags)
+        length = max(one.count for one in places)
         levels = int((self._top_high[rows] - self._top_low[rows]).max()).bit_length() + 1
         return _Rows(
             values=np.zeros((len(rows), length), np.float32),
@@ -191,8 +171,8 @@ class PeakSearch:
             microphones_m=np.concatenate([spec.microphones_m for spec in specs]).astype(np.float32),
             first_microphone=np.cumsum([0, *(len(spec.microphones_m) for spec in specs)]),
             pairs=np.concatenate([self._pairs[name] for name in arrays]),
-            scale=np.array([one.scale for one in lags]),
-            offset=np.array([one.offset for one in lags]),
+            scale=np.array([one.scale for one in places]),
+            offset=np.array([one.offset for one in places]),
         )
 
 
@@ -215,3 +195,19 @@ class _Rows:
     pairs: IntArray
     scale: Float32Array
     offset: Float32Array
+
+
+def warm_up() -> None:
+    """Run every kernel once, so that nothing is compiled, or read from the compiler's cache, while somebody waits.
+
+    Without a cache, the first time on a machine, it takes some seconds; else a fraction of one.
+    """
+    spec = ArraySpec("warm-up", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), (100.0, 6000.0))
+    grid = Grid(((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)), 0.5)
+    lags_s = np.arange(-200, 201) / 400_000.0
+    heard = HeardBy(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
+    search = PeakSearch([spec], grid, 343.0)
+    search.prepare(spec.name, lags_s)
+    search.among([heard])(2)
+    SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
+    SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))

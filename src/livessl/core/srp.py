@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from livessl.core.geometry import Grid
+from livessl.core.kernels import kernels
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.vectorised import interpolated, lag_places, neighbours
 
 _NEAREST_M: Final = 1e-9
 """A point in a microphone has no direction from it; one so far away has."""
@@ -98,8 +99,27 @@ def alias_free_hz(
     return np.asarray(np.divide(1.0 / (2.0 * spacing_m), steepness, out=limit, where=steepness > 0.0))
 
 
+@dataclass(frozen=True, slots=True)
+class LagPlaces:
+    """From a difference of distances, metres, to a place on a fine lag axis: the whole part of `d * scale + offset`.
+
+    In float32, and by the same formula wherever a node's lag is looked up: a map and a search then agree to the last
+    bit.
+    """
+
+    count: int
+    scale: np.float32
+    offset: np.float32
+
+    @classmethod
+    def on(cls, lags_s: FloatArray, c_m_s: float) -> LagPlaces:
+        """Of an axis (L,), evenly spaced around zero."""
+        scale = 1.0 / ((lags_s[1] - lags_s[0]) * c_m_s)
+        return cls(len(lags_s), np.float32(scale), np.float32(len(lags_s) // 2 + 0.5))
+
+
 class SRPMapper:
-    """Maps an array's GCC onto the grid by nearest fine lag: one sparse product.
+    """Maps an array's GCC onto the grid by nearest fine lag: one look-up a pair and node.
 
     With cut-offs, each pair and node looks its lag up in the GCC of the highest band that is free of spatial aliasing
     there (`alias_free_hz`), or of the lowest where none is. What is left out lowers a node's power: it is not
@@ -128,28 +148,32 @@ class SRPMapper:
         c_m_s: float,
         cut_offs_hz: Sequence[float] = (),
     ) -> None:
-        step = lags_s[1] - lags_s[0]
-        row = np.arange(len(pairs))[:, None] * len(lags_s)
-        band = len(pairs) * len(lags_s)
+        on_axis = LagPlaces.on(lags_s, c_m_s)
+        microphones_m = spec.microphones_m.astype(np.float32)
         ascending_hz = np.array([spec.band_hz[1], *cut_offs_hz])[::-1]
-        columns = np.empty((grid.size, len(pairs)), dtype=np.int32)
+        columns = len(lags_s) * len(ascending_hz)
+        table = np.empty((grid.size, len(pairs)), dtype=np.uint16 if columns < 1 << 16 else np.uint32)
         for first in range(0, grid.size, _SLAB_NODES):
             nodes = grid.nodes_m(slice(first, first + _SLAB_NODES))
-            lags = steering_delays_s(nodes, spec.microphones_m, pairs, c_m_s)
-            place = np.rint((lags - lags_s[0]) / step) + row
+            place = lag_places(nodes.astype(np.float32), microphones_m, pairs, on_axis.scale, on_axis.offset)
             if len(cut_offs_hz):
                 limit = alias_free_hz(nodes, spec.microphones_m, pairs, grid.spacing_m, c_m_s)
                 free = np.searchsorted(ascending_hz, limit, side="right")  # bands that are free of aliasing
-                place += band * np.minimum(len(ascending_hz) - free, len(cut_offs_hz))
-            columns[first : first + len(nodes)] = place.T
-        weight = np.full(columns.size, pair_weight(len(spec.microphones_m)), dtype=np.float32)
-        starts = np.arange(0, columns.size + 1, len(pairs), dtype=np.int32)
-        self._look_up = csr_array((weight, columns.ravel(), starts), shape=(grid.size, len(ascending_hz) * band))
+                place = place + len(lags_s) * np.minimum(len(ascending_hz) - free, len(cut_offs_hz))
+            table[first : first + len(nodes)] = place.T
+        self._weight = np.float32(pair_weight(len(spec.microphones_m)))
+        self._table = kernels.look_up_table(table, columns)
+
+    def add(self, power: Float32Array, *gccs: GCC) -> None:
+        """Add to the power (G,) at every node that of the GCC of the whole band and those below each cut-off."""
+        values = gccs[0].values if len(gccs) == 1 else np.concatenate([gcc.values for gcc in gccs], axis=1)
+        kernels.add_power(np.ascontiguousarray(values, dtype=np.float32), self._table, self._weight, power)
 
     def __call__(self, *gccs: GCC) -> Float32Array:
-        """Power (G,) at every node, float32, from the GCC of the whole band and those below each cut-off."""
-        values = [gcc.values.astype(np.float32).ravel() for gcc in gccs]
-        return np.asarray(self._look_up @ (values[0] if len(values) == 1 else np.concatenate(values)))
+        """Power (G,) at every node."""
+        power = np.zeros(self._table.shape[0], dtype=np.float32)
+        self.add(power, *gccs)
+        return power
 
 
 def pair_weight(microphones: int) -> float:
@@ -168,40 +192,53 @@ class SRPFunctional:
     """
 
     def __init__(self, evidence: Sequence[HeardBy], c_m_s: float) -> None:
-        self._evidence = evidence
+        self._names = [heard.spec.name for heard in evidence]
+        counts = [len(heard.spec.microphones_m) for heard in evidence]
+        rows = [len(heard.gcc.pairs) for heard in evidence]
+        self._first_row = np.cumsum([0, *rows])
+        self._microphones_m = np.concatenate([heard.spec.microphones_m for heard in evidence])
+        shift = np.repeat(np.cumsum([0, *counts[:-1]]), rows)
+        self._pairs = np.concatenate([heard.gcc.pairs for heard in evidence]) + shift[:, None]
+        self._weight = np.repeat([pair_weight(count) for count in counts], rows)
         self._c_m_s = c_m_s
-        self._tables = [_Tables(heard.gcc) for heard in evidence]
+        self._first_s = np.repeat([heard.gcc.lags_s[0] for heard in evidence], rows)
+        self._step_s = np.repeat([heard.gcc.lags_s[1] - heard.gcc.lags_s[0] for heard in evidence], rows)
+        self._last = np.repeat([len(heard.gcc.lags_s) - 3 for heard in evidence], rows)
+        lengths = np.repeat([len(heard.gcc.lags_s) for heard in evidence], rows)
+        self._start = np.cumsum(lengths) - lengths
+        self._values = np.concatenate([heard.gcc.values.ravel() for heard in evidence])
 
     def value(self, points_m: FloatArray) -> FloatArray:
         """SRP at points (N, 3): (N,)."""
-        total = np.zeros(len(points_m))
-        for heard, table in zip(self._evidence, self._tables, strict=True):
-            lags = steering_delays_s(points_m, heard.spec.microphones_m, heard.gcc.pairs, self._c_m_s)
-            total += pair_weight(len(heard.spec.microphones_m)) * table.values(lags).sum(axis=0)
-        return total
+        return np.asarray(
+            kernels.smooth_power(
+                np.ascontiguousarray(points_m), self._microphones_m, self._pairs, self._c_m_s, self._first_s,
+                self._step_s, self._start, self._last, self._weight, self._values,
+            )
+        )  # fmt: skip
 
     def pair_terms(self, point_m: FloatArray) -> list[PairTerms]:
         """For each array, what its pairs say at one point (3,)."""
-        terms = []
-        for heard, table in zip(self._evidence, self._tables, strict=True):
-            microphones, pairs = heard.spec.microphones_m, heard.gcc.pairs
-            towards = point_m - microphones
-            distance = np.sqrt((towards**2).sum(axis=1))
-            unit = towards / np.maximum(distance, 1e-9)[:, None]
-            gradient = (unit[pairs[:, 1]] - unit[pairs[:, 0]]) / self._c_m_s
-            lags = (distance[pairs[:, 1]] - distance[pairs[:, 0]]) / self._c_m_s
-            values, slope, curvature = (one[:, 0] for one in table.derivatives(lags[:, None]))
-            weight = pair_weight(len(microphones))
-            terms.append(PairTerms(heard.spec.name, weight, values, slope, curvature, gradient, lags))
-        return terms
+        terms = self._terms(point_m)
+        parts = zip(self._names, self._first_row[:-1], self._first_row[1:], strict=True)
+        return [PairTerms(name, *(part[first:end] for part in terms)) for name, first, end in parts]
 
     def derivatives(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient (3,) and Gauss-Newton Hessian (3, 3) at one point: sum R' grad tau, sum R'' grad tau grad tau^T."""
-        gradient, hessian = np.zeros(3), np.zeros((3, 3))
-        for term in self.pair_terms(point_m):
-            gradient += term.weight * term.slope @ term.gradient_s_m
-            hessian += term.weight * (term.gradient_s_m.T * term.curvature) @ term.gradient_s_m
-        return gradient, hessian
+        _, slope, curvature, gradient, _ = self._terms(point_m)
+        return (self._weight * slope) @ gradient, (gradient.T * (self._weight * curvature)) @ gradient
+
+    def _terms(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Of all pairs R, R', R'', grad tau and tau."""
+        towards = point_m - self._microphones_m
+        distance = np.sqrt((towards**2).sum(axis=1))
+        unit = towards / np.maximum(distance, _NEAREST_M)[:, None]
+        i, k = self._pairs.T
+        lags = (distance[k] - distance[i]) / self._c_m_s
+        place = (lags - self._first_s) / self._step_s
+        left, around = neighbours(place, self._start, self._last, self._values)
+        value, slope, curvature = interpolated(place - left, *around)
+        return value, slope / self._step_s, curvature / self._step_s**2, (unit[k] - unit[i]) / self._c_m_s, lags
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,39 +246,8 @@ class PairTerms:
     """One array's pairs at one point: R, R' (1/s), R'' (1/s^2), grad tau (P, 3) (s/m) and tau (s), each (P,)."""
 
     array: str
-    weight: float
     values: FloatArray
     slope: FloatArray
     curvature: FloatArray
     gradient_s_m: FloatArray
     lags_s: FloatArray
-
-
-class _Tables:
-    """R, R' and R'' between the fine lags: differences over four neighbours, R bent by its curvature.
-
-    R must be smooth, for a kink at every fine lag would stop a climb at its ridge. At `OVERSAMPLING` lags a sample the
-    highest frequency advances by at most 0.35 rad a step, so the differences err by less than 2 %.
-    """
-
-    def __init__(self, gcc: GCC) -> None:
-        self._first = gcc.lags_s[0]
-        self._step = gcc.lags_s[1] - gcc.lags_s[0]
-        self._values = gcc.values
-        self._row = np.arange(len(gcc.values))[:, None]
-
-    def values(self, lags_s: FloatArray) -> FloatArray:
-        """R at each pair's own lags (P, N): (P, N)."""
-        return self.derivatives(lags_s)[0]
-
-    def derivatives(self, lags_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """R, R' (1/s) and R'' (1/s^2) at each pair's own lags (P, N): (P, N) each."""
-        place = (lags_s - self._first) / self._step
-        left = np.minimum(np.maximum(place.astype(np.int64), 1), self._values.shape[1] - 3)
-        after_share = place - left
-        here_share = 1.0 - after_share
-        before, here, after, beyond = (self._values[self._row, left + k] for k in (-1, 0, 1, 2))
-        slope = 0.5 * (here_share * (after - before) + after_share * (beyond - here))
-        curvature = here_share * (after - 2.0 * here + before) + after_share * (beyond - 2.0 * after + here)
-        value = here_share * here + after_share * after - 0.5 * here_share * after_share * curvature
-        return value, slope / self._step, curvature / self._step**2

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import as_completed as completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import BytesIO
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -73,7 +73,7 @@ class Job:
     @property
     def digest(self) -> str:
         """Tells jobs apart: the same for the same settings (but for the number of positions) and sounds."""
-        known = asdict(self.settings) | {"positions": None}
+        known = self.settings.as_dict() | {"positions": None}
         hashed = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
         for name, clips in sorted(self.clips.items()):
             for clip, samples in clips:
@@ -261,7 +261,7 @@ def _claim(out: Path, job: Job) -> None:
             )
     out.mkdir(parents=True, exist_ok=True)
     sounds = {name: [clip for clip, _ in clips] for name, clips in job.clips.items()}
-    text = json.dumps({"digest": job.digest, "settings": asdict(job.settings), "sounds": sounds}, indent=1)
+    text = json.dumps({"digest": job.digest, "settings": job.settings.as_dict(), "sounds": sounds}, indent=1)
     _write(path, text.encode())
 
 

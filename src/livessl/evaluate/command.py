@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings
+from livessl.config import load_site
+from livessl.evaluate.layout import layout_of
+from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
 
 HALVES: Final = ("development", "test")
 LOCALIZER: Final = "localizer"
@@ -21,6 +24,9 @@ def add_arguments(parser: Any) -> None:
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
         help=f"{LOCALIZER}: onset against srp-phat; {REPORT}: only what --with names, reported together",
+    )
+    parser.add_argument(
+        "--site", type=Path, help="site file with a room and arrays instead of the paper's, for one-array or diversity"
     )
     parser.add_argument("--events", type=Path, metavar="DIR", help="clips named like doorslam001.wav")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; a run that was cut resumes")
@@ -39,7 +45,12 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--jobs", type=_whole, help="processes (default: one a core)")
     parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of processes here")
     parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
-    parser.add_argument("--snr", type=float, metavar="DB", help="add white sensor noise (default: none)")
+    parser.add_argument(
+        "--snr",
+        type=float,
+        metavar="DB",
+        help="white sensor noise, so far below each recording's mean power (default: none)",
+    )
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
     parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
@@ -54,18 +65,22 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     ------
     ValueError
         Where something cannot be.
+    ConfigError
+        Where the site file is wrong.
     """
-    experiment = EXPERIMENTS[arguments.experiment]
+    layout = None if arguments.site is None else layout_of(load_site(arguments.site))
+    experiment = experiment_of(arguments.experiment, layout)
     rt60s_s = experiment.rt60s_s if arguments.rt is None else reverberation_times_s(arguments.rt)
     from livessl.simulate.room import absorption
 
     for rt60_s in rt60s_s:
-        absorption(rt60_s, experiment.room_m)
+        absorption(rt60_s, experiment.room_m, experiment.c_m_s)
     if arguments.grid is not None and not 0.02 <= arguments.grid <= 2.0:
         raise ValueError(f"--grid: expected 0.02 to 2 metres, got {arguments.grid:g}")
-    if arguments.sample_rate < 14000:
+    if arguments.sample_rate < experiment.lag_rate_hz:
         raise ValueError(
-            f"--sample-rate: the band ends at 6000 Hz, expected 14000 Hz or more, got {arguments.sample_rate}"
+            f"--sample-rate: the band ends at {experiment.band_hz[1]:g} Hz, expected "
+            f"{math.ceil(experiment.lag_rate_hz)} Hz or more, got {arguments.sample_rate}"
         )
     return Settings(
         experiment=arguments.experiment,
@@ -77,6 +92,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
         snr_db=arguments.snr,
         segment=arguments.segment,
         band_limit=not arguments.no_band_limit,
+        layout=layout,
     )
 
 
@@ -95,6 +111,8 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
         raise ValueError(f"evaluate needs more packages: pip install 'livessl[evaluate]' ({error})") from error
 
     if arguments.experiment == REPORT:
+        if arguments.site is not None:
+            raise ValueError("evaluate report: runs nothing, so expected no --site; take it away")
         if not arguments.others:
             raise ValueError(
                 "evaluate report: expected one or more folders of campaigns, got none; name them by --with"

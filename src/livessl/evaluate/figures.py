@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,17 @@ from livessl.core.frontends import whole_segment
 from livessl.core.gcc import CrossSpectra, microphone_pairs
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.evaluate.maps import PairMatrices, reach_samples
-from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, OFFICE_M, ROOM_M, System, pair, tetrahedron_in_cube
+from livessl.evaluate.paper import (
+    BAND_HZ,
+    C_M_S,
+    EXPERIMENTS,
+    METHODS,
+    OFFICE_M,
+    ROOM_M,
+    System,
+    pair,
+    tetrahedron_in_cube,
+)
 from livessl.evaluate.statistics import Interval, Results
 from livessl.simulate.room import impulse_responses
 
@@ -43,28 +54,33 @@ TITLES: Final[Mapping[str, str]] = {
 """Every figure, and what it shows."""
 
 
-def draw_all(directory: Path, campaigns: Mapping[str, Results]) -> list[str]:
-    """Draw what the campaigns at hand allow; returns the names of the figures."""
+def draw_all(directory: Path, campaigns: Mapping[str, Results]) -> dict[str, str]:
+    """Draw what the campaigns at hand allow; returns the names of the figures, and what they show.
+
+    Campaigns of the paper have its figures; any other has its medians.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     mpl.rcParams["svg.hashsalt"] = "livessl"  # the same figure, the same bytes
-    drawings: dict[str, Callable[[], Figure]] = {
+    explaining = {
         "gcc": _gcc,
         "angle-error": _angle_error,
         "maps-size": _maps_of_sizes,
         "maps-pair": _maps_of_a_pair,
         "topology": _topology,
     }
-    if "one-array" in campaigns:
-        drawings["one-array"] = lambda: _one_array(campaigns["one-array"])
-    if "diversity" in campaigns:
-        drawings["diversity"] = lambda: _diversity(campaigns["diversity"])
-    if "office" in campaigns:
-        drawings["office"] = lambda: _office(campaigns["office"])
+    papers = {"one-array": _one_array, "diversity": _diversity, "office": _office}
+    drawings: dict[str, Callable[[], Figure]] = {}
+    titles: dict[str, str] = {}
+    if papers.keys() & campaigns.keys():
+        drawings |= explaining
+    for name, results in campaigns.items():
+        drawings[name] = partial(papers.get(name, _all_medians), results)
+        titles[name] = TITLES.get(name, f"Median error against reverberation time: {name}")
     for name, draw in drawings.items():
         figure = draw()
         figure.savefig(directory / f"{name}.png", dpi=130, metadata={"Software": None})
         figure.savefig(directory / f"{name}.svg", metadata={"Date": None})
-    return list(drawings)
+    return {name: titles.get(name) or TITLES[name] for name in drawings}
 
 
 def sigma_theta_deg(theta_deg: FloatArray, spacing_m: FloatArray | float, sample_rate_hz: float) -> FloatArray:
@@ -222,6 +238,21 @@ def _diversity(results: Results) -> Figure:
     _curve(axes[0, 0], results, "joint-8", "srp-phat", "black", "s--", "8 microphones, joint")
     _curve(axes[0, 0], results, "small", "srp-phat", "grey", "^:", "one array")
     _finish(axes[0, 0])
+    return figure
+
+
+def _all_medians(results: Results) -> Figure:
+    """Every system, and every method of it."""
+    figure, axes = _figure(size=(7.5, 5.0))
+    columns = list(dict.fromkeys(condition[:2] for condition in results.values))
+    systems = list(dict.fromkeys(system for system, _ in columns))
+    styles = dict(zip(METHODS, ("o-", "s--", "^:"), strict=True))
+    for system, method in columns:
+        colour = COLOURS[systems.index(system) % len(COLOURS)]
+        _curve(axes[0, 0], results, system, method, colour, styles[method], f"{system}, {method}")
+    axes[0, 0].set(xlabel="nominal reverberation time (s)", ylabel="median error (m)", ylim=(0.0, None))
+    axes[0, 0].grid(visible=True, alpha=0.3)
+    axes[0, 0].legend(fontsize=8)
     return figure
 
 

@@ -30,7 +30,7 @@ def reach_samples(aperture_m: float, sample_rate_hz: float, c_m_s: float) -> int
 
 
 class PairMatrices:
-    """Interpolation matrices W of pairs of microphones: map = W r, with r a pair's GCC at whole-sample lags.
+    """Interpolation matrices W of pairs of microphones: map = 2/K sum of W r, with r a pair's GCC at whole-sample lags.
 
     W[g, n] = (2 f/fs) sinc(2 f (tau_g - n/fs)) with f the node's cut-off, or fs/2 where nothing is cut: low-pass and
     fractional delay in one (Dietzen et al. 2021 for the sampling; the cut-off as in `alias_free_hz`).
@@ -71,7 +71,7 @@ class PairMatrices:
             matrix = self._matrix(spec.microphones_m[[i, k]])
             reach = matrix.shape[1] // 2
             total += matrix @ lags[:, index, centre - reach : centre + reach + 1].T
-        return total
+        return total * np.float32(2.0 / len(spec.microphones_m))
 
     def _matrix(self, microphones_m: FloatArray) -> Float32Array:
         key = np.round(microphones_m, 9).tobytes()

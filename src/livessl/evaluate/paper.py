@@ -1,17 +1,17 @@
-"""The paper's experiments as data: rooms, arrays, places, methods. It simulates nothing and draws nothing."""
+"""The paper's experiments as data: rooms, arrays, places, methods; the same elsewhere. It simulates nothing."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from livessl.core.estimators import joined
 from livessl.core.geometry import Grid
 from livessl.core.types import ArraySpec, FloatArray
+from livessl.evaluate.layout import Layout
 
 C_M_S: Final = 343.0
 BAND_HZ: Final = (100.0, 6000.0)
@@ -72,11 +72,14 @@ class Settings:
     spacing_m : float
         Of the search grid: cell-centred.
     snr_db : float or None
-        White sensor noise below the mean power of the event at the system's microphones; None is the paper's: none.
+        White sensor noise, independent at each microphone, so far below the mean power of the whole recording, over the
+        system's microphones; None is the paper's: none.
     segment : str
         Which of an event's segments is localized: "longest", or "peak" for the one that holds the loudest frame.
     band_limit : bool
         Against spatial aliasing, per pair and node; see `livessl.core.srp.alias_free_hz`.
+    layout : Layout or None
+        Room, search volume and arrays; None are the paper's.
     """
 
     experiment: str
@@ -88,10 +91,14 @@ class Settings:
     snr_db: float | None = None
     segment: str = "longest"
     band_limit: bool = True
+    layout: Layout | None = None
 
-    def as_json(self) -> str:
-        """The same settings give the same text."""
-        return json.dumps(asdict(self), sort_keys=True, indent=1)
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values by name. The paper's layout is not among them: campaigns from before there were others go on."""
+        known = asdict(self)
+        if self.layout is None:
+            del known["layout"]
+        return known
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +117,11 @@ class Experiment:
         The paper's grid.
     positions : int
         The paper's number.
+    c_m_s : float
+    band_hz : (float, float)
+        From the lowest to the highest frequency used.
+    bounds_m : three (float, float), or None
+        Search volume; None is the room.
     """
 
     room_m: tuple[float, float, float]
@@ -118,11 +130,19 @@ class Experiment:
     rt60s_s: tuple[float, ...]
     spacing_m: float
     positions: int
+    c_m_s: float = C_M_S
+    band_hz: tuple[float, float] = BAND_HZ
+    bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
+
+    @property
+    def lag_rate_hz(self) -> float:
+        """Least rate of the lags kept: twice the band's end and a sixth, however fast the sound was sampled."""
+        return 7.0 * self.band_hz[1] / 3.0
 
     def grid(self, spacing_m: float) -> Grid:
-        """The search grid over the whole room."""
+        """The search grid."""
         x, y, z = self.room_m
-        return Grid(((0.0, x), (0.0, y), (0.0, z)), spacing_m)
+        return Grid(self.bounds_m or ((0.0, x), (0.0, y), (0.0, z)), spacing_m)
 
 
 def tetrahedron_in_cube(edge_m: float) -> FloatArray:
@@ -207,3 +227,44 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {
     ),
 }
 """By their names on the command line."""
+
+
+def experiment_of(name: str, layout: Layout | None = None) -> Experiment:
+    """An experiment of the paper, or the same with another room and other arrays.
+
+    `one-array` hears each array alone, by every method; `diversity` each alone, and their sums. Sources are anywhere in
+    the search volume.
+
+    Raises
+    ------
+    ValueError
+        Where the layout does not allow it.
+    """
+    paper = EXPERIMENTS[name]
+    if layout is None:
+        return paper
+    if name not in _OTHER_LAYOUTS:
+        raise ValueError(f"--site: expected one of {', '.join(_OTHER_LAYOUTS)}, got {name}, which has its own room")
+    specs = {array.name: array.spec for array in layout.arrays}
+    methods = METHODS if name == "one-array" else ("srp-phat",)
+    systems = [System(array, (spec,), methods) for array, spec in specs.items()]
+    if name == "diversity":
+        if not layout.sums:
+            raise ValueError(f"--site: diversity expects two arrays or more, got {', '.join(specs)} only; add another")
+        systems += [System(called, tuple(specs[array] for array in arrays)) for called, arrays in layout.sums]
+    lower_m, upper_m = np.array(layout.bounds_m).T
+    bands_hz = np.array([spec.band_hz for spec in specs.values()])
+    return Experiment(
+        layout.room_m,
+        tuple(systems),
+        lambda rng, number: np.asarray(rng.uniform(lower_m, upper_m)),  # noqa: ARG005 - a place
+        paper.rt60s_s,
+        layout.spacing_m,
+        paper.positions,
+        layout.c_m_s,
+        (float(bands_hz[:, 0].min()), float(bands_hz[:, 1].max())),
+        layout.bounds_m,
+    )
+
+
+_OTHER_LAYOUTS: Final = ("one-array", "diversity")

@@ -13,7 +13,8 @@ import numpy as np
 
 from livessl.evaluate.campaign import read_costs
 from livessl.evaluate.claims import Claim, claims
-from livessl.evaluate.figures import TITLES, draw_all
+from livessl.evaluate.figures import draw_all
+from livessl.evaluate.paper import EXPERIMENTS
 from livessl.evaluate.statistics import Interval, Results, read_results, summary, write_csv
 
 READINGS: Final = (
@@ -25,15 +26,23 @@ READINGS: Final = (
     "summed over pairs and arrays (--no-band-limit). On grids of more than 8192 nodes cut-offs are third octaves.",
     "cepstral: rectangular frames of 0.6 s or half the segment, the channel's cepstrum starts as the first frame's and "
     "takes 0.06 of each further one. averaged: 25 ms Hann frames, half overlapping.",
-    "Tetrahedra are every other vertex of a cube, the second of a pair mirrored along the length, so that two at 0 m "
-    "are a cube's eight vertices; the 8-microphone array is these eight.",
     "Grids are cell-centred; the estimate is the highest node, not refined below the grid, as in the paper.",
     "Rooms by the image method, walls by Sabine with 24 ln 10 / c; each response ends at its nominal reverberation "
     "time. T30 is what the responses then measure.",
     "Intervals are 99 % bootstrap intervals; positions are resampled, all conditions alike, so differences are paired.",
-    "The office is simulated with sources anywhere in 4 x 4 m at two heights 2 m apart; the paper's was real.",
 )
 """How the paper's open points are read; each is a switch or a line here."""
+
+PAPERS_LAYOUT: Final = (
+    "Tetrahedra are every other vertex of a cube, the second of a pair mirrored along the length, so that two at 0 m "
+    "are a cube's eight vertices; the 8-microphone array is these eight.",
+    "The office is simulated with sources anywhere in 4 x 4 m at two heights 2 m apart; the paper's was real.",
+)
+OTHER_LAYOUT: Final = (
+    "Room, search volume, speed of sound, bands and arrays are the site file's.",
+    "Sources are anywhere in the search volume.",
+)
+"""What is read so of rooms and arrays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,26 +87,28 @@ def write_report(out: Path, folders: Sequence[Path]) -> list[Path]:
         require_campaign(folder)
         settings = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))["settings"]
         experiment = settings["experiment"]
+        if "layout" in settings:
+            experiment += f"-{settings['layout']['site']}"
         if experiment in campaigns:
             raise ValueError(f"{folder}: expected each experiment once, got {experiment} again")
         campaigns[experiment] = read_results(folder / "results.parquet", experiment)
         about[experiment] = settings | {"costs": read_costs(folder)}
     out.mkdir(parents=True, exist_ok=True)
     rows = [row for results in campaigns.values() for row in summary(results)]
-    found = claims(campaigns)
+    found = claims(campaigns) if EXPERIMENTS.keys() & campaigns.keys() else []
     figures = draw_all(out / "figures", campaigns)
     blocks = _blocks(campaigns, about, rows, found, figures)
-    claim_rows = [dict(zip(_CLAIM_TITLES, row, strict=True)) for row in _claim_rows(found)]
     write_csv(out / "summary.csv", rows)
-    write_csv(out / "claims.csv", claim_rows)
-    written = {
-        "claims.md": as_markdown([Heading(1, "What the paper says"), Table(_CLAIM_TITLES, _claim_rows(found))]),
-        "report.md": as_markdown(blocks),
-        "report.html": as_html("The paper, reproduced", blocks),
-    }
+    written = {"report.md": as_markdown(blocks), "report.html": as_html(_title(found), blocks)}
+    tables = ["summary.csv"]
+    if found:
+        write_csv(out / "claims.csv", [dict(zip(_CLAIM_TITLES, row, strict=True)) for row in _claim_rows(found)])
+        tables.append("claims.csv")
+        table = Table(_CLAIM_TITLES, _claim_rows(found))
+        written = {"claims.md": as_markdown([Heading(1, "What the paper says"), table])} | written
     for name, text in written.items():
         (out / name).write_text(text, encoding="utf-8")
-    return [out / name for name in ("summary.csv", "claims.csv", *written)]
+    return [out / name for name in (*tables, *written)]
 
 
 def require_campaign(folder: Path) -> None:
@@ -204,15 +215,16 @@ def _blocks(
     about: Mapping[str, Mapping[str, Any]],
     rows: Sequence[Mapping[str, Any]],
     found: Sequence[Claim],
-    figures: Sequence[str],
+    figures: Mapping[str, str],
 ) -> list[Block]:
-    blocks: list[Block] = [Heading(1, "The paper, reproduced"), Heading(2, "What was run")]
+    blocks: list[Block] = [Heading(1, _title(found)), Heading(2, "What was run")]
     titles = [
         "experiment",
         "positions",
         "events a condition",
         "seed",
         "grid",
+        "SNR",
         "CPU a position",
         "CPU in all",
         "peak memory",
@@ -228,29 +240,41 @@ def _blocks(
                 str(results.positions * len(results.classes)),
                 str(settings["seed"]),
                 f"{settings['spacing_m']:g} m",
+                "no noise" if settings["snr_db"] is None else f"{settings['snr_db']:g} dB",
                 f"{np.mean(cpu_s):.1f} s" if cpu_s else "-",
                 f"{sum(cpu_s) / 3600.0:.2f} h" if cpu_s else "-",
                 f"{max(cost['peak_mib'] for cost in costs):.0f} MiB" if costs else "-",
             ]
         )
-    blocks += [Table(titles, run), Heading(2, "What the paper says, and what we find")]
-    counts: dict[str, int] = {}
-    for claim in found:
-        counts[claim.verdict] = counts.get(claim.verdict, 0) + 1
+    blocks.append(Table(titles, run))
+    if found:
+        counts: dict[str, int] = {}
+        for claim in found:
+            counts[claim.verdict] = counts.get(claim.verdict, 0) + 1
+        blocks += [
+            Heading(2, "What the paper says, and what we find"),
+            ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+            + ". Nothing was tuned towards the paper: a claim that does not hold is a finding.",
+            Table(_CLAIM_TITLES, _claim_rows(found)),
+        ]
     blocks += [
-        ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-        + ". Nothing was tuned towards the paper: a claim that does not hold is a finding.",
-        Table(_CLAIM_TITLES, _claim_rows(found)),
         Heading(2, "Figures"),
-        *(Picture(name, TITLES[name]) for name in figures),
+        *(Picture(name, text) for name, text in figures.items()),
         Heading(2, "Medians"),
         "Metres, all sounds, with 99 % intervals; `summary.csv` has quartiles, tails and each class of sound.",
     ]
     for results in campaigns.values():
         blocks += [Heading(3, results.experiment), _medians(results)]
     blocks += [Heading(3, "By class of sound"), _by_class(rows)]
-    blocks += [Heading(2, "How the paper's open points are read"), READINGS]
+    blocks += [
+        Heading(2, "How the paper's open points are read"),
+        (*READINGS, *(PAPERS_LAYOUT if found else OTHER_LAYOUT)),
+    ]
     return blocks
+
+
+def _title(found: Sequence[Claim]) -> str:
+    return "The paper, reproduced" if found else "The paper's experiments with other arrays"
 
 
 def _medians(results: Results) -> Table:

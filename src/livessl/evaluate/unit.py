@@ -16,7 +16,7 @@ from livessl.core.gcc import CrossSpectra, microphone_pairs
 from livessl.core.geometry import Grid, direction_deg
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, IntArray
 from livessl.evaluate.maps import PairMatrices, PairTables, reach_samples
-from livessl.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, System
+from livessl.evaluate.paper import Experiment, Settings, System, experiment_of
 from livessl.simulate.room import impulse_responses
 
 Row = dict[str, Any]
@@ -30,9 +30,6 @@ FRONT_ENDS: Final[Mapping[str, FrontEnd]] = {
 
 PEAK: Final = 0.5
 """Largest sample of a system's recording before it is rounded to 16 bits: 6 dB of headroom."""
-
-LAG_RATE_HZ: Final = 14000.0
-"""Least rate of the lags kept: correlations that end at 6 kHz need 12 kHz, however fast the sound was sampled."""
 
 Clips = Mapping[str, tuple[tuple[str, Float32Array], ...]]
 """Class of sound -> its clips: name and samples (n,), at the campaign's sample rate."""
@@ -63,18 +60,19 @@ class Position:
     settings: Settings
     clips: Clips
     grid: Grid = field(init=False)
+    _experiment: Experiment = field(init=False)
     _every: int = field(init=False)
     _mapper: Mapper = field(init=False)
     _microphones_m: FloatArray = field(init=False)
     _channels: list[list[int]] = field(init=False)
 
     def __post_init__(self) -> None:
-        experiment = EXPERIMENTS[self.settings.experiment]
+        self._experiment = experiment = experiment_of(self.settings.experiment, self.settings.layout)
         self.grid = experiment.grid(self.settings.spacing_m)
-        self._every = max(1, int(self.settings.sample_rate_hz // LAG_RATE_HZ))
+        self._every = max(1, int(self.settings.sample_rate_hz // experiment.lag_rate_hz))
         lag_rate_hz, band_limit = self.settings.sample_rate_hz / self._every, self.settings.band_limit
         make = PairMatrices if self.grid.size <= MATRIX_NODES else PairTables
-        self._mapper = make(self.grid, lag_rate_hz, C_M_S, band_limit=band_limit)
+        self._mapper = make(self.grid, lag_rate_hz, experiment.c_m_s, band_limit=band_limit)
         every = np.round(np.vstack([system.microphones_m for system in experiment.systems]), 9)
         self._microphones_m, inverse = np.unique(every, axis=0, return_inverse=True)
         ends = np.cumsum([len(system.microphones_m) for system in experiment.systems])
@@ -82,7 +80,7 @@ class Position:
 
     def rows(self, number: int) -> list[Row]:
         """Simulate and localize position `number`: one row per system, method, event and reverberation time."""
-        settings, experiment = self.settings, EXPERIMENTS[self.settings.experiment]
+        settings, experiment = self.settings, self._experiment
         rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
         source_m = experiment.place(rng, number)
         chosen = {name: clips[int(rng.integers(len(clips)))] for name, clips in self.clips.items()}
@@ -93,11 +91,11 @@ class Position:
             self._microphones_m,
             settings.rt60s_s,
             sample_rate_hz=settings.sample_rate_hz,
-            c_m_s=C_M_S,
+            c_m_s=experiment.c_m_s,
             own_lengths=True,
             compiled=True,
         )
-        decay_s = [t30_s(response[0], settings.sample_rate_hz, BAND_HZ) for response in responses]
+        decay_s = [t30_s(response[0], settings.sample_rate_hz, experiment.band_hz) for response in responses]
         heads: list[Row] = []
         found: list[list[tuple[_Heard, ...]]] = [[] for _ in experiment.systems]
         for name, (clip, sound) in chosen.items():
@@ -116,7 +114,7 @@ class Position:
                     }
                 )
                 for index, system in enumerate(experiment.systems):
-                    samples = _recorded(wet[self._channels[index]], settings.snr_db, noise, (len(heads), index))
+                    samples = recorded(wet[self._channels[index]], settings.snr_db, noise, (len(heads), index))
                     found[index].append(self._heard(system, samples))
         return [
             row
@@ -135,7 +133,7 @@ class Position:
             first = 0
             for spec in system.arrays:
                 count = len(spec.microphones_m)
-                reach = self._every * reach_samples(spec.aperture_m, rate_hz / self._every, C_M_S)
+                reach = self._every * reach_samples(spec.aperture_m, rate_hz / self._every, self._experiment.c_m_s)
                 spectra = FRONT_ENDS[method](segment[first : first + count], rate_hz, reach)
                 cross = CrossSpectra(spectra, microphone_pairs(count), rate_hz, spec.band_hz)
                 lags.append(np.ascontiguousarray(cross.correlations(reach).real[:, :: self._every]))
@@ -211,10 +209,14 @@ def convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
     return np.asarray(scipy.fft.irfft(spectrum, n_fft, axis=1, overwrite_x=True)[:, :count], dtype=np.float32)
 
 
-def _recorded(
+def recorded(
     wet: Float32Array, snr_db: float | None, noise: np.random.SeedSequence, key: tuple[int, int]
 ) -> Float32Array:
-    """Add the sensors' noise, set the level, round to 16 bits."""
+    """Add the sensors' noise to what a system hears (K, n), set the level, round to 16 bits.
+
+    The noise is white, independent at each microphone and drawn by `key`, `snr_db` below the mean power over all
+    microphones and the whole recording.
+    """
     if snr_db is not None:
         rng = np.random.default_rng(np.random.SeedSequence(noise.entropy, spawn_key=(*noise.spawn_key, *key)))
         rms = np.sqrt(np.square(wet).mean(dtype=np.float64) * 10.0 ** (-snr_db / 10.0))

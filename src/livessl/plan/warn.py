@@ -38,6 +38,11 @@ def warnings(plan: Plan) -> list[str]:
 
 
 def _together(plan: Plan) -> Iterator[str]:
+    if plan.site.joint:
+        yield (
+            f"joint arrays ({', '.join(plan.site.joint)}) are not planned as such: the error above is that of the maps "
+            "of the arrays that they join, summed"
+        )
     if len(plan.arrays) == 1:
         yield "one array alone tells a direction, but hardly a distance; set up a second one, metres apart"
     centres = np.array([array.spec.centre_m for array in plan.arrays])

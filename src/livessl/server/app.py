@@ -6,6 +6,7 @@ import asyncio
 import errno
 import logging
 import socket
+import ssl
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import Final
 import uvicorn
 
 from livessl.clock import Clock
-from livessl.config import Site
+from livessl.config import ConfigError, Fault, HttpConfig, Site, open_doors
+from livessl.keys import read_tokens
 from livessl.messages import JsonObject
 from livessl.server.engine import Engine
 from livessl.server.hub import Hub
 from livessl.server.receiver import BindError
 from livessl.server.sinks import Sinks
-from livessl.server.store import Store
+from livessl.server.store import Store, StoreError
 from livessl.server.web import create_app
 
 SHUTDOWN_S: Final = 2
@@ -31,6 +33,20 @@ MAX_CONNECTIONS: Final = 1000
 
 MAX_SAID_BYTES: Final = 4096
 """Of a subscriber, who has nothing to say."""
+
+MAX_HEAD_BYTES: Final = 16_384
+"""Of a request: its line and all of its headers."""
+
+CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
+"""Of TLS 1.2: forward secret and authenticated. Those of 1.3 all are."""
+
+MAX_UNREAD_BYTES: Final = 131_072
+"""What the system keeps for a client that does not read; left to itself it would be megabytes for each."""
+
+EXPIRE_S: Final = 600.0
+"""How often events are looked through for those that have been kept long enough."""
+
+DAY_NS: Final = 86_400_000_000_000
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +67,8 @@ class Server:
     ------
     BindError
         Where an address is taken.
+    ConfigError
+        Where the server would be open to the network, or where keys, tokens or certificate cannot be used.
     StoreError, SinkError
         Where the event database or a sink cannot be used.
     """
@@ -63,11 +81,19 @@ class Server:
         method: str | None = None,
         on_event: Callable[[JsonObject], None] | None = None,
     ) -> None:
+        faults = open_doors(site)
+        if faults:
+            raise ConfigError(faults)
+        http = site.server.http
+        tokens = None if http.tokens is None else read_tokens(site.file(http.tokens))
+        certificate = _certificate(site)
         self._on_event = on_event
-        self._hub = Hub()
+        self._clock = clock
+        self._retention_days = site.store.retention_days
+        self._hub = Hub(clock.now_ns() // 1_000_000)  # fewer than a message a millisecond: no number comes twice
         self._loop: asyncio.AbstractEventLoop | None = None
         with ExitStack() as undo:  # what is open when a later step fails
-            self._http = _listen(site.server.http.host, site.server.http.port)
+            self._http = _listen(http.host, http.port)
             undo.callback(self._http.close)
             self._sinks = Sinks(site.server.sinks)
             undo.callback(self._sinks.close)
@@ -75,11 +101,17 @@ class Server:
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish, method)
             undo.pop_all()
-        app = create_app(site, self.engine, self._hub, self._store, self._sinks)
+        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, tokens)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
+                ws="websockets-sansio",  # the quickest to send many small messages
                 log_level="warning",
+                http="h11",  # the one that limits a request's head
+                h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+                ssl_certfile=certificate,
+                ssl_ciphers=CIPHERS,
+                ssl_keyfile=None if http.private_key is None else site.file(http.private_key),
                 limit_concurrency=MAX_CONNECTIONS,
                 ws_max_size=MAX_SAID_BYTES,
                 ws_per_message_deflate=False,  # small messages hardly shrink, and each would cost time and memory
@@ -87,7 +119,7 @@ class Server:
             )
         )
         host, port = self._http.getsockname()[:2]
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        self.url = f"{'http' if certificate is None else 'https'}://{f'[{host}]' if ':' in host else host}:{port}"
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raises what made the engine fail, if it did."""
@@ -108,11 +140,13 @@ class Server:
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
         self.engine.start()
-        watch = asyncio.create_task(self._watch())
+        tasks = [asyncio.create_task(self._watch()), asyncio.create_task(self._expire())]
         try:
             await self._uvicorn.serve(sockets=[self._http])
         finally:
-            watch.cancel()
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             self._loop = None
 
     async def _watch(self) -> None:
@@ -121,7 +155,19 @@ class Server:
             await asyncio.sleep(0.2)
         self.stop()
 
+    async def _expire(self) -> None:
+        """Forget events that are older than they may become."""
+        while self._retention_days is not None:
+            before_ns = self._clock.now_ns() - round(self._retention_days * DAY_NS)
+            try:
+                if gone := await asyncio.to_thread(self._store.expire, before_ns):
+                    _log.info("%d events older than %g days were deleted", gone, self._retention_days)
+            except StoreError as error:
+                _log.error("%s", error)
+            await asyncio.sleep(EXPIRE_S)
+
     def _publish(self, message: JsonObject) -> None:
+        told_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
         if message["kind"] == "event":
             self._sinks.take(message)
             if self._on_event is not None:
@@ -130,15 +176,31 @@ class Server:
         if loop is None:
             return
         try:
-            loop.call_soon_threadsafe(self._hub.publish, message)
+            loop.call_soon_threadsafe(self._hub.publish, message, told_ns)
         except RuntimeError:  # the loop has just closed: nobody is left to tell
             _log.debug("a message came after the end")
+
+
+def _certificate(site: Site) -> Path | None:
+    """The certificate's file, once it is known to fit its key: uvicorn would find out only when it is too late."""
+    http: HttpConfig = site.server.http
+    if http.certificate is None or http.private_key is None:
+        return None
+    certificate, key = site.file(http.certificate), site.file(http.private_key)
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except (OSError, ssl.SSLError) as error:
+        reason = getattr(error, "reason", None) or error.strerror
+        what = f"cannot use {certificate} with {key}: {reason}; name a PEM certificate and its key without a passphrase"
+        raise ConfigError([Fault("server.http.certificate", what)]) from error
+    return certificate
 
 
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # and of all that it accepts
     try:
         listener.bind((host, port))
         listener.listen(128)

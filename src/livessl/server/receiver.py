@@ -15,13 +15,20 @@ from livessl import wire
 from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.types import Message
+from livessl.keys import server_keys
+from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
+from livessl.server.latency import Arrival, Arrivals
+from livessl.server.refusals import Refusals
 
 POLL_MS: Final = 20
 """How long the thread waits for sound before it looks whether acknowledgements are due."""
 
 QUEUE_MESSAGES: Final = 1000
 """Ten seconds of five arrays. When it is full the socket is left alone, and nodes keep their sound themselves."""
+
+BUSY_MESSAGES: Final = 100
+"""While so many wait, nodes are not asked for what they have kept: live sound would wait behind it."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,13 +52,20 @@ class Joined:
 
 
 @dataclass(frozen=True, slots=True)
+class Greeted:
+    """A node tells anew what it has kept: more after an interruption, nothing when all of it is sent."""
+
+    hello: wire.Hello
+
+
+@dataclass(frozen=True, slots=True)
 class Left:
     """A node has ended on purpose."""
 
     hello: wire.Hello
 
 
-Item = Message | Joined | Left
+Item = Message | Joined | Greeted | Left
 
 
 class Receiver:
@@ -66,10 +80,17 @@ class Receiver:
     ------
     BindError
         Where the address is taken.
+    ConfigError
+        Where the site uses keys that cannot be read.
     """
 
     def __init__(self, site: Site, clock: Clock) -> None:
+        keys = server_keys(site)
         self.ingest = Ingest(site)
+        self.arrivals = Arrivals()
+        self.refusals = Refusals(clock)
+        self.enrolled = [] if keys is None else sorted(keys.nodes)
+        self._guarded = keys is not None
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
         self._stop = threading.Event()
@@ -79,6 +100,8 @@ class Receiver:
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        if keys is not None:
+            guard(self._context, self._socket, keys, self.refusals, self._fail)
         try:
             self._socket.bind(site.server.bind)
         except zmq.ZMQError as error:
@@ -118,25 +141,32 @@ class Receiver:
             while not self._stop.is_set():
                 if self._socket.poll(POLL_MS):
                     self._drain()
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
-                    self._reply(routing_id, ack)
+                self._acknowledge()
         except BaseException as error:
-            self.failure = error
+            self._fail(error)
             _log.exception("the receiving thread has failed")
             raise
+
+    def _fail(self, error: BaseException) -> None:
+        self.failure = error
 
     def _drain(self) -> None:
         for _ in range(QUEUE_MESSAGES):
             try:
-                routing_id, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
+                address, *parts = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            arrival = self.ingest.receive(routing_id, b"".join(parts), self._clock.monotonic_ns())
+            routing_id, data = address.bytes, b"".join(part.bytes for part in parts)
+            enrolled = str(parts[0].get("User-Id")) if self._guarded else None
+            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
             if arrival.joined is not None:
                 self._put(Joined(arrival.joined))
+            if arrival.greeted is not None:
+                self._put(Greeted(arrival.greeted))
             if arrival.left is not None:
                 self._put(Left(arrival.left))
             if arrival.message is not None:
+                self.arrivals.note(arrival.message.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
                 self._put(arrival.message)
             if arrival.reply is not None:
                 self._reply(routing_id, arrival.reply)
@@ -146,10 +176,14 @@ class Receiver:
             try:
                 self._queue.put(item, timeout=0.1)
             except Full:
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
-                    self._reply(routing_id, ack)
+                self._acknowledge()
             else:
                 return
+
+    def _acknowledge(self) -> None:
+        soon = self._queue.qsize() < BUSY_MESSAGES
+        for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
+            self._reply(routing_id, ack)
 
     def _reply(self, routing_id: bytes, ack: wire.Ack) -> None:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -18,12 +17,15 @@ from prometheus_client.registry import Collector
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
-from livessl.clock import utc_ns, utc_text
-from livessl.config import Site
+from livessl.clock import Clock, utc_ns, utc_text
+from livessl.config import Site, is_loopback
 from livessl.core.types import FRAME_S
+from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
+from livessl.server.auth import HEALTH, Gate
 from livessl.server.engine import Engine
-from livessl.server.hub import Filter, Hub, Subscription
+from livessl.server.hub import Filter, Hub, Subscription, Told
+from livessl.server.latency import Latency
 from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
 from livessl.server.png import map_png
 from livessl.server.sinks import Sinks
@@ -39,11 +41,18 @@ MAX_REASON: Final = 120
 """A closing frame's reason holds 123 bytes (RFC 6455)."""
 
 KINDS: Final = frozenset({"update", "event", "track", "arrays"})
+_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    401: {"description": "no token, or one that is not known"},
+    403: {"description": "a token of a lesser role"},
+}
+
 _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
 
 
-def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> FastAPI:
-    """The application around a running engine."""
+def create_app(
+    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, tokens: Tokens | None = None
+) -> FastAPI:
+    """The application around a running engine, open to anyone or to those who have a token."""
     app = FastAPI(
         title="livessl",
         version=__version__,
@@ -51,11 +60,16 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks)
         docs_url=None,  # its page would load scripts from elsewhere
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
+        responses={} if tokens is None else _REFUSALS,
     )
 
-    if _is_loopback(site.server.http.host):
+    app.add_middleware(Gate, tokens=tokens, refusals=engine.refusals)
+    if tokens is None and is_loopback(site.server.http.host):
         # else a page from anywhere could have its own name point here, and read as if it were ours
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost", "[::1]"])
+        app.add_middleware(
+            TrustedHostMiddleware,
+            allowed_hosts=["127.0.0.1", "localhost", "[::1]", site.server.http.host],
+        )
 
     @app.middleware("http")
     async def _headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
@@ -66,16 +80,26 @@ def create_app(site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks)
         return response
 
     _add_state_routes(app, site, engine, hub, store, sinks)
+    _add_access_route(app, engine, tokens)
     _add_event_routes(app, site, store)
     _add_map_route(app, site, engine)
-    _add_live_route(app, site, engine, hub)
+    _add_live_route(app, site, clock, engine, hub)
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
         return FileResponse(STATIC / "index.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    if tokens is not None:
+        _tell_of_tokens(app.openapi())
     return app
+
+
+def _tell_of_tokens(described: JsonObject) -> None:
+    """Into the OpenAPI, which knows of no gate before the application."""
+    described.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    described["security"] = [{"token": []}]
+    described["paths"][HEALTH]["get"]["security"] = [{}, {"token": []}]
 
 
 def describe_site(site: Site, mode: str) -> JsonObject:
@@ -99,14 +123,16 @@ def describe_site(site: Site, mode: str) -> JsonObject:
                 "microphones_m": spec.microphones_m.round(4).tolist(),
                 "band_hz": list(spec.band_hz),
             }
-            for spec in site.specs
+            for spec in site.processed
         },
+        "joint": {name: list(members) for name, members in site.joint.items()},
         "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
+        "privacy": _privacy(site),
     }
 
 
-def _is_loopback(host: str) -> bool:
-    return host in ("127.0.0.1", "localhost", "::1")
+def _privacy(site: Site) -> JsonObject:
+    return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
 def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
@@ -125,9 +151,9 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         """The tracks that live now."""
         return {"v": API_VERSION, "tracks": engine.tracks()}
 
-    @app.get("/api/v1/health", tags=["state"])
-    def get_health(response: Response) -> JsonObject:
-        """Whether the server works (503 where it does not) and how the arrays are."""
+    @app.get("/api/v1/health", tags=["state"], responses={503: {"description": "the server has failed"}})
+    def get_health(request: Request, response: Response) -> JsonObject:
+        """Whether the server works (503 where it does not) and how the arrays are; without a token the status only."""
         arrays = engine.arrays()
         reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
         states = {a["state"] for a in arrays}
@@ -135,9 +161,14 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         if engine.unkept:
             reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
             status = "degraded" if status == "ok" else status
+        if engine.unsaved:
+            reasons.append(f"server.events_db: {engine.unsaved} events wait for it; free space or release the file")
+            status = "degraded" if status == "ok" else status
         if engine.failure is not None:
             status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
             response.status_code = 503
+        if request.scope["client_role"] is None:
+            return {"v": API_VERSION, "status": status}
         return {
             "v": API_VERSION,
             "status": status,
@@ -146,10 +177,18 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
             "uptime_s": round(engine.uptime_s(), 3),
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
+            "privacy": _privacy(site),
+            "secured": {
+                "nodes": site.keys is not None,
+                "tokens": site.server.http.tokens is not None,
+                "tls": site.server.http.certificate is not None,
+            },
+            "refused": {door: engine.refusals.count(door) for door in ("nodes", "http")},
         }
 
     registry = CollectorRegistry()
     registry.register(_Metrics(engine, hub, store, sinks))
+    registry.register(engine.latency.histogram)
 
     @app.get("/metrics", tags=["state"], response_class=PlainTextResponse)
     def get_metrics() -> PlainTextResponse:
@@ -157,8 +196,23 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         return PlainTextResponse(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
+def _add_access_route(app: FastAPI, engine: Engine, tokens: Tokens | None) -> None:
+    @app.get("/api/v1/access", tags=["state"])
+    def get_access() -> JsonObject:
+        """Who may ask, which nodes are enrolled, and who was refused; for admins."""
+        return {
+            "v": API_VERSION,
+            "clients": [{"name": c.name, "role": str(c.role)} for c in (tokens.clients if tokens else ())],
+            "nodes": engine.enrolled,
+            "refused": [
+                {"door": r.door, "who": r.who, "reason": r.reason, "count": r.count, "last_utc": utc_text(r.last_ns)}
+                for r in engine.refusals.known()
+            ],
+        }
+
+
 def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
-    @app.get("/api/v1/events", tags=["estimates"])
+    @app.get("/api/v1/events", tags=["estimates"], responses={404: {"description": "no such zone"}})
     def get_events(
         since: Annotated[str | None, Query(description="RFC 3339; events that began then or later")] = None,
         until: Annotated[str | None, Query(description="RFC 3339; events that began then or earlier")] = None,
@@ -176,7 +230,7 @@ def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
         events, following = store.find(query)
         return {"v": API_VERSION, "events": events, "next_cursor": None if following is None else str(following)}
 
-    @app.get("/api/v1/events/{event_id}", tags=["estimates"])
+    @app.get("/api/v1/events/{event_id}", tags=["estimates"], responses={404: {"description": "no such event"}})
     def get_event(event_id: str) -> JsonObject:
         """One event."""
         event = store.get(event_id)
@@ -185,13 +239,18 @@ def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
         return {"v": API_VERSION, **event}
 
 
+def _unprocessable(name: str, what: str) -> HTTPException:
+    """A query that cannot be understood, told as FastAPI tells its own."""
+    return HTTPException(422, [{"type": "value_error", "loc": ["query", name], "msg": what}])
+
+
 def _instant(name: str, text: str | None) -> int | None:
     if text is None:
         return None
     try:
         time_ns = utc_ns(text.replace(" ", "+"))  # an unescaped + in a query arrives as a blank
     except (ValueError, OverflowError) as error:
-        raise HTTPException(422, f"{name}: {error}") from error
+        raise _unprocessable(name, f"{name}: {error}") from error
     return max(-(2**63), min(2**63 - 1, time_ns))
 
 
@@ -199,7 +258,12 @@ def _cursor(text: str | None) -> Cursor | None:
     try:
         return None if text is None else Cursor.parse(text)
     except ValueError as error:
-        raise HTTPException(422, f"cursor: {error}") from error
+        raise _unprocessable("cursor", f"cursor: {error}") from error
+
+
+def _mapped(site: Site) -> list[str]:
+    """Names that a map may be asked of."""
+    return [FUSED, *(spec.name for spec in site.processed)]
 
 
 def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
@@ -209,6 +273,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         responses={
             200: {"content": {"image/png": {}, "application/octet-stream": {}}},
             204: {"description": "no window has been localized yet"},
+            404: {"description": "no such array, or it has no part in the newest map"},
         },
     )
     def get_map(
@@ -217,10 +282,10 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         format: Annotated[Literal["png", "float32"], Query()] = "png",  # noqa: A002 - the API's word
     ) -> Response:
         """The newest power map: a projection (largest value along the axis left out) or the whole volume."""
-        if array != FUSED and array not in site.arrays:
-            raise HTTPException(404, f"no array {array!r}; there are fused, {', '.join(site.arrays)}")
+        if array not in _mapped(site):
+            raise HTTPException(404, f"no array {array!r}; there are {', '.join(_mapped(site))}")
         if view == "volume" and format == "png":
-            raise HTTPException(422, "view=volume has no picture; use format=float32")
+            raise _unprocessable("view", "view=volume has no picture; use format=float32")
         drawn = engine.maps.newest(array)
         if drawn is None:
             return Response(status_code=204)
@@ -246,19 +311,24 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         return Response(body, media_type="application/octet-stream", headers=headers)
 
 
-def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
+def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub: Hub) -> None:
     @app.websocket("/api/v1/live")
     async def live(
-        socket: WebSocket, kinds: str | None = None, min_confidence: str = "0", zone: str | None = None
+        socket: WebSocket,
+        kinds: str | None = None,
+        min_confidence: str = "0",
+        zone: str | None = None,
+        since_seq: str | None = None,
     ) -> None:
         await socket.accept()  # a reason can only be told to a client that is connected
         try:
             _refuse_strangers(socket)
             wanted = _filter(site, kinds, min_confidence, zone)
+            since = _number("since_seq", since_seq)
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
             return
-        subscription = hub.subscribe(wanted)
+        subscription = hub.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
             "seq": hub.last_seq,
@@ -270,7 +340,7 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
             "arrays": await asyncio.to_thread(engine.arrays),
         }
         try:
-            await _while_connected(socket, _send_all(socket, subscription, hello))
+            await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
         finally:
             hub.unsubscribe(subscription)
 
@@ -293,8 +363,8 @@ def _add_live_route(app: FastAPI, site: Site, engine: Engine, hub: Hub) -> None:
 
 
 def _chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
-    if array != FUSED and array not in site.arrays:
-        raise ValueError(f"array: none of that name; there are fused, {', '.join(site.arrays)}")
+    if array not in _mapped(site):
+        raise ValueError(f"array: none of that name; there are {', '.join(_mapped(site))}")
     chosen = tuple(dict.fromkeys(view.strip() for view in views.split(",")))
     if not set(chosen) <= VIEWS.keys():
         raise ValueError(f"views: expected some of {', '.join(VIEWS)}")
@@ -305,11 +375,13 @@ async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -
     """Do the work until it ends or the client is gone."""
     tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
     try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises what was wrong, if anything
 
 
 def _refuse_strangers(socket: WebSocket) -> None:
@@ -317,6 +389,12 @@ def _refuse_strangers(socket: WebSocket) -> None:
     origin = socket.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
         raise ValueError("origin: pages of other servers may not listen")
+
+
+def _number(name: str, text: str | None) -> int | None:
+    if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ValueError(f"{name}: expected the seq of a message")
+    return None if text is None else int(text)
 
 
 def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
@@ -334,13 +412,14 @@ def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None
     return Filter(chosen, least, zone)
 
 
-async def _send_all(socket: WebSocket, subscription: Subscription, first: JsonObject) -> None:
-    message = first
-    while True:
-        text = json.dumps(message, separators=(",", ":"))
-        if not await _sent(socket.send_text(text)):
-            return
-        message = await subscription.next()
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, clock: Clock, latency: Latency) -> None:
+    told = first
+    while await _sent(socket.send_text(told.text)):
+        if told.told_ns is not None:
+            latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+        if subscription.lags:  # else all of it goes out in one turn, even to a client that has left meanwhile
+            await asyncio.sleep(0)
+        told = await subscription.next()
 
 
 async def _send_pictures(
@@ -363,7 +442,8 @@ async def _send_pictures(
 async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
     """Whether a client took what it was sent, in time."""
     try:
-        await asyncio.wait_for(sending, SEND_TIMEOUT_S)
+        async with asyncio.timeout(SEND_TIMEOUT_S):
+            await sending
     except (TimeoutError, WebSocketDisconnect, RuntimeError):
         return False
     return True
@@ -387,11 +467,21 @@ class _Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", self._engine.uptime_s())
         yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
+        yield GaugeMetricFamily("livessl_map_watchers", "Subscribers to maps.", self._engine.maps.watchers)
+        yield CounterMetricFamily("livessl_maps_drawn", "Drawings of maps.", self._engine.maps.drawings)
+        yield CounterMetricFamily(
+            "livessl_messages_superseded", "Messages that slow subscribers never got.", self._hub.superseded
+        )
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
         yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
+        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", self._engine.unsaved)
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
         yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
         yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
+        refused = CounterMetricFamily("livessl_refused", "Peers and requests turned away.", labels=["door", "reason"])
+        for (door, reason), count in self._engine.refusals.counts().items():
+            refused.add_metric([door, reason], count)
+        yield refused
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
         level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])

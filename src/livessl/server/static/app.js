@@ -1,5 +1,6 @@
 // The wiring: what the server says goes into one state, and the panels and plans are drawn from it.
 
+import { get, onRefused, useToken } from "./access.js";
 import { ArraysPanel, effectiveState } from "./arrays.js";
 import { Readout } from "./estimate.js";
 import { EventList, verdict } from "./events.js";
@@ -34,7 +35,7 @@ const state = {
   unread: null,     // its message, until it is read out
   mark: null,       // the event that is pointed at or pinned, as a marker
   tracks: new Map(),
-  latencies: [],
+  latencies: { update: [], event: [] }, // messages that say how long they took, the newest last
   maps: null,       // { floor, side, bornMs, time }
   images: null,     // { floor, side, bornMs } coloured, each { canvas, bounds }
   missed: 0,
@@ -93,6 +94,7 @@ const HEARD = {
     const shown = marker(message, bornMs);
     state.current.set(message.event_id, shown);
     if (shown.position) leaveTrail(shown);
+    learnLatency("update", message);
     newest(message, shown);
   },
   event({ v, seq, ...message }) { // what is left is the event as it is stored
@@ -102,7 +104,7 @@ const HEARD = {
     state.events.add(message.id);
     eventList.add(message, serverNow());
     if (shown.position && shown.status === "located") leaveTrail(shown);
-    learnLatency(message);
+    learnLatency("event", message);
     newest(message, shown);
     announce(message);
   },
@@ -127,7 +129,9 @@ const live = new Live(socketUrl(), {
     redraw();
   },
   onState: showLink,
+  onUnopened: () => getJson("site").catch(() => {}), // where a token is missing, this asks for it
 });
+
 
 function socketUrl() {
   const url = new URL("live?kinds=update,event,track,arrays", API);
@@ -136,7 +140,7 @@ function socketUrl() {
 }
 
 async function getJson(path) {
-  const response = await fetch(new URL(path, API), { cache: "no-store", signal: AbortSignal.timeout(8000) });
+  const response = await get(new URL(path, API));
   if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
   return response.json();
 }
@@ -149,6 +153,7 @@ async function loadSite(tries = 0) {
     find("floor-frame").style.setProperty("--aspect", String(x / y));
     find("side-frame").style.setProperty("--aspect", String(y / z));
     find("floor-empty").hidden = true;
+    showPrivacy(state.site.privacy);
     redraw();
   } catch (error) {
     console.warn("livessl: site:", error.message);
@@ -168,7 +173,7 @@ async function loadEvents(tries = 0) {
     if (events.length > 0 && (state.last === null || born(events[0], events[0].duration_s, false) > state.last.bornMs + LATE_MS)) {
       newest(events[0], marker(events[0], born(events[0], events[0].duration_s, false)));
     }
-    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.length < TRAIL) learnLatency(event);
+    for (const event of events.slice(0, TRAIL).reverse()) if (state.latencies.event.length < TRAIL) learnLatency("event", event);
     redraw();
   } catch (error) {
     console.warn("livessl: events:", error.message);
@@ -217,11 +222,26 @@ function newest(message, shown) {
   state.unread = { kind: "event", ...message }; // read out with the next tick, so that numbers and plans agree
 }
 
-function learnLatency({ latency_s: latency }) {
-  if (!Number.isFinite(latency)) return;
-  state.latencies = [...state.latencies, latency].slice(-TRAIL);
-  const sorted = [...state.latencies].sort((a, b) => a - b);
-  write(find("vital-latency"), `${number(sorted[sorted.length >> 1])} s`);
+function median(values) {
+  return values.sort((a, b) => a - b)[values.length >> 1];
+}
+
+function milliseconds(seconds) {
+  return `${number(1000 * seconds, 0)} ms`;
+}
+
+/** The middle one of the last answers: while a sound lasts, and after it has ended; where the time goes, on pointing. */
+function learnLatency(kind, message) {
+  if (!Number.isFinite(message.latency_s)) return;
+  state.latencies[kind] = [...state.latencies[kind], message].slice(-TRAIL);
+  const { update, event } = state.latencies;
+  const told = Object.entries({ live: update, event }).filter(([, heard]) => heard.length > 0);
+  write(find("vital-latency"), told.map(([name, heard]) => `${name} ${milliseconds(median(heard.map((one) => one.latency_s)))}`).join(" · "));
+  const parts = told.map(([name, heard]) => [name, heard.map((one) => one.latency_stages_s).filter(Boolean)]).filter(([, stages]) => stages.length > 0);
+  find("vital-latency").title = parts.map(([name, stages]) => {
+    const each = Object.keys(stages[0]).map((stage) => `${stage} ${milliseconds(median(stages.map((one) => one[stage])))}`);
+    return `${name}: ${each.join(", ")}`;
+  }).join("\n");
 }
 
 function announce(event) {
@@ -252,6 +272,18 @@ function setSite(name, mode) {
   find("mode").hidden = !state.mode;
   find("mode").dataset.mode = state.mode ?? "";
   write(find("mode"), state.mode ?? "");
+}
+
+function showPrivacy({ mode, retention_days: days }) {
+  const chip = find("privacy");
+  chip.hidden = mode !== "positions-only" && days === null;
+  write(chip, [mode === "positions-only" ? "positions only" : null, days === null ? null : `kept ${days} d`].filter(Boolean).join(" · "));
+  chip.title = `${mode === "positions-only" ? "No sound is stored" : "Sound may be recorded"}; events are kept ${days === null ? "for ever" : `for ${days} days`}`;
+}
+
+function askForToken(known) {
+  write(find("token-why"), known ? "The server does not know this token." : "This server tells only those who have a token.");
+  if (!find("token-dialog").open) find("token-dialog").showModal();
 }
 
 function fillMapChoice() {
@@ -334,7 +366,7 @@ function readTheme() {
   const read = (name) => style.getPropertyValue(`--${name}`).trim();
   const names = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
   colours = Object.fromEntries(names.map((name) => [name, read(name)]));
-  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
+  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), quiet: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
   table = ramp(light.matches ? "light" : "dark");
   const g = find("ramp").getContext("2d");
   const image = g.createImageData(256, 8);
@@ -411,5 +443,11 @@ followPointer(plans[0], find("floor-pointer"));
 followPointer(plans[1], find("side-pointer"));
 find("map-choice").addEventListener("change", ({ target }) => heat.choose(target.value));
 find("gap-close").addEventListener("click", closeGap);
+onRefused(askForToken);
+find("token-form").addEventListener("submit", () => {
+  useToken(find("token").value.trim());
+  find("token").value = "";
+  live.hurry();
+});
 setInterval(nextTick, TICK_MS);
 live.start();

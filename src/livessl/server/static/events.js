@@ -28,8 +28,9 @@ export class EventList {
     this.#trim();
   }
 
-  /** One more, on top; or the same one anew, where it was. */
+  /** One more in its place by time, mostly on top; or the same one anew, where it was. What it replaces goes. */
   add(event, nowMs) {
+    for (const id of event.replaces ?? []) this.#remove(id);
     const before = this.rows.get(event.id);
     const row = this.#row(event, nowMs);
     if (before) {
@@ -37,18 +38,24 @@ export class EventList {
       this.rows.set(event.id, row);
     } else {
       row.root.classList.add("fresh");
-      this.rows = new Map([[event.id, row], ...this.rows]);
-      this.list.prepend(row.root);
+      const rows = [...this.rows];
+      const at = rows.findIndex(([, { event: other }]) => other.time_utc <= event.time_utc);
+      const place = event.late && at >= 0 ? at : 0;
+      rows.splice(place, 0, [event.id, row]);
+      this.list.insertBefore(row.root, rows[place + 1]?.[1].root ?? null);
+      this.rows = new Map(rows);
     }
     this.#trim();
   }
 
+  #remove(id) {
+    this.rows.get(id)?.root.remove();
+    this.rows.delete(id);
+    if (this.pinned === id) this.#pin(null);
+  }
+
   #trim() {
-    for (const [id, row] of [...this.rows].slice(MOST_ROWS)) {
-      row.root.remove();
-      this.rows.delete(id);
-      if (this.pinned === id) this.#pin(null);
-    }
+    for (const [id] of [...this.rows].slice(MOST_ROWS)) this.#remove(id);
     this.empty.hidden = this.rows.size > 0;
     this.count.textContent = this.rows.size === MOST_ROWS ? `the last ${MOST_ROWS}` : this.rows.size ? String(this.rows.size) : "";
   }
@@ -156,6 +163,12 @@ export function percent(fraction) {
   return Number.isFinite(fraction) ? `${Math.round(100 * fraction)} %` : "–";
 }
 
+/** How long the answer took after the sound, and where that went. */
+function latency({ latency_s: total, latency_stages_s: stages }) {
+  const each = stages ? Object.entries(stages).map(([stage, seconds]) => `${stage} ${number(seconds, 3)}`).join(" + ") : "";
+  return `${number(total, 3)} s${each && ` = ${each}`}`;
+}
+
 function details(event) {
   const pair = (name, value, className) => (value ? el("div", { className }, el("dt", { text: name }), el("dd", { text: value })) : null);
   const sigmas = event.covariance_m2?.map((row, axis) => `${"xyz"[axis]} ${number(Math.sqrt(Math.max(0, row[axis])))}`).join("  ");
@@ -167,7 +180,7 @@ function details(event) {
     pair("zones", event.zones?.join(", ")),
     pair("began", event.time_utc ?? `${number(event.start_s, 3)} s into the recording`, "wide"),
     pair("lasted", `${number(event.duration_s, 2)} s`),
-    pair("latency", `${number(event.latency_s, 3)} s`),
+    pair("latency", latency(event), "wide"),
     pair("late frames", event.late_frames ? String(event.late_frames) : null),
     pair("method", event.method),
     pair("id", event.id, "wide"));

@@ -1,5 +1,7 @@
 // Power maps: sent by the server while the page can be seen, as fresh as the sound, and coloured by lightness.
 
+import { protocols } from "./access.js";
+
 const RETRY_MS = 2000;
 const MAGIC = 0x50414d4c; // "LMAP", little-endian
 const VIEWS = ["floor", "side", "front"];
@@ -132,7 +134,7 @@ export class HeatFeed {
 
   #open() {
     this.url.search = new URLSearchParams({ array: this.choice, views: "floor,side" });
-    const socket = new WebSocket(this.url);
+    const socket = new WebSocket(this.url, protocols());
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     socket.onmessage = ({ data }) => {

@@ -1,5 +1,7 @@
 // The socket to the server: kept open for ever, its silence measured, and the server's clock told from the browser's.
 
+import { protocols } from "./access.js";
+
 /** The server speaks twice a second at least, so this much silence means that something is wrong. */
 const STALE_MS = 2000;
 /** After this much silence the socket is given up and opened anew. */
@@ -35,12 +37,15 @@ export class ServerClock {
  *
  * `onMessage(message)` gets each parsed object, `onState(state, silentMs)` is called on every change and every tick;
  * state is "live", "stale" (open, but silent) or "down"; silentMs is null before the first contact ever.
+ * `onUnopened()` is called when the server did not let us in, for a reason that browsers do not tell.
  */
+
 export class Live {
-  constructor(url, { onMessage, onState }) {
+  constructor(url, { onMessage, onState, onUnopened }) {
     this.url = url;
     this.onMessage = onMessage;
     this.onState = onState;
+    this.onUnopened = onUnopened;
     this.state = "down";
     this.socket = null;
     this.heardAt = null;
@@ -52,10 +57,11 @@ export class Live {
   start() {
     this.#open();
     setInterval(() => this.tick(), 250);
-    for (const name of ["online", "pageshow"]) addEventListener(name, () => this.#hurry());
+    for (const name of ["online", "pageshow"]) addEventListener(name, () => this.hurry());
+
     document.addEventListener("visibilitychange", () => {
       this.tick();
-      if (!document.hidden) this.#hurry();
+      if (!document.hidden) this.hurry();
     });
   }
 
@@ -82,7 +88,7 @@ export class Live {
     clearTimeout(this.retry);
     this.retry = null;
     this.openedAt = performance.now();
-    const socket = new WebSocket(this.url);
+    const socket = new WebSocket(this.url, protocols());
     this.socket = socket;
     socket.onmessage = ({ data }) => {
       if (socket !== this.socket) return;
@@ -99,7 +105,9 @@ export class Live {
       this.onMessage(message);
     };
     socket.onclose = () => {
-      if (socket === this.socket) this.#abandon();
+      if (socket !== this.socket) return;
+      if (!(this.heardAt >= this.openedAt)) this.onUnopened();
+      this.#abandon();
     };
   }
 
@@ -114,7 +122,8 @@ export class Live {
     this.tick();
   }
 
-  #hurry() {
+  /** Try now, rather than after the wait. */
+  hurry() {
     if (this.socket === null) this.#open();
   }
 }

@@ -1,0 +1,296 @@
+"""What many WebSocket clients cost, some of them stalled: the server's memory, and how late the healthy ones hear.
+
+The server is the real one, in a process of its own; updates are put in where its engine would publish them. Clients are
+bare sockets in this process, so that reading costs little. Prints a table, or with `--json` one object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import os
+import socket
+import statistics
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+from livessl.clock import SystemClock, utc_text
+from livessl.config import parse_site
+from livessl.messages import JsonObject
+from livessl.server.app import Server
+
+SITE: Final = """
+site: many-clients
+room: {size_m: [8.0, 10.0, 4.0]}
+grid: {spacing_m: 0.5}
+arrays:
+  north: {geometry: {tetrahedron: {edge_m: 0.5}}, position_m: [4.0, 2.5, 2.0]}
+  south: {geometry: {tetrahedron: {edge_m: 0.5}}, position_m: [4.0, 7.5, 2.0]}
+server: {bind: "tcp://127.0.0.1:*", http: {port: 0}}
+"""
+STALLED_WINDOW_BYTES: Final = 4096
+"""A stalled client's receive buffer: small, so that the server soon has to keep what is not read."""
+
+WARM_UP_S: Final = 2.0
+
+
+STAMP: Final = b'"published_ns":'
+"""The last field of an update."""
+
+
+@dataclass
+class Log:
+    """What the listeners have heard while it was open."""
+
+    open: bool = False
+    delays_ms: list[float] = field(default_factory=list)
+    message_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it."""
+
+    clients: int
+    stalled: int
+    updates_per_s: float
+    seconds: float
+    message_bytes: int
+    delay_p50_ms: float
+    delay_p95_ms: float
+    delay_p99_ms: float
+    delay_max_ms: float
+    received: int
+    expected: int
+    rss_before_mb: float
+    rss_connected_mb: float
+    rss_peak_mb: float
+    cpu_share: float
+    stalled_cut: int
+
+
+def measure(clients: int, stalled: int, updates_per_s: float, seconds: float) -> Outcome:
+    """Connect, publish, listen."""
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs, updates_per_s), daemon=True)
+    process.start()
+    try:
+        url = ours.recv()
+        return asyncio.run(_watch(ours, int(process.pid or 0), url, clients, stalled, updates_per_s, seconds))
+    finally:
+        ours.send("end")
+        process.join(timeout=10)
+        process.close()
+        ours.close()
+        theirs.close()
+
+
+def _serve(control: Connection, updates_per_s: float) -> None:
+    clock = SystemClock()
+    server = Server(parse_site(SITE), clock)
+    publishing = threading.Event()
+    ended = threading.Event()
+
+    def publish() -> None:
+        publishing.wait()
+        begun_ns, number = time.monotonic_ns(), 0
+        while not ended.is_set():
+            number += 1
+            # where the engine hands over what it has located
+            server._publish(_update(number, clock))
+            due_ns = begun_ns + round(number / updates_per_s * 1e9)
+            ended.wait(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
+
+    def obey() -> None:
+        control.send(server.url)
+        while control.recv() != "end":
+            publishing.set()
+        ended.set()
+        publishing.set()
+        server.stop()
+
+    for deed in (publish, obey):
+        threading.Thread(target=deed, daemon=True).start()
+    server.run()
+
+
+def _update(number: int, clock: SystemClock) -> JsonObject:
+    """An update as a sound that two arrays hear makes it, and when it was published."""
+    contribution = {"active_s": 0.2, "level_dbfs": -31.2, "azimuth_deg": 12.3, "elevation_deg": -4.5, "distance_m": 3.2}
+    return {
+        "kind": "update",
+        "event_id": f"many-clients-{number}",
+        "time_utc": utc_text(clock.now_ns()),
+        "start_s": number / 20,
+        "position_m": [3.1234, 4.5678, 1.2345],
+        "covariance_m2": [[0.01, 0.001, 0.0], [0.001, 0.02, 0.0], [0.0, 0.0, 0.05]],
+        "confidence": 0.61,
+        "arrays": ["north", "south"],
+        "status": "located",
+        "contributions": [{"array": name, **contribution} for name in ("north", "south")],
+        "zones": [],
+        "level_dbfs": -29.8,
+        "published_ns": time.monotonic_ns(),
+    }
+
+
+async def _watch(
+    control: Connection, pid: int, url: str, clients: int, stalled: int, updates_per_s: float, seconds: float
+) -> Outcome:
+    host, port = url.removeprefix("http://").split(":")
+    rss_before = _rss_mb(pid)
+    log, loop = Log(), asyncio.get_running_loop()
+    lazy = [open_client(host, int(port), STALLED_WINDOW_BYTES) for _ in range(stalled)]
+    keen = [open_client(host, int(port), None) for _ in range(clients - stalled)]
+    listeners = [(await loop.create_connection(lambda: Listener(log), sock=each))[1] for each in keen]
+    rss_connected = _rss_mb(pid)
+    control.send("publish")
+    await asyncio.sleep(WARM_UP_S)
+    log.open = True
+    cpu_s, begun = _cpu_s(pid), time.monotonic()
+    peak = rss_connected
+    while (left_s := begun + seconds - time.monotonic()) > 0:
+        await asyncio.sleep(min(0.5, left_s))
+        peak = max(peak, _rss_mb(pid))
+    log.open = False
+    share = (_cpu_s(pid) - cpu_s) / (time.monotonic() - begun)
+    cut = sum(_is_cut(each) for each in lazy)
+    for listener in listeners:
+        listener.close()
+    for lazy_one in lazy:
+        lazy_one.close()
+    percentiles = statistics.quantiles(log.delays_ms, n=100)
+    return Outcome(
+        clients,
+        stalled,
+        updates_per_s,
+        seconds,
+        log.message_bytes,
+        delay_p50_ms=round(percentiles[49], 1),
+        delay_p95_ms=round(percentiles[94], 1),
+        delay_p99_ms=round(percentiles[98], 1),
+        delay_max_ms=round(max(log.delays_ms), 1),
+        received=len(log.delays_ms),
+        expected=round((clients - stalled) * updates_per_s * seconds),
+        rss_before_mb=rss_before,
+        rss_connected_mb=rss_connected,
+        rss_peak_mb=peak,
+        cpu_share=round(share, 2),
+        stalled_cut=cut,
+    )
+
+
+def open_client(host: str, port: int, window_bytes: int | None) -> socket.socket:
+    """A WebSocket for updates, opened by hand."""
+    connection = socket.socket()
+    if window_bytes is not None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window_bytes)
+    connection.settimeout(10)
+    connection.connect((host, port))
+    lines = [
+        "GET /api/v1/live?kinds=update HTTP/1.1",
+        f"Host: {host}:{port}",
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+    ]
+    connection.sendall("\r\n".join([*lines, "", ""]).encode())
+    answer = b""
+    while not answer.endswith(b"\r\n\r\n"):
+        answer += connection.recv(1)
+    if b" 101 " not in answer:
+        raise OSError(f"expected a WebSocket, got {answer!r}")
+    connection.setblocking(False)
+    return connection
+
+
+class Listener(asyncio.Protocol):
+    """Takes frames apart as they come, and notes how long each update was under way."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._rest = b""
+        self._transport: asyncio.Transport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Keep the way back, for pongs."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        """Some bytes of some frames."""
+        now_ns = time.monotonic_ns()
+        data, at = self._rest + data, 0
+        while len(data) >= at + 4:
+            length, body = data[at + 1] & 127, at + 2
+            if length == 126:
+                length, body = int.from_bytes(data[at + 2 : at + 4], "big"), at + 4
+            if len(data) < body + length:
+                break
+            if data[at] & 15 == 9 and self._transport is not None:  # a ping wants its pong, masked with zeros
+                self._transport.write(bytes([0x8A, 0x80 | length, 0, 0, 0, 0]) + data[body : body + length])
+            stamp = data.rfind(STAMP, body, body + length)
+            if stamp >= 0 and self._log.open:
+                sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
+                self._log.delays_ms.append((now_ns - sent_ns) / 1e6)
+                self._log.message_bytes = length
+            at = body + length
+        self._rest = data[at:]
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _is_cut(connection: socket.socket) -> bool:
+    """Whether the server has hung up; what it sent before is read and thrown away."""
+    try:
+        while connection.recv(65536):
+            pass
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+    return True
+
+
+def _rss_mb(pid: int) -> float:
+    fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return round(int(fields["VmRSS"].split()[0]) / 1024, 1)
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clients", type=int, default=500, help="in all (default 500)")
+    parser.add_argument("--stalled", type=int, default=50, help="of them, that never read (default 50)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="updates a second (default 20)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="measured, after a warm-up (default 60)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    asked = parser.parse_args(arguments)
+    found: dict[str, Any] = asdict(measure(asked.clients, asked.stalled, asked.rate, asked.seconds))
+    if asked.json:
+        print(json.dumps(found))
+    else:
+        for name, value in found.items():
+            print(f"{name:<18} {value}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,511 @@
+"""Our localizer and others at the same work, in one process, in turn, on one thread: how long, and how right.
+
+    python benchmarks/peers.py --out docs/performance
+
+Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.bench.kernels`. The work is the whole way
+from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl does,
+so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map with
+that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
+
+On the fine grid the others are timed on a random part of the nodes, the time being scaled up with the nodes: all of
+them work node by node, and what they do once a block is below a hundredth of what they do on the part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, TypeVar
+
+import numba
+import numpy as np
+import scipy.fft
+from threadpoolctl import threadpool_limits
+
+import machine
+from livessl import wire
+from livessl.bench import kernels as bench
+from livessl.clock import SystemClock
+from livessl.core import compiled, search, srp, vectorised
+from livessl.core.activity import band_bins
+from livessl.core.frontends import Spectra, whole_segment
+from livessl.core.gcc import GCCPhat, microphone_pairs
+from livessl.core.geometry import Grid, posed, tetrahedron
+from livessl.core.peaks import Peak
+from livessl.core.search import PeakSearch
+from livessl.core.srp import SRPMapper, pair_weight, steering_delays_s
+from livessl.core.types import ArraySpec, Float32Array, FloatArray, Frame, HeardBy, RealArray
+from livessl.progress import counted
+
+COARSE_M: Final = 0.5
+FINE_M: Final = 0.1
+PART: Final = 1000
+"""Nodes of the fine grid that the others are timed on."""
+
+CHECKED: Final = 3
+"""bench.Blocks whose maps are held against the reference."""
+
+SPACINGS_M: Final = (0.5, 0.1, 0.05)
+COUNTS: Final = (2, 4, 8)
+MICROPHONES: Final = (2, 4, 8, 16)
+MAP_SPACINGS_M: Final = (0.5, 0.2, 0.1, 0.05)
+
+Heard = TypeVar("Heard")
+Sounds = Sequence[Float32Array]
+Power = Callable[[Sounds], RealArray]
+"""From each array's samples (K, n) to the summed power (N,) at the nodes that it was made for."""
+
+
+def room_grid(spacing_m: float) -> Grid:
+    """The whole room."""
+    return Grid(((0.0, bench.ROOM_M[0]), (0.0, bench.ROOM_M[1]), (0.0, bench.ROOM_M[2])), spacing_m)
+
+
+def transform_length() -> int:
+    """Samples that livessl makes of a block before it transforms it."""
+    lengths = []
+
+    def front_end(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:
+        spectra = whole_segment(samples, sample_rate_hz, lags)
+        lengths.append(spectra.n_fft)
+        return spectra
+
+    (spec,) = bench.array_specs(1)
+    GCCPhat(spec, bench.RATE_HZ, bench.C_M_S, front_end)([np.zeros((len(spec.microphones_m), bench.BLOCK), np.float32)])
+    return lengths[0]
+
+
+N_FFT: Final = transform_length()
+LOW, HIGH = band_bins(N_FFT, bench.RATE_HZ, bench.BAND_HZ)
+FREQUENCY_HZ: Final = np.arange(LOW, HIGH) * (bench.RATE_HZ / N_FFT)
+
+STEERING_BYTES: Final = 2 * 6 * 2 * 4 * (HIGH - LOW)
+"""A node's share of the steering product's matrices: two arrays, six pairs, real and imaginary parts in float32."""
+
+
+def reference(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+    """The plain formula in double precision: 2/K sum_{i<k} 1/B sum_f Re[conj(X_i) X_k / |X_i X_k| e^{j 2 pi f tau}]."""
+
+    def power(sounds: Sounds) -> RealArray:
+        total = np.zeros(len(nodes_m))
+        for spec, samples in zip(specs, sounds, strict=True):
+            whitened = _whitened(samples.astype(np.float64))
+            pairs = microphone_pairs(len(samples))
+            delays_s = steering_delays_s(nodes_m, spec.microphones_m, pairs, bench.C_M_S)
+            for (i, k), tau_s in zip(pairs, delays_s, strict=True):
+                steering = np.exp(2j * np.pi * tau_s[:, None] * FREQUENCY_HZ)
+                terms = steering @ (np.conj(whitened[i]) * whitened[k])
+                total += pair_weight(len(samples)) * terms.real / len(FREQUENCY_HZ)
+        return total
+
+    return power
+
+
+def steering_product(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+    """What one writes first: whitened cross-spectra times a kept steering matrix, (N, bins) of every pair, float32."""
+    matrices: list[Float32Array] = []
+    for spec in specs:
+        pairs = microphone_pairs(len(spec.microphones_m))
+        delays_s = steering_delays_s(nodes_m, spec.microphones_m, pairs, bench.C_M_S)
+        matrix = np.empty((len(nodes_m), len(pairs), 2, len(FREQUENCY_HZ)), np.float32)
+        for pair, tau_s in enumerate(delays_s):
+            phase = 2.0 * np.pi * tau_s[:, None] * FREQUENCY_HZ
+            matrix[:, pair, 0], matrix[:, pair, 1] = np.cos(phase), -np.sin(phase)
+        matrices.append(matrix.reshape(len(nodes_m), -1))
+
+    def power(sounds: Sounds) -> RealArray:
+        total = np.zeros(len(nodes_m), np.float32)
+        for matrix, samples in zip(matrices, sounds, strict=True):
+            whitened = _whitened(samples)
+            first, second = microphone_pairs(len(samples)).T
+            cross = np.conj(whitened[first]) * whitened[second]
+            parts = np.stack([cross.real, cross.imag], axis=1).astype(np.float32)
+            total += np.float32(pair_weight(len(samples)) / cross.shape[1]) * (matrix @ parts.ravel())
+        return total
+
+    return power
+
+
+class _Nodes:
+    """Places (N, 3) anywhere, as pyroomacoustics wants a grid."""
+
+    def __init__(self, nodes_m: FloatArray) -> None:
+        self.x, self.y, self.z = np.ascontiguousarray(nodes_m.T)
+        self.n_points = len(nodes_m)
+        self.values = np.zeros(self.n_points)
+
+    def set_values(self, values: FloatArray) -> None:
+        self.values = values
+
+
+def pyroomacoustics_srp(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+    """`doa.SRP` of pyroomacoustics, its own loop, made to look at places instead of directions.
+
+    As it comes its near field cannot be used: several distances raise an error, the grid is the unit sphere whatever
+    the distance, and the steering has the sign of the far field turned round. So the grid is replaced by the nodes, and
+    the delays of its own near-field steering are taken with the other sign.
+    """
+    from pyroomacoustics.doa import SRP
+    from pyroomacoustics.doa.doa import ModeVector
+
+    localizers = []
+    for spec in specs:
+        place_m = spec.microphones_m.T
+        localizer = SRP(place_m, bench.RATE_HZ, N_FFT, c=bench.C_M_S, azimuth=np.zeros(1))
+        localizer.grid = _Nodes(nodes_m)
+        localizer.mode_vec = ModeVector(place_m, bench.RATE_HZ, N_FFT, bench.C_M_S, localizer.grid, mode="near")
+        localizer.mode_vec.tau = -localizer.mode_vec.tau
+        localizer.num_snap, localizer.freq_bins, localizer.num_freq = 1, np.arange(LOW, HIGH), HIGH - LOW
+        localizers.append(localizer)
+
+    def power(sounds: Sounds) -> RealArray:
+        total = np.zeros(len(nodes_m))
+        for localizer, samples in zip(localizers, sounds, strict=True):
+            localizer._process(np.fft.rfft(samples, N_FFT)[:, :, None])
+            total += localizer.grid.values
+        return total
+
+    return power
+
+
+def acoular_beamformer(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+    """`BeamformerBase` of acoular on the cross-spectral matrix of phases alone, summed over the band."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that it keeps to one thread beside OpenBLAS, as all do here
+        import acoular
+
+    acoular.config.global_caching = "none"
+    beamformers = []
+    for spec in specs:
+        steering = acoular.SteeringVector(
+            grid=acoular.ImportGrid(pos=np.ascontiguousarray(nodes_m.T)),
+            mics=acoular.MicGeom(pos_total=spec.microphones_m.T),
+            env=acoular.Environment(c=bench.C_M_S),
+            steer_type="classic",
+        )
+        beamformers.append(acoular.BeamformerBase(steer=steering, r_diag=False, cached=False))
+
+    def power(sounds: Sounds) -> RealArray:
+        total = np.zeros(len(nodes_m))
+        for beamformer, samples in zip(beamformers, sounds, strict=True):
+            whitened = _whitened(samples.astype(np.float64))
+            matrix = np.einsum("if,kf->fik", whitened, np.conj(whitened))
+            beamformer.freq_data = acoular.PowerSpectraImport(csm=matrix, frequencies=FREQUENCY_HZ)
+            total += beamformer.result[:].sum(axis=0)
+        return total
+
+    return power
+
+
+def _whitened(samples: RealArray) -> Any:
+    """Phases (K, B) in the band."""
+    spectra = scipy.fft.rfft(samples, N_FFT)[:, LOW:HIGH]
+    return spectra / np.abs(spectra)
+
+
+PEERS: Final[dict[str, Callable[[Sequence[ArraySpec], FloatArray], Power]]] = {
+    "steering product, NumPy": steering_product,
+    "acoular": acoular_beamformer,
+    "pyroomacoustics": pyroomacoustics_srp,
+}
+
+
+@contextmanager
+def using(form: ModuleType) -> Iterator[None]:
+    """Build and run with one form of the kernels, `compiled` or `vectorised`."""
+    before = vars(search)["kernels"]
+    for module in (search, srp):
+        setattr(module, "kernels", form)  # noqa: B010 - it is not exported, and mypy would say so
+    try:
+        yield
+    finally:
+        for module in (search, srp):
+            setattr(module, "kernels", before)  # noqa: B010
+
+
+class Ours:
+    """livessl with one form of the kernels, on one grid.
+
+    Parameters
+    ----------
+    specs : sequence of ArraySpec
+    grid : Grid
+    form : module
+    """
+
+    def __init__(self, specs: Sequence[ArraySpec], grid: Grid, form: ModuleType) -> None:
+        self._form = form
+        self._gcc = {spec.name: GCCPhat(spec, bench.RATE_HZ, bench.C_M_S) for spec in specs}
+        self._specs = specs
+        self._power = np.empty(grid.size, np.float32)
+        with using(form):
+            self._mappers = [
+                SRPMapper(s, grid, self._gcc[s.name].pairs, self._gcc[s.name].lags_s, bench.C_M_S) for s in specs
+            ]
+            self._search = PeakSearch(specs, grid, bench.C_M_S)
+            for spec in specs:
+                self._search.prepare(spec.name, self._gcc[spec.name].lags_s)
+
+    def heard(self, sounds: Sounds) -> list[HeardBy]:
+        """Every array's GCC."""
+        return [HeardBy(spec, self._gcc[spec.name]([x])) for spec, x in zip(self._specs, sounds, strict=True)]
+
+    def power(self, sounds: Sounds) -> Float32Array:
+        """The summed map (G,), overwritten by the next call."""
+        return self.mapped(self.heard(sounds))
+
+    def mapped(self, heard: Sequence[HeardBy]) -> Float32Array:
+        """The same from the GCCs."""
+        self._power[:] = 0.0
+        with using(self._form):
+            for mapper, one in zip(self._mappers, heard, strict=True):
+                mapper.add(self._power, one.gcc)
+        return self._power
+
+    def peak(self, sounds: Sounds) -> int:
+        """The highest node, without the map."""
+        with using(self._form):
+            (found,) = self._search.among(self.heard(sounds))(1)
+        return found.node
+
+
+@dataclass(frozen=True, slots=True)
+class _Contender:
+    """One code on one grid: what to time, how many of the grid's nodes that covers, and what to check, if it can be.
+
+    `power` gives the map at the nodes that the reference is worked out at, `node` the highest of all.
+    """
+
+    name: str
+    spacing_m: float
+    nodes: int
+    timed_nodes: int
+    run: Callable[[Sounds], int]
+    power: Power | None
+
+
+def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) -> Iterator[_Contender]:
+    """All of them; with `part`, the others on so many random nodes."""
+    grid = room_grid(spacing_m)
+    rng = np.random.default_rng(0)
+    which = np.arange(grid.size) if part is None else np.sort(rng.choice(grid.size, part, replace=False))
+    nodes_m = grid.nodes_m()[which]
+
+    def at_part(ours: Ours) -> Power:
+        return lambda sounds: ours.power(sounds)[which]
+
+    def to_peak(power: Power) -> Callable[[Sounds], int]:
+        return lambda sounds: int(power(sounds).argmax())
+
+    for form in (compiled, vectorised):
+        ours = Ours(specs, grid, form)
+        label = {"numba": "compiled", "NumPy": "NumPy"}[form.NAME]
+        yield _Contender(f"livessl, map, {label}", spacing_m, grid.size, grid.size, to_peak(ours.power), at_part(ours))
+        yield _Contender(f"livessl, search, {label}", spacing_m, grid.size, grid.size, ours.peak, None)
+    for name, make in {**PEERS, REFERENCE: reference}.items():
+        power = make(specs, nodes_m)
+        yield _Contender(name, spacing_m, grid.size, len(which), to_peak(power), power)
+
+
+REFERENCE: Final = "plain formula, double precision"
+
+
+def side_by_side(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
+    """Times and correlations of all codes on both grids; the reference itself is timed like the rest."""
+    specs = bench.array_specs(2)
+    blocks = bench.Blocks(specs)
+    heard = [blocks.sound("voice", number) for number in range(12)]
+    contenders = [*_contenders(specs, COARSE_M, None), *_contenders(specs, FINE_M, PART)]
+    cases = [bench.Case(one.name, _each(one.run, heard)) for one in contenders]
+    taken_ms = bench.timed_ms(SystemClock(), cases, rounds, progress)
+
+    plain = {one.spacing_m: one for one in contenders if one.name == REFERENCE}
+    maps = {m: [np.array(one.power(sounds)) for sounds in heard[:CHECKED]] for m, one in plain.items() if one.power}
+    nodes = {m: [int(power.argmax()) for power in maps[m]] for m in maps}
+    rows: list[dict[str, Any]] = []
+    for one, ms in zip(contenders, taken_ms, strict=True):
+        truth = maps[one.spacing_m]
+        correlation = None
+        if one.power is not None:
+            pairs = zip(map(one.power, heard), truth, strict=False)
+            correlation = min(float(np.corrcoef(own, true)[0, 1]) for own, true in pairs)
+        same = None
+        if len(truth[0]) == one.nodes:
+            same = sum(one.run(x) == node for x, node in zip(heard, nodes[one.spacing_m], strict=False))
+        scale = one.nodes / one.timed_nodes
+        rows.append(
+            {
+                "name": one.name,
+                "spacing_m": one.spacing_m,
+                "nodes": one.nodes,
+                "timed_nodes": one.timed_nodes,
+                "median_ms": float(np.median(ms)) * scale,
+                "least_ms": float(ms.min()) * scale,
+                "correlation": correlation,
+                "same_peaks": same,
+            }
+        )
+    for row in rows:
+        (ours,) = (r for r in rows if r["name"] == "livessl, map, compiled" and r["spacing_m"] == row["spacing_m"])
+        row["ratio"] = row["median_ms"] / ours["median_ms"]
+    return rows
+
+
+def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
+    """The search alone, over grids, numbers of arrays, lengths and kinds of sound; GCCs are worked out before."""
+    specs = bench.array_specs(max(COUNTS))
+    blocks = bench.Blocks(specs)
+    gcc = [GCCPhat(spec, bench.RATE_HZ, bench.C_M_S) for spec in specs]
+    lengths = {"block": bench.BLOCK, "1 s": bench.SEGMENT}
+
+    def evidence(kind: str, length: str, number: int) -> list[HeardBy]:
+        sounds = blocks.sound(kind, number, lengths[length])
+        return [HeardBy(spec, make([x])) for spec, make, x in zip(specs, gcc, sounds, strict=True)]
+
+    heard = {
+        (kind, length): [evidence(kind, length, number) for number in range({"block": 12, "1 s": 3}[length])]
+        for kind in bench.KINDS
+        for length in lengths
+    }
+
+    def search_in(peaks: PeakSearch) -> Callable[[list[HeardBy]], Peak]:
+        return lambda one: peaks.among(one)(1)[0]
+
+    rows: list[dict[str, Any]] = []
+    cases = []
+    for spacing_m in SPACINGS_M:
+        peaks = PeakSearch(specs, room_grid(spacing_m), bench.C_M_S)
+        for spec, make in zip(specs, gcc, strict=True):
+            peaks.prepare(spec.name, make.lags_s)
+        for count in COUNTS:
+            for (kind, length), sounds in heard.items():
+                some = [one[:count] for one in sounds]
+                find = search_in(peaks)
+                given_up = sum(not find(one).proven for one in some)
+                rows.append(
+                    {"spacing_m": spacing_m, "arrays": count, "length": length, "kind": kind}
+                    | {"sounds": len(sounds), "given_up": given_up}
+                )
+                cases.append(bench.Case("peak", _each(find, some)))
+    return _with_times(rows, bench.timed_ms(SystemClock(), cases, rounds, progress))
+
+
+def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[dict[str, Any]]]:
+    """What grows with the microphones of an array, and the map with the grid; two arrays throughout.
+
+    And the map of the fine grid alone by either form of the kernels, beside as many bare look-ups, compiled.
+    """
+    shape = tetrahedron(0.5)
+    parts = [
+        ArraySpec(f"{place}.{turn}", posed(shape, place, yaw_deg=23.0 * turn, pitch_deg=41.0 * turn), bench.BAND_HZ)
+        for place in bench.PLACES_M[:2]
+        for turn in range(max(MICROPHONES) // 4)
+    ]
+    sounds = bench.Blocks(parts).sound("voice", 0)
+    half = len(parts) // 2
+    microphones: list[dict[str, Any]] = []
+    cases = []
+    for count in MICROPHONES:
+        specs, heard = [], []
+        for name, own in (("a", slice(half)), ("b", slice(half, None))):
+            place_m = np.concatenate([part.microphones_m for part in parts[own]])[:count]
+            specs.append(ArraySpec(name, place_m, bench.BAND_HZ))
+            heard.append(np.concatenate(sounds[own])[:count])
+        fine, display = Ours(specs, room_grid(0.05), compiled), Ours(specs, room_grid(FINE_M), compiled)
+        microphones += [{"microphones": count, "what": what} for what in ("GCC", "peak", "map")]
+        cases += [
+            bench.Case("GCC", _each(fine.heard, [heard])),
+            bench.Case("peak", _each(fine.peak, [heard])),
+            bench.Case("map", _each(display.power, [heard])),
+        ]
+    specs = bench.array_specs(2)
+    block = bench.Blocks(specs).sound("voice", 0)
+    maps: list[dict[str, Any]] = []
+    for spacing_m in MAP_SPACINGS_M:
+        ours = Ours(specs, room_grid(spacing_m), compiled)
+        maps.append({"spacing_m": spacing_m, "nodes": room_grid(spacing_m).size})
+        cases.append(bench.Case("map", _each(ours.power, [block])))
+    forms: list[dict[str, Any]] = []
+    for form in (compiled, vectorised):
+        ours = Ours(specs, room_grid(FINE_M), form)
+        forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
+        cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))
+    cases.append(bench.bare_look_ups())
+    taken_ms = bench.timed_ms(SystemClock(), cases, rounds, progress)
+    of_microphones, of_maps, of_forms, floor_ms = np.split(
+        taken_ms, np.cumsum([len(microphones), len(maps), len(forms)])
+    )
+    lookup_ms = float(np.median(floor_ms)) / bench.LOOKED_UP
+    return {
+        "microphones": _with_times(microphones, of_microphones),
+        "maps": _with_times(maps, of_maps),
+        "forms": [
+            row | {"ratio": row["median_ms"] / (row["look_ups"] * lookup_ms)} for row in _with_times(forms, of_forms)
+        ],
+    }
+
+
+def frame_bytes() -> int:
+    """Of an array's 50 ms on the wire."""
+    samples = np.zeros((4, round(bench.RATE_HZ / 20)), np.float32)
+    return len(wire.encode(Frame("array1", 0, 0, 0, bench.RATE_HZ, samples, 0.0, True)))
+
+
+def _each(run: Callable[[Heard], object], heard: Sequence[Heard]) -> Callable[[int], object]:
+    """What runs on one after the other, round after round."""
+    return lambda number: run(heard[number % len(heard)])
+
+
+def _with_times(rows: list[dict[str, Any]], taken_ms: FloatArray) -> list[dict[str, Any]]:
+    return [
+        row | {"median_ms": float(np.median(ms)), "p95_ms": float(np.percentile(ms, 95)), "least_ms": float(ms.min())}
+        for row, ms in zip(rows, taken_ms, strict=True)
+    ]
+
+
+def main() -> int:
+    """Measure all of it and write peers.json."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--rounds", type=int, default=20, help="of all codes, side by side (default 20)")
+    parser.add_argument("--search-rounds", type=int, default=60, help="of our search and maps alone (default 60)")
+    arguments = parser.parse_args()
+    about = machine.describe()
+    numba.set_num_threads(1)
+    with threadpool_limits(limits=1):
+        with counted("side by side", "round") as show:
+            rows = side_by_side(arguments.rounds, show)
+        with counted("searches", "round") as show:
+            found = searches(arguments.search_rounds, show)
+        with counted("growth", "round") as show:
+            grown = growth(arguments.search_rounds, show)
+    report = {
+        "machine": about,
+        "rounds": arguments.rounds,
+        "search_rounds": arguments.search_rounds,
+        "checked": CHECKED,
+        "side_by_side": rows,
+        "searches": found,
+        **grown,
+        "frame_bytes": frame_bytes(),
+        "steering_bytes_a_node": STEERING_BYTES,
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "peers.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    for row in rows:
+        correlation = "" if row["correlation"] is None else f"  correlation {row['correlation']:.4f}"
+        print(
+            f"{row['spacing_m']:g} m  {row['name']:<32} {row['median_ms']:12.3f} ms  x {row['ratio']:.3g}{correlation}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,468 @@
+"""Writes docs/performance.md from what the benchmarks measured; with `--measure` measures all of it first.
+
+    python benchmarks/performance.py --measure      # some six minutes, on a machine that does nothing else
+    python benchmarks/performance.py                # the text alone, from the files in docs/performance/
+
+Every figure in the text comes from those files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import machine
+from livessl.bench import kernels
+from livessl.clock import SystemClock
+from livessl.core.types import FRAME_S
+from livessl.progress import counted
+
+HERE: Final = Path(__file__).parent
+DOCS: Final = HERE.parent / "docs"
+OURS: Final = "livessl, map, compiled"
+
+LIVE: Final = ((4, 1), (4, 20), (4, 100), (16, 20), (64, 20), (64, 20, "spin"))
+"""Arrays and clients of each run of the service; the last with a foreign process spinning on each core."""
+
+TO_BUY: Final = (10, 100, 1000)
+USED: Final = 0.6
+"""Of a core, of memory and of a link: what should be in use where all arrays sound at once."""
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a cost grows: `factor * x ** exponent`, or `factor * x + offset`; and by how much it misses at worst.
+
+    Parameters
+    ----------
+    factor, exponent, offset : float
+    worst : float
+        Greatest deviation of what was measured from the fit, relative to the fit.
+    """
+
+    factor: float
+    exponent: float
+    offset: float
+    worst: float
+
+    def __call__(self, x: float) -> float:
+        """The cost at x."""
+        return self.offset + self.factor * float(x**self.exponent)
+
+    @classmethod
+    def power(cls, x: Sequence[float], y: Sequence[float]) -> Fit:
+        """Least squares of the logarithms."""
+        exponent, logarithm = np.polyfit(np.log(x), np.log(y), 1)
+        return cls._judged(math.exp(logarithm), float(exponent), 0.0, x, y)
+
+    @classmethod
+    def line(cls, x: Sequence[float], y: Sequence[float]) -> Fit:
+        """Least squares of the deviations relative to what was measured: small costs count as much as great ones."""
+        factor, offset = np.polyfit(x, y, 1, w=1.0 / np.asarray(y))
+        return cls._judged(float(factor), 1.0, float(offset), x, y)
+
+    @classmethod
+    def _judged(cls, factor: float, exponent: float, offset: float, x: Sequence[float], y: Sequence[float]) -> Fit:
+        fitted = factor * np.asarray(x, dtype=np.float64) ** exponent + offset
+        return cls(factor, exponent, offset, float(np.abs(np.asarray(y) / fitted - 1.0).max()))
+
+
+def measure(folder: Path, parts: Iterable[str], *, brief: bool) -> None:
+    """Run the benchmarks, one after the other, each writing its file.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        Where one fails; exactness fails where the search and the map differ.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    runs: dict[str, Callable[[], None]] = {
+        "kernels": lambda: _measure_kernels(folder, 5 if brief else 200),
+        "peers": lambda: _script("peers.py", folder, *(["--rounds", "2", "--search-rounds", "3"] if brief else [])),
+        "exactness": lambda: _script("exactness.py", folder, *(["--sounds", "1"] if brief else [])),
+        "live": lambda: _measure_live(folder, 3.0 if brief else 12.0),
+    }
+    for part in parts:
+        print(f"performance: measuring {part}", file=sys.stderr)
+        runs[part]()
+
+
+def _script(name: str, folder: Path, *options: str) -> None:
+    subprocess.run([sys.executable, str(HERE / name), "--out", str(folder), *options], check=True)  # noqa: S603 - ours
+
+
+def _measure_kernels(folder: Path, rounds: int) -> None:
+    about = machine.describe()
+    with counted("kernels", "round") as show:
+        report = kernels.measure(SystemClock(), rounds, progress=show)
+    _write(folder / "kernels.json", {"machine": about, "rounds": rounds, **report.as_json()})
+
+
+def _measure_live(folder: Path, seconds: float) -> None:
+    for arrays, clients, *spin in LIVE:
+        about = machine.describe()
+        command = [sys.executable, "-m", "livessl", "bench", "--live", "--json", *(["--spin"] if spin else [])]
+        command += ["--arrays", str(arrays), "--clients", str(clients), "--seconds", str(seconds)]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603 - ours
+        name = "-".join(["live", str(arrays), str(clients), *map(str, spin)])
+        _write(folder / f"{name}.json", {"machine": about, **json.loads(done.stdout)})
+
+
+def _write(file: Path, report: Json) -> None:
+    file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+def document(folder: Path) -> str:
+    """The text, from the files in a folder.
+
+    Raises
+    ------
+    FileNotFoundError
+        Where one is missing; those of the service may be.
+    ValueError
+        Where they are of different machines.
+    """
+    measured, peers, exact = (
+        json.loads((folder / f"{name}.json").read_text(encoding="utf-8")) for name in ("kernels", "peers", "exactness")
+    )
+    live = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.glob("live-*.json"))]
+    live.sort(key=lambda run: (run["demand"]["spin"], run["demand"]["arrays"], run["demand"]["clients"]))
+    sections = [
+        _head([measured, peers, exact, *live]),
+        _ratios(peers, exact),
+        _side_by_side(peers),
+        _exactness(exact),
+        _kernels(measured),
+        _searches(peers),
+        _service(live),
+        _growth(peers, live),
+        _purchase(peers, live),
+    ]
+    return "\n\n".join("\n".join(section) for section in sections) + "\n"
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    yield f"| {' | '.join(columns)} |"
+    yield "|---" * len(columns) + "|"
+    for row in rows:
+        yield f"| {' | '.join(row)} |"
+
+
+def _number(value: float) -> str:
+    """Three figures, without an exponent."""
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    rounded = value if digits else float(f"{value:.3g}")
+    return f"{rounded:,.{digits}f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def _paragraph(*parts: str) -> str:
+    return textwrap.fill(" ".join(parts), 120, break_long_words=False, break_on_hyphens=False)
+
+
+def _item(*parts: str) -> str:
+    return textwrap.indent(_paragraph(*parts), "  ").replace("  ", "- ", 1)
+
+
+def _head(reports: Sequence[Json]) -> Iterator[str]:
+    machines = [report["machine"] for report in reports]
+    one = machines[0]
+    if any({**other, "load_before": 0} != {**one, "load_before": 0} for other in machines):
+        raise ValueError(
+            "docs/performance: expected every file to be of one machine and one set of versions, got several; "
+            "measure all of it again: python benchmarks/performance.py --measure"
+        )
+    yield "# Performance"
+    yield ""
+    yield _paragraph(
+        "Made by `python benchmarks/performance.py --measure`, in some six minutes on a machine that does nothing",
+        "else, from the files in [performance/](performance); every figure is from there. Compare ratios, and inside",
+        "one table: milliseconds are those of this machine on that day. All times are medians, on one thread, except",
+        "the service's.",
+    )
+    yield ""
+    yield _paragraph(
+        f"{one['cpu']}, {one['cores']} cores, {one['memory_gb']:g} GB; {one['system']}, Python {one['python']},",
+        ", ".join(f"{name} {version}" for name, version in one["packages"].items()) + ".",
+        "Processes that wanted to run before a measurement began:",
+        f"{min(m['load_before'] for m in machines):g} to {max(m['load_before'] for m in machines):g}.",
+    )
+    yield ""
+    yield _paragraph(
+        "The work, unless something else is said: two tetrahedra of 0.5 m, 5 m apart, in a room of 8 x 10 x 4 m with a",
+        "reverberation time of 0.7 s, blocks of 4096 samples at 44.1 kHz, 100 to 6000 Hz, a voice at 20 dB.",
+    )
+
+
+def _row(peers: Json, name: str, spacing_m: float) -> Json:
+    return next(r for r in peers["side_by_side"] if (r["name"], r["spacing_m"]) == (name, spacing_m))
+
+
+def _ratios(peers: Json, exact: Json) -> Iterator[str]:
+    by_form = {form["kernels"]: form["ratio"] for form in peers["forms"]}
+    yield "## In short"
+    yield ""
+    yield _item(
+        f"The map of the 0.1 m grid takes {by_form['numba']:.1f} times what as many bare look-ups take on this",
+        f"machine, and {by_form['NumPy']:.1f} times without numba.",
+    )
+    for name in ("pyroomacoustics", "acoular", "steering product, NumPy"):
+        coarse, fine = (_number(_row(peers, name, spacing)["ratio"]) for spacing in (0.5, 0.1))
+        yield _item(
+            f"From samples to the highest node of the summed map, {name} takes {coarse} times as long as livessl on a",
+            f"0.5 m grid and {fine} times on a 0.1 m grid.",
+        )
+    ours, search = _row(peers, OURS, 0.1), _row(peers, "livessl, search, compiled", 0.1)
+    yield _item(
+        f"The search, without the map, takes {_number(search['median_ms'] / ours['median_ms'])} of the map's time on a",
+        f"0.1 m grid; on {exact['same']} of {exact['maps']} maps it finds the very node and value.",
+    )
+
+
+def _side_by_side(peers: Json) -> Iterator[str]:
+    yield "## Side by side"
+    yield ""
+    yield _paragraph(
+        f"One process, one thread, {peers['rounds']} rounds in turn: samples, summed map, highest node. The ratio is",
+        f"to *{OURS}*. Correlation is with the plain formula, the least of {peers['checked']} blocks; *same peak*",
+        "tells on how many of them the highest node is the formula's. Imports and tables are not counted.",
+    )
+    yield ""
+    rows = []
+    for row in peers["side_by_side"]:
+        part = "" if row["timed_nodes"] == row["nodes"] else f" ({row['timed_nodes']} of {row['nodes']} nodes, scaled)"
+        rows.append(
+            (
+                f"{row['spacing_m']:g} m{part}", row["name"], _number(row["ratio"]), _number(row["median_ms"]),
+                "" if row["correlation"] is None else f"{row['correlation']:.4f}",
+                "" if row["same_peaks"] is None else f"{row['same_peaks']} of {peers['checked']}",
+            )
+        )  # fmt: skip
+    yield from _table(("grid", "code", "ratio", "ms a block", "correlation", "same peak"), rows)
+    yield ""
+    yield _paragraph(
+        "All get the same transform, with zeros after the block so that no lag wraps round. On the fine grid the",
+        "others are timed on random nodes, and the time is scaled with their number: they work node by node. The",
+        "steering product keeps its matrix, which of the whole fine grid would hold",
+        f"{_number(peers['steering_bytes_a_node'] * _row(peers, OURS, 0.1)['nodes'] / 1e9)} GB. acoular's time",
+        "includes the cross-spectral matrix. pyroomacoustics is made for directions; its near field does not work as",
+        "it comes: several distances raise an error, the grid ignores the distance, and the steering has the opposite",
+        "sign of the far field's. We gave it the nodes as its grid and turned the sign; its own loop does the rest.",
+    )
+
+
+def _exactness(exact: Json) -> Iterator[str]:
+    yield "## The same node as the whole map"
+    yield ""
+    yield _paragraph(
+        f"{exact['same']} of {exact['maps']} maps: all rules of fusion, 2 to {exact['most_arrays']} arrays, a voice,",
+        "two voices and noise, grids of 0.1 and 0.05 m; the search unbounded. As shipped it gives up after",
+        f"{exact['most_look_ups'] / 1e6:g} million look-ups and says so: in {exact['given_up']} of them.",
+    )
+    given_up = [case for case in exact["cases"] if case["given_up"]]
+    if given_up:
+        yield ""
+        yield from _table(
+            ("grid", "arrays", "sound", "rule", "given up", "right all the same"),
+            (
+                (f"{case['spacing_m']:g} m", str(case["arrays"]), case["kind"], case["rule"],
+                 f"{case['given_up']} of {case['maps']}", str(case["right_all_the_same"]))
+                for case in given_up
+            ),
+        )  # fmt: skip
+
+
+def _kernels(measured: Json) -> Iterator[str]:
+    yield "## Kernels"
+    yield ""
+    yield _paragraph(
+        f"{measured['kernels']}, {measured['rounds']} rounds; a bare look-up takes {measured['lookup_ns']:.2f} ns. The",
+        "ratio is to as many of those.",
+    )
+    yield ""
+    yield from _table(
+        ("what", "ratio", "median, ms", "99 %, ms"),
+        (
+            (one["name"], "" if one["ratio"] is None else f"{one['ratio']:.2f}", _number(one["median_ms"]),
+             _number(one["p99_ms"]))
+            for one in measured["timings"]
+        ),
+    )  # fmt: skip
+
+
+def _searches(peers: Json) -> Iterator[str]:
+    yield "## The search"
+    yield ""
+    yield _paragraph(
+        f"From GCCs to the highest node, median / 95 % in ms of {peers['search_rounds']} rounds. A star: some are",
+        "given up at the limit.",
+    )
+    yield ""
+    kinds = list(dict.fromkeys(row["kind"] for row in peers["searches"]))
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for row in peers["searches"]:
+        key = (f"{row['spacing_m']:g} m", str(row["arrays"]), row["length"])
+        star = " \\*" if row["given_up"] else ""
+        rows.setdefault(key, []).append(f"{_number(row['median_ms'])} / {_number(row['p95_ms'])}{star}")
+    yield from _table(("grid", "arrays", "sound of", *kinds), ((*key, *cells) for key, cells in rows.items()))
+
+
+def _service(live: Sequence[Json]) -> Iterator[str]:
+    yield "## The service"
+    yield ""
+    if not live:
+        yield "Not measured here."
+        return
+    yield _paragraph(
+        "A server, the load and the clients on the same cores; every array sounds nearly all the time. Latency is from",
+        "the end of a window to a client; what was dropped are frames that no answer used.",
+    )
+    yield ""
+    rows = []
+    for run in live:
+        demand, late = run["demand"], run["latency_ms"]
+        dropped = run["frames_dropped"] + sum(run["lost"].values())
+        rows.append(
+            (
+                str(demand["arrays"]), str(demand["clients"]), "spinning" if demand["spin"] else "idle",
+                "nothing" if run["nothing_dropped"] else f"{dropped} frames, {run['updates']:.1f} of "
+                f"{run['updates_due']} updates told",
+                f"{late['p50']:.0f} / {late['p95']:.0f} / {late['p99']:.0f}", f"{run['cpu_percent']:.0f}",
+                " / ".join(f"{mb:.0f}" for mb in run["rss_mb"]),
+            )
+        )  # fmt: skip
+    yield from _table(
+        ("arrays", "clients", "cores otherwise", "dropped", "latency 50 / 95 / 99 %, ms", "server, % of a core",
+         "memory at first / at last / most, MB"), rows,
+    )  # fmt: skip
+
+
+def _service_fits(live: Sequence[Json]) -> dict[str, Fit]:
+    """Processor and memory against arrays and against clients, of the runs on idle cores."""
+    idle = [run for run in live if not run["demand"]["spin"]]
+    arrays = [run for run in idle if run["demand"]["clients"] == 20]
+    clients = [run for run in idle if run["demand"]["arrays"] == 4]
+
+    def against(name: str, runs: Sequence[Json], cost: Callable[[Json], float]) -> Fit:
+        return Fit.line([run["demand"][name] for run in runs], [cost(run) for run in runs])
+
+    return {
+        "processor, arrays": against("arrays", arrays, lambda run: float(run["cpu_percent"])),
+        "processor, clients": against("clients", clients, lambda run: float(run["cpu_percent"])),
+        "memory, arrays": against("arrays", arrays, lambda run: float(max(run["rss_mb"]))),
+    }
+
+
+def _growth(peers: Json, live: Sequence[Json]) -> Iterator[str]:
+    yield "## How costs grow"
+    yield ""
+    yield _paragraph(
+        "Fits to what was measured: least squares of the logarithms for powers, of relative deviations for lines. The",
+        "last column tells by how much the fit misses at worst.",
+    )
+    yield ""
+
+    def row(what: str, variable: str, x: Sequence[float], fit: Fit, unit: str) -> tuple[str, ...]:
+        power = f"{_number(fit.factor)} {variable}^{fit.exponent:.2f}"
+        line = f"{_number(fit.offset)} + {_number(fit.factor)} {variable}"
+        formula = line if fit.exponent == 1.0 else power
+        return what, f"{variable} = {', '.join(f'{one:g}' for one in x)}", f"{formula} {unit}", f"{fit.worst:.0%}"
+
+    def searched(kind: str, **fixed: object) -> list[Json]:
+        wanted = {"kind": kind, "length": "block", **fixed}
+        return [one for one in peers["searches"] if all(one[key] == value for key, value in wanted.items())]
+
+    rows = []
+    for kind in ("voice", "noise"):
+        found = searched(kind, spacing_m=0.05)
+        x, y = [one["arrays"] for one in found], [one["median_ms"] for one in found]
+        rows.append(row(f"search, 0.05 m, {kind}", "arrays", x, Fit.power(x, y), "ms"))
+        found = searched(kind, arrays=2)
+        x, y = [one["spacing_m"] for one in found], [one["median_ms"] for one in found]
+        rows.append(row(f"search, 2 arrays, {kind}", "spacing", x, Fit.power(x, y), "ms"))
+    for what, name in (
+        ("GCC", "GCC, both arrays"),
+        ("peak", "samples to peak, 0.05 m"),
+        ("map", "samples to map, 0.1 m"),
+    ):
+        found = [one for one in peers["microphones"] if one["what"] == what]
+        x, y = [one["microphones"] for one in found], [one["median_ms"] for one in found]
+        rows.append(row(f"{name}, 2 arrays, voice", "microphones", x, Fit.power(x, y), "ms"))
+    x, y = [one["nodes"] / 1000 for one in peers["maps"]], [one["median_ms"] for one in peers["maps"]]
+    rows.append(row("samples to map, 2 arrays", "nodes/1000", x, Fit.line(x, y), "ms"))
+    if live:
+        fits = _service_fits(live)
+        for name, fit in fits.items():
+            what, variable = name.split(", ")
+            x = sorted({run["demand"][variable] for run in live})
+            rows.append(row(f"the service's {what}", variable, x, fit, "MB" if what == "memory" else "% of a core"))
+    yield from _table(("cost", "measured at", "fit", "worst"), rows)
+
+
+def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
+    yield "## What to buy for 10, 100 and 1000 arrays"
+    yield ""
+    carried = [run["demand"]["arrays"] for run in live if run["nothing_dropped"] and not run["demand"]["spin"]]
+    if not carried:
+        yield "To be told from runs of the service that drop nothing; there are none here."
+        return
+    fits, most = _service_fits(live), max(carried)
+    cpu, clients, memory = fits["processor, arrays"], fits["processor, clients"], fits["memory, arrays"]
+    megabits = 8e-6 * peers["frame_bytes"] / FRAME_S
+    yield _paragraph(
+        f"From the fits above: a server takes {_number(cpu.offset)} % of a core for itself and 20 clients,",
+        f"{_number(cpu.factor)} % for each array that sounds, {_number(clients.factor)} % for each further client, and",
+        f"{_number(memory.offset)} MB and {_number(memory.factor)} MB an array. An array of four microphones sends",
+        f"{_number(megabits)} Mbit/s while it sounds, and hardly anything while it is quiet. The most arrays that one",
+        f"server was seen to carry on this machine are {most}; beyond that take several, one for each hall. All arrays",
+        f"are taken to sound at once, and nothing to be used beyond {USED:.0%}.",
+    )
+    yield ""
+    rows = []
+    for arrays in TO_BUY:
+        servers = math.ceil(arrays / most)
+        cores = math.ceil((servers * max(0.0, cpu.offset) + arrays * cpu.factor) / 100.0 / USED)
+        gigabytes = (servers * memory.offset + arrays * memory.factor) / 1000.0 / USED
+        rows.append(
+            (
+                str(arrays), str(math.ceil(arrays / 2)), str(servers), f"{cores}", f"{_number(gigabytes)} GB",
+                f"{_number(arrays * megabits / USED)} Mbit/s",
+            )
+        )  # fmt: skip
+    yield from _table(
+        ("arrays", "interfaces of eight channels", "servers", "cores like these", "memory", "network"), rows
+    )
+
+
+def main() -> int:
+    """Perhaps measure; write the text."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = ("kernels", "peers", "exactness", "live")
+    parser.add_argument(
+        "--measure", nargs="*", choices=parts, metavar="PART", help=f"all, or some of {', '.join(parts)}"
+    )
+    parser.add_argument("--brief", action="store_true", help="few rounds: to see that it works, not for the record")
+    parser.add_argument("--out", type=Path, default=DOCS, metavar="DIR", help="default: docs")
+    arguments = parser.parse_args()
+    folder = arguments.out / "performance"
+    if arguments.measure is not None:
+        measure(folder, arguments.measure or parts, brief=arguments.brief)
+    (arguments.out / "performance.md").write_text(document(folder), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""The gate before the nodes' socket: CURVE, and ZeroMQ's authentication protocol (RFC 27) on a thread of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from livessl.keys import ServerKeys
+from livessl.server.refusals import Refusals
+
+DOOR: Final = "nodes"
+
+ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
+DOMAIN: Final = b"nodes"
+
+HANDSHAKE_MS: Final = 5000
+"""Who takes longer over the handshake than this is dropped."""
+
+_BROKEN: Final = {
+    int(zmq.Event.HANDSHAKE_FAILED_PROTOCOL): "without keys, or with another server's",
+    int(zmq.Event.HANDSHAKE_FAILED_NO_DETAIL): "broke off the handshake",
+}
+"""What fails before any key is shown. ZeroMQ does not tell from where."""
+
+_log = logging.getLogger(__name__)
+
+
+def guard(
+    context: zmq.Context[zmq.Socket[bytes]],
+    socket: zmq.Socket[bytes],
+    keys: ServerKeys,
+    refusals: Refusals,
+    failed: Callable[[BaseException], None],
+) -> None:
+    """Let only enrolled nodes connect to a socket, from before it is bound until its context ends.
+
+    Parameters
+    ----------
+    context : zmq.Context
+    socket : zmq.Socket
+        The server's, not yet bound. Its messages then carry the node's name as their `User-Id`.
+    keys : ServerKeys
+    refusals : Refusals
+        Told of everyone who is turned away.
+    failed : callable
+        Gets what ends the thread before its time: from then on nobody is let in.
+    """
+    socket.setsockopt(zmq.CURVE_SERVER, 1)
+    socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
+    socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without the thread below nobody is let in
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+    monitor = socket.get_monitor_socket(sum(_BROKEN))
+    asked: zmq.Socket[bytes] = context.socket(zmq.REP)
+    asked.setsockopt(zmq.LINGER, 0)
+    asked.bind(ZAP_ENDPOINT)
+    names = {key: name for name, key in keys.nodes.items()}
+    threading.Thread(target=_run, args=(asked, monitor, names, refusals, failed), name="guard", daemon=True).start()
+
+
+def _run(
+    asked: zmq.Socket[bytes],
+    monitor: zmq.Socket[bytes],
+    names: Mapping[bytes, str],
+    refusals: Refusals,
+    failed: Callable[[BaseException], None],
+) -> None:
+    poller = zmq.Poller()
+    poller.register(asked, zmq.POLLIN)
+    poller.register(monitor, zmq.POLLIN)
+    with asked, monitor:
+        try:
+            while True:
+                ready = dict(poller.poll())
+                if asked in ready:
+                    asked.send_multipart(_answer(asked.recv_multipart(), names, refusals))
+                if monitor in ready:
+                    event = int(recv_monitor_message(monitor)["event"])
+                    if event in _BROKEN:
+                        refusals.note(DOOR, "a peer", _BROKEN[event])
+        except zmq.ContextTerminated:
+            _log.debug("the guard ends with its context")
+        except BaseException as error:
+            _log.exception("the guard of the nodes' socket has failed")
+            failed(error)
+            raise
+
+
+def _answer(request: list[bytes], names: Mapping[bytes, str], refusals: Refusals) -> list[bytes]:
+    version, number, _domain, address, _identity, mechanism, *credentials = request
+    name = names.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
+    if name is None:
+        refusals.note(DOOR, address.decode("ascii", "replace"), "its key is not enrolled")
+        return [version, number, b"400", b"not enrolled", b"", b""]
+    return [version, number, b"200", b"", name.encode(), b""]

@@ -1,0 +1,92 @@
+"""How long sound takes to become an answer on a client's socket: by stages, in histograms.
+
+The reference is the moment at which all had happened that an answer needs: the window's end; of an event, the end of
+the quiet that ends it. What lies before is no delay of ours.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final, NamedTuple
+
+from prometheus_client import Histogram
+
+from livessl.core.types import FRAME_NS, Event, Update
+from livessl.messages import JsonObject, Stages
+
+KEPT: Final = 1200
+"""Raster intervals whose arrival is remembered: a minute."""
+
+BUCKETS_S: Final = (
+    0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08,
+    0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0,
+)  # fmt: skip
+
+DELIVERED: Final = "delivered"
+TOTAL: Final = "total"
+
+
+class Arrival(NamedTuple):
+    """When a message was sent, by its node's clock, and received."""
+
+    sent_ns: int
+    received_ns: int
+
+
+class Arrivals:
+    """Of each raster interval the message that came last. Noted on one thread, looked up on another."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, Arrival] = {}
+        self._order: deque[int] = deque()
+
+    def note(self, raster: int, arrival: Arrival) -> None:
+        """A message of that interval has come."""
+        if raster not in self._last:
+            self._order.append(raster)
+            if len(self._order) > KEPT:
+                del self._last[self._order.popleft()]
+        self._last[raster] = arrival
+
+    def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
+        """Where the time of an answer that was there at `located_ns` went; None where nobody sent its last interval."""
+        arrival = self._last.get(answer.complete_ns // FRAME_NS - 1)
+        if arrival is None or not arrival.sent_ns:
+            return None
+        end_ns = answer.end_ns if isinstance(answer, Event) else answer.complete_ns
+        return Stages(
+            waited=(answer.complete_ns - end_ns) / 1e9,
+            sent=(arrival.sent_ns - answer.complete_ns) / 1e9,
+            received=(arrival.received_ns - arrival.sent_ns) / 1e9,
+            located=(located_ns - arrival.received_ns) / 1e9,
+        )
+
+
+class Latency:
+    """The histograms. Safe to call from any thread."""
+
+    def __init__(self) -> None:
+        self.histogram = Histogram(
+            "livessl_latency_seconds",
+            "From the end of a window (an event's: of the quiet that ends it) until sent by the node, from there until "
+            "received by the server, located, delivered to a client's socket; total is their sum.",
+            ["kind", "stage"],
+            buckets=BUCKETS_S,
+            registry=None,
+        )
+        self._stages = {
+            (kind, stage): self.histogram.labels(kind, stage)
+            for kind in ("update", "event")
+            for stage in ("sent", "received", "located", DELIVERED, TOTAL)
+        }
+
+    def located(self, kind: str, stages: Stages) -> None:
+        """An answer is there."""
+        for stage in ("sent", "received", "located"):
+            self._stages[kind, stage].observe(getattr(stages, stage))
+
+    def delivered(self, message: JsonObject, seconds: float) -> None:
+        """A client's socket took an answer so long after it was there."""
+        stages = message["latency_stages_s"]
+        self._stages[message["kind"], DELIVERED].observe(seconds)
+        self._stages[message["kind"], TOTAL].observe(stages["sent"] + stages["received"] + stages["located"] + seconds)

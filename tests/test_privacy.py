@@ -1,0 +1,144 @@
+"""Privacy: what may be stored, for how long, and that everyone can see it."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from livessl.capture.node import send_session
+from livessl.cli import main
+from livessl.clock import SystemClock, UnpacedClock
+from livessl.config import ConfigError
+from livessl.server import app
+from livessl.server.store import Query, Store
+from small_site import running_server, scene_parts, site_of, wait_until, write_site
+
+CLOCK = SystemClock()
+DAY_NS = 86_400_000_000_000
+PRIVATE = {"privacy": "positions-only"}
+
+
+def event(number: int) -> dict[str, Any]:
+    return {"id": f"small-{number}", "confidence": 0.5, "zones": [], "note": f"uttered {number}"}
+
+
+def test_nothing_is_recorded_where_only_positions_may_be_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = write_site(tmp_path, PRIVATE), tmp_path / "session"
+    assert main(["record", "--site", str(path), "--node", "lab-pc", "--out", str(out)]) == 2
+    assert "privacy: positions-only: no sound may be stored, so nothing is recorded" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_running_it_all_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A database is all that is written, and an event in it is shorter than a frame of sound."""
+    monkeypatch.chdir(tmp_path)
+    site = site_of({**PRIVATE, "server.events_db": str(tmp_path / "events.db")}, tmp_path)
+    with running_server(site) as server:
+        send_session(site, server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run", lambda: False)
+        wait_until(lambda: server.engine.events == 2, "both events")
+        written = {path.name for path in tmp_path.rglob("*")}
+        assert {name.partition("-")[0] for name in written} == {"events.db"}
+    with closing(sqlite3.connect(tmp_path / "events.db")) as db:
+        texts = [text for (text,) in db.execute("SELECT json FROM events")]
+    assert len(texts) == 2
+    assert max(map(len, texts)) < 2 * 4 * 0.05 * 16000  # 16 bit, four channels
+
+
+@pytest.mark.parametrize(
+    ("changes", "privacy"),
+    [
+        ({}, {"mode": "recording", "retention_days": None}),
+        (PRIVATE | {"store": {"retention_days": 1.5}}, {"mode": "positions-only", "retention_days": 1.5}),
+    ],
+)
+def test_everyone_can_see_what_is_kept(changes: dict[str, Any], privacy: dict[str, Any]) -> None:
+    with running_server(site_of(changes)) as server:
+        for path in ("site", "health"):
+            assert httpx.get(f"{server.url}/api/v1/{path}").json()["privacy"] == privacy
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"privacy": "none"}, "'positions-only' or 'recording'"),
+        ({"store": {"retention_days": 0}}, "greater than 0"),
+        ({"store": {"retention_days": -1}}, "greater than 0"),
+        ({"store": {"days": 1}}, "unknown key"),
+    ],
+)
+def test_wrong_privacy_is_a_fault(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        site_of(changes)
+
+
+def test_store_forgets_what_began_before() -> None:
+    store = Store()
+    for number in range(5):
+        store.add(event(number), number * DAY_NS)
+    assert store.expire(0) == 0
+    assert store.expire(3 * DAY_NS) == 3
+    assert [kept["id"] for kept in store.find(Query())[0]] == ["small-4", "small-3"]
+    store.close()
+
+
+def test_file_holds_nothing_of_what_was_deleted(tmp_path: Path) -> None:
+    path = tmp_path / "events.db"
+    store = Store(path)
+    store.add(event(1), 0)
+    store.add(event(2), DAY_NS)
+
+    def bytes_on_disk() -> bytes:
+        return b"".join(file.read_bytes() for file in sorted(tmp_path.iterdir()))
+
+    assert b"uttered 1" in bytes_on_disk()
+    assert store.expire(DAY_NS) == 1
+    assert b"uttered 1" not in bytes_on_disk()
+    assert store.get("small-2") == event(2)
+    store.close()
+    assert b"uttered 1" not in bytes_on_disk()
+
+
+def test_server_forgets_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(app, "EXPIRE_S", 0.05)
+    path = tmp_path / "events.db"
+    site = site_of({"store": {"retention_days": 2.0}, "server.events_db": str(path)})
+    now_ns = CLOCK.now_ns()
+    old = Store(path)
+    old.add(event(1), now_ns - 3 * DAY_NS)
+    old.add(event(2), now_ns - 1 * DAY_NS)
+    old.close()
+
+    def kept(url: str) -> list[str]:
+        return [found["id"] for found in httpx.get(f"{url}/api/v1/events").json()["events"]]
+
+    with running_server(site) as server:
+        wait_until(lambda: kept(server.url) == ["small-2"], "the old event to be gone")
+        late = Store(path)
+        late.add(event(3), now_ns - 4 * DAY_NS)
+        late.close()
+        wait_until(lambda: kept(server.url) == ["small-2"], "another that comes later")
+
+
+def test_file_that_retention_does_not_reach_is_told_of() -> None:
+    sinks = [{"type": "jsonl", "path": "events.jsonl"}]
+    [warning] = site_of({"store": {"retention_days": 7}, "server.sinks": sinks}).warnings
+    assert warning == "store.retention_days: 7 days do not reach server.sinks; rotate those files yourself"
+    assert site_of({"server.sinks": sinks}).warnings == ()
+
+
+def test_no_sound_on_a_disk_where_only_positions_are_kept() -> None:
+    changes: dict[str, Any] = {"privacy": "positions-only", "nodes.lab-pc.spool": {"directory": "spool"}}
+    with pytest.raises(ConfigError) as caught:
+        site_of(changes)
+    (fault,) = caught.value.faults
+    assert fault.where.endswith("nodes.lab-pc.spool.directory")
+    assert "no sound is kept on a disk; take it away" in fault.what
+    assert site_of({**changes, "nodes.lab-pc.spool": {"directory": None}}).nodes["lab-pc"].spool.directory is None
+    assert site_of({**changes, "privacy": "recording"}).nodes["lab-pc"].spool.directory == "spool"
