@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from livessl.core.certainty import LEAST_CONFIDENCE, NEAR_M, Signs
 from livessl.core.types import BoolArray, FloatArray
+from livessl.evaluate.command import HALVES
 from livessl.evaluate.figures import COLOURS
-from livessl.evaluate.localizer import HALVES, METHODS, development_fit
+from livessl.evaluate.localizer import METHODS, development_fit
 from livessl.evaluate.report import Block, Heading, Picture, Table, as_markdown
 from livessl.evaluate.statistics import INTERVAL, RESAMPLES, write_csv
 
@@ -181,7 +182,7 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _calibration(columns: Columns, ours: BoolArray, good: BoolArray) -> list[tuple[str, ...]]:
     edges = (0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for low, high in pairwise(edges):
         within = ours & (columns["confidence"] >= low) & ((columns["confidence"] < high) | (high == 1.0))
         if within.any():
@@ -194,7 +195,8 @@ def _figure(columns: Columns) -> Figure:
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     share, risk = figure.subplots(1, 2)
-    hard = [(rt60_s, snr_db) for rt60_s, snr_db in _conditions(columns) if rt60_s >= 1.0]
+    found = _conditions(columns)
+    hard = [each for each in found if each[0] >= 1.0] or found
     for colour, (rt60_s, snr_db) in zip(COLOURS, hard, strict=False):
         name = f"RT {rt60_s:g} s, " + (f"{snr_db:g} dB" if np.isfinite(snr_db) else "clean")
         here = (columns["rt60_s"] == rt60_s) & (columns["snr_db"] == snr_db)
