@@ -131,13 +131,15 @@ def _blocks(columns: Columns, rows: Sequence[dict[str, Any]], settings: Mapping[
         "below the event's mean power, over its whole recording with its reverberation. Both methods see the same "
         f"samples and refine below a grid of {settings['spacing_m']:g} m. Refused: confidence below "
         f"{LEAST_CONFIDENCE:g}.",
+        f"Command: `livessl evaluate localizer --events DIR --positions {settings['positions']} "
+        f"--seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 task 2.",
         Table(_TITLES, [_cells(row) for row in rows if row["sound"] == "all"]),
         "Lost: more than 0.5 m off, or refused. More lost than the standard: difference on the same events, with its "
         "99 % interval (bootstrap over positions); below 0 is better.",
         Picture(
             "localizer",
             "Left: share of events within a distance, refused ones counted as never. Right: of the "
-            "events kept when the least confident are refused, the share over 0.5 m off.",
+            "events kept when the least confident are refused, the share over 0.5 m off",
         ),
         Heading(2, "By class of sound"),
         Table(("sound", *_TITLES), [(row["sound"], *_cells(row)) for row in rows if row["sound"] != "all"]),
