@@ -421,9 +421,10 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
         return
     fits, most = _service_fits(live), max(carried)
     cpu, clients, memory = fits["processor, arrays"], fits["processor, clients"], fits["memory, arrays"]
+    base = max(0.0, cpu.offset)
     megabits = 8e-6 * peers["frame_bytes"] / FRAME_S
     yield _paragraph(
-        f"From the fits above: a server takes {_number(cpu.offset)} % of a core for itself and 20 clients,",
+        f"From the fits above: a server takes {_number(base)} % of a core for itself and 20 clients,",
         f"{_number(cpu.factor)} % for each array that sounds, {_number(clients.factor)} % for each further client, and",
         f"{_number(memory.offset)} MB and {_number(memory.factor)} MB an array. An array of four microphones sends",
         f"{_number(megabits)} Mbit/s while it sounds, and hardly anything while it is quiet. The most arrays that one",
@@ -434,7 +435,7 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
     rows = []
     for arrays in TO_BUY:
         servers = math.ceil(arrays / most)
-        cores = math.ceil((servers * max(0.0, cpu.offset) + arrays * cpu.factor) / 100.0 / USED)
+        cores = math.ceil((servers * base + arrays * cpu.factor) / 100.0 / USED)
         gigabytes = (servers * memory.offset + arrays * memory.factor) / 1000.0 / USED
         rows.append(
             (
