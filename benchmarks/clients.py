@@ -148,8 +148,8 @@ async def _watch(
     host, port = url.removeprefix("http://").split(":")
     rss_before = _rss_mb(pid)
     log, loop = Log(), asyncio.get_running_loop()
-    lazy = [_connect(host, int(port), STALLED_WINDOW_BYTES) for _ in range(stalled)]
-    keen = [_connect(host, int(port), None) for _ in range(clients - stalled)]
+    lazy = [open_client(host, int(port), STALLED_WINDOW_BYTES) for _ in range(stalled)]
+    keen = [open_client(host, int(port), None) for _ in range(clients - stalled)]
     listeners = [(await loop.create_connection(lambda: Listener(log), sock=each))[1] for each in keen]
     rss_connected = _rss_mb(pid)
     control.send("publish")
@@ -188,7 +188,7 @@ async def _watch(
     )
 
 
-def _connect(host: str, port: int, window_bytes: int | None) -> socket.socket:
+def open_client(host: str, port: int, window_bytes: int | None) -> socket.socket:
     """A WebSocket for updates, opened by hand."""
     connection = socket.socket()
     if window_bytes is not None:

@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 import soundfile
 import yaml
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from livessl import __version__, demo
+from livessl import __version__, cli, demo
 from livessl.capture.link import Link
 from livessl.cli import main
 from livessl.clock import SystemClock, utc_ns, utc_text
@@ -31,7 +32,7 @@ from livessl.session import read_session
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
-COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices")
+COMMANDS = ("demo", "serve", "capture", "locate", "replay", "record", "simulate", "check", "devices", "bench")
 STOP_S = 5.0
 """How long a command may take to end on Ctrl-C or SIGTERM."""
 
@@ -685,6 +686,20 @@ def test_demo_on_a_port_in_use_says_so_at_once(capsys: pytest.CaptureFixture[str
         taken.listen()
         assert main(["demo", "--once", "--port", str(taken.getsockname()[1])]) == 1
     assert "cannot be used: Address already in use" in capsys.readouterr().err
+
+
+def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    seen: list[set[int]] = []
+    monkeypatch.setattr(cli, "load_site", lambda _: seen.append(threads()) or site_of())  # type: ignore[func-returns-value]
+    with threadpool_limits(limits=2, user_api="blas"):
+        if threads() != {2}:
+            pytest.skip("this machine's BLAS has one thread anyway")
+        assert run("check", write_site(tmp_path)).code == 0
+        assert threads() == {2}
+    assert seen == [{1}]
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["its own site", "a site that is given"])

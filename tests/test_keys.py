@@ -259,3 +259,12 @@ def test_open_server_does_not_start_and_says_all_that_is_to_do(
     said = capsys.readouterr().err
     assert "server.http.host: '0.0.0.0' can be reached from other machines" in said
     assert "server.bind: 'tcp://*:5570' can be reached from other machines" in said
+
+
+def test_tokens_in_the_clear_are_told_of() -> None:
+    public = {"server.http.host": "0.0.0.0", "server.http.tokens": "tokens.yaml"}
+    [warning] = site_of(public).warnings
+    assert warning.startswith("server.http: tokens and positions travel unencrypted; set certificate and private_key")
+    files = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}
+    assert site_of(public | files).warnings == ()
+    assert site_of({"server.http.tokens": "tokens.yaml"}).warnings == ()

@@ -44,7 +44,7 @@ def test_paper_is_the_papers_set_up() -> None:
     assert isinstance(node.device, SoundDeviceConfig)
     assert (node.device.name, node.device.sample_rate_hz) == ("UMC1820", 44100)
     assert sorted(node.arrays.values()) == [[1, 2, 3, 4], [5, 6, 7, 8]]
-    assert site.grid.spacing_m == 0.1
+    assert site.grid.spacing_m == 0.05
     for spec in site.specs:
         assert spec.aperture_m == pytest.approx(0.5)
     left, right = (spec.centre_m for spec in site.specs)

@@ -16,8 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from livessl import __version__, demo, progress, replay
 from livessl import keys as keyring
+from livessl.bench import kernels as kernel_bench
+from livessl.bench import live as live_bench
 from livessl.capture.devices import DeviceError
 from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
 from livessl.capture.record import Recorder, record_device, record_parts
@@ -48,6 +52,7 @@ from livessl.core.types import FRAME_NS, Event
 from livessl.evaluate import command as evaluation
 from livessl.messages import JsonObject, Messages
 from livessl.plan import design, figure, words
+from livessl.processes import NotStartedError
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.sinks import SinkError
@@ -70,6 +75,17 @@ WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
+_FAILURES: Final = (
+    BindError,
+    NotStartedError,
+    SinkError,
+    StoreError,
+    UndeliveredError,
+    demo.DemoError,
+    figure.FigureError,
+)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code.
 
@@ -81,7 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
     try:
-        with _sigterm_interrupts():
+        # the products are small: a second thread spins more than it works, eight times the processor's time in all
+        with _sigterm_interrupts(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except (ConfigError, DeviceError) as error:
         for line in str(error).splitlines():
@@ -90,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (BindError, SinkError, StoreError, UndeliveredError, demo.DemoError, figure.FigureError, OSError) as error:
+    except (*_FAILURES, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -218,6 +235,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluation.add_arguments(sub)
 
+    _add_bench(command)
     _add_plan(command)
 
     _add_keys(command)
@@ -229,6 +247,24 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("devices", _devices, "list audio devices", "livessl devices")
     sub.add_argument("--json", action="store_true", help="print the list as JSON")
     return parser
+
+
+def _add_bench(command: Callable[..., Any]) -> None:
+    sub = command(
+        "bench",
+        _bench,
+        "measure how much this machine carries, and how fast it answers",
+        "livessl bench --live --arrays 64 --clients 20 --seconds 30",
+    )
+    sub.add_argument("--live", action="store_true", help="a server under load, instead of the kernels alone")
+    sub.add_argument("--arrays", type=_positive, default=4, help="live: that sound all the time (default 4)")
+    sub.add_argument("--clients", type=_positive, default=4, help="live: that subscribe (default 4)")
+    sub.add_argument("--watchers", type=_count, default=0, help="live: that watch the power map (default none)")
+    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="live: to measure, after a warm-up (default 20)")
+    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="live: of the grid (default 0.1)")
+    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="live: of the simulated room (default 0.3)")
+    sub.add_argument("--spin", action="store_true", help="live: let a foreign process spin on each core")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_plan(command: Callable[..., Any]) -> None:
@@ -314,6 +350,27 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         metavar="ARRAY=1,2,3,4",
         help="channels of the file, from 1, in microphone order",
     )
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    if not arguments.live:
+        with progress.counted("measuring", "round") as show:
+            report = kernel_bench.measure(SystemClock(), progress=show)
+        print(json.dumps(report.as_json()) if arguments.json else kernel_bench.table(report))
+        return OK
+    demand = live_bench.Demand(
+        arrays=arguments.arrays,
+        clients=arguments.clients,
+        seconds=arguments.seconds,
+        watchers=arguments.watchers,
+        spacing_m=arguments.spacing,
+        rt60_s=arguments.rt60,
+        spin=arguments.spin,
+    )
+    with progress.counted("measuring", "s") as show:
+        outcome = live_bench.measure(demand, SystemClock(), progress=show)
+    print(json.dumps(outcome.json()) if arguments.json else live_bench.table(outcome))
+    return OK
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -833,6 +890,10 @@ def _positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
     return int(text)
+
+
+def _count(text: str) -> int:
+    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number from 0 on"))
 
 
 def _rt60(text: str) -> float:

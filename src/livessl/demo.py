@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import socket
-import subprocess
-import sys
-import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +15,7 @@ import yaml
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from livessl import processes
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site, load_site, parse_site
 from livessl.messages import JsonObject
@@ -30,8 +27,6 @@ SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
 LEAD_NS: Final = 5_000_000_000
 """From the command to the scene's first sample: the nodes must be up by then."""
 
-READY_NS: Final = 20_000_000_000
-POLL_NS: Final = 100_000_000
 MATCH_S: Final = 1.0
 """An event that begins this near to a source's start is its event."""
 
@@ -71,7 +66,7 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
     """Simulate the demo's scene into a folder, with a site file on free ports."""
     _need_free("127.0.0.1", http_port)
     data = yaml.safe_load(SITE_FILE.read_text(encoding="utf-8"))
-    endpoint = f"tcp://127.0.0.1:{_free_port()}"
+    endpoint = f"tcp://127.0.0.1:{processes.free_port()}"
     data["server"] = {"bind": endpoint, "http": {"host": "127.0.0.1", "port": http_port}}
     for node in data["nodes"].values():
         node["server"] = endpoint
@@ -100,21 +95,22 @@ def running(directory: Path, site: Site, start_ns: int, *, loop: bool, clock: Cl
 
     Raises
     ------
-    DemoError
+    NotStartedError
         Where one of them does not come up.
     """
     http = site.server.http
     url = f"http://{http.host}:{http.port}"
     common = ["--site", str(directory / "site.yaml")]
-    processes = [_start("serve", *common)]
+    started = [processes.start("serve", *common)]
     try:
-        _wait_until_ready(url, processes, clock)
+        processes.wait_until_ready(url, started, clock)
         for node in site.nodes:
             extra = ["--loop"] if loop else []
-            processes.append(_start("capture", *common, "--node", node, "--start-at", utc_text(start_ns), *extra))
+            at = utc_text(start_ns)
+            started.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
         yield url
     finally:
-        _end(processes)
+        processes.end(started)
 
 
 def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObject]:
@@ -162,41 +158,6 @@ def _scene_time_s(event: JsonObject, start_ns: int, period_s: float) -> float:
     return ((utc_ns(event["time_utc"]) - start_ns) / 1e9) % period_s
 
 
-def _start(*arguments: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-m", "livessl", *arguments])  # noqa: S603 - ourselves
-
-
-def _wait_until_ready(url: str, processes: Sequence[subprocess.Popen[bytes]], clock: Clock) -> None:
-    deadline_ns = clock.now_ns() + READY_NS
-    while clock.now_ns() < deadline_ns:
-        if any(process.poll() is not None for process in processes):
-            raise DemoError("the server did not start; it says why above")
-        if _answers(url):
-            return
-        clock.sleep_until_ns(clock.now_ns() + POLL_NS)
-    raise DemoError(f"the server at {url} did not answer within {READY_NS / 1e9:.0f} s")
-
-
-def _answers(url: str) -> bool:
-    try:
-        with urllib.request.urlopen(f"{url}/api/v1/health", timeout=1.0):  # noqa: S310 - our own http address
-            return True
-    except OSError:
-        return False
-
-
-def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
-    for process in reversed(processes):
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-    for process in processes:
-        try:
-            process.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
 def _need_free(host: str, port: int) -> None:
     """Fail before anything is simulated; and never take another server's answers for the demo's."""
     with socket.socket() as probe:
@@ -208,9 +169,3 @@ def _need_free(host: str, port: int) -> None:
             raise DemoError(
                 f"--port {port}: cannot be used: {reason}; stop what listens there or choose another"
             ) from error
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -205,7 +205,7 @@ def make_node_keys(directory: Path, name: str, server: bytes | None = None) -> b
 def enrol(directory: Path, name: str, public: bytes) -> None:
     """Let a node in, on the server; a key that it had before is let in no longer."""
     _check_name(name)
-    _write_nodes(directory, {**_nodes(directory), name: public})
+    _write_nodes(directory, {**enrolled(directory), name: public})
 
 
 def dismiss(directory: Path, name: str) -> None:
@@ -216,7 +216,7 @@ def dismiss(directory: Path, name: str) -> None:
     ConfigError
         Where it was not enrolled.
     """
-    held = _nodes(directory)
+    held = enrolled(directory)
     if name not in held:
         raise _fault(directory / NODES_FILE, f"no node {name!r} is enrolled; there are {', '.join(held) or 'none'}")
     _write_nodes(directory, {other: key for other, key in held.items() if other != name})
@@ -233,7 +233,7 @@ def server_keys(site: Site) -> ServerKeys | None:
     if site.keys is None:
         return None
     directory = site.file(site.keys)
-    return ServerKeys(_read_pair(directory, SERVER, "`livessl keys server`"), _nodes(directory))
+    return ServerKeys(_read_pair(directory, SERVER, "`livessl keys server`"), enrolled(directory))
 
 
 def node_keys(site: Site, name: str) -> NodeKeys | None:
@@ -252,8 +252,22 @@ def node_keys(site: Site, name: str) -> NodeKeys | None:
 
 
 def enrolled(directory: Path) -> dict[str, bytes]:
-    """Public keys of the nodes that are let in, by name."""
-    return _nodes(directory)
+    """Public keys of the nodes that are let in, by name.
+
+    Raises
+    ------
+    ConfigError
+        Where their file holds something else.
+    """
+    path = directory / NODES_FILE
+    if not path.exists():
+        return {}
+    try:
+        data = read_yaml(path.read_text(encoding="utf-8"))
+        return {str(name): as_key(str(text)) for name, text in dict(data or {}).items()}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, ValueError) as error:
+        what = f"expected NAME: PUBLIC KEY a line: {error}; correct it with `livessl keys enrol`"
+        raise _fault(path, what) from error
 
 
 def as_key(text: str) -> bytes:
@@ -299,18 +313,6 @@ def _write_tokens(path: Path, entries: tuple[_Entry, ...]) -> None:
     data = {"tokens": [entry.model_dump() for entry in entries]}
     head = "# Made by `livessl keys token`: hashes of the clients' tokens, which are kept nowhere.\n"
     _write(path, head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200), 0o600)
-
-
-def _nodes(directory: Path) -> dict[str, bytes]:
-    path = directory / NODES_FILE
-    if not path.exists():
-        return {}
-    try:
-        data = read_yaml(path.read_text(encoding="utf-8"))
-        return {str(name): as_key(str(text)) for name, text in dict(data or {}).items()}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, ValueError) as error:
-        what = f"expected NAME: PUBLIC KEY a line: {error}; correct it with `livessl keys enrol`"
-        raise _fault(path, what) from error
 
 
 def _write_nodes(directory: Path, nodes: Mapping[str, bytes]) -> None:

@@ -24,6 +24,7 @@ from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
+from livessl.keys import add_token
 from livessl.messages import Messages
 from livessl.server import engine
 from livessl.server.app import Server
@@ -277,9 +278,9 @@ def test_server_ends_while_someone_listens(query: str) -> None:
     assert subscriber.ended.code == 1012  # service restart: come again
 
 
-def refused(changes: Changes) -> str:
+def refused(changes: Changes, directory: Path | None = None) -> str:
     with pytest.raises(BindError) as caught:
-        Server(site_of(changes), CLOCK)
+        Server(site_of(changes, directory), CLOCK)
     return str(caught.value)
 
 
@@ -299,8 +300,9 @@ def test_addresses_that_are_taken() -> None:
         pass  # the failed start has given its port back
 
 
-def test_host_that_is_not_ours() -> None:
-    said = refused({"server.http.host": "192.0.2.1"})
+def test_host_that_is_not_ours(tmp_path: Path) -> None:
+    add_token(tmp_path / "tokens.yaml", "tests", "viewer")
+    said = refused({"server.http.host": "192.0.2.1", "server.http.tokens": "tokens.yaml"}, tmp_path)
     assert said.startswith("server.http: cannot listen on 192.0.2.1:0: ")
     assert said.endswith("; write an address of this machine")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import ssl
 import subprocess
 from pathlib import Path
@@ -46,6 +47,27 @@ def test_everything_is_encrypted(folder: Path) -> None:
             httpx.get(server.url.replace("https", "http") + "/api/v1/health")
         with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
             httpx.get(f"{server.url}/api/v1/health", verify=ssl.create_default_context())
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl.TLSVersion) -> None:
+    trusted = ssl.create_default_context(cafile=folder / "site.crt")
+    trusted.minimum_version = trusted.maximum_version = version
+    with running_server(site_of(FILES, folder)) as server:
+        port = int(server.url.rpartition(":")[2])
+        for offered in ("DEFAULT", "AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA256"):
+            trusted.set_ciphers(offered)
+            with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
+                if (
+                    version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT"
+                ):  # no key exchange anew, or none authentic
+                    with pytest.raises(ssl.SSLError):
+                        trusted.wrap_socket(plain, server_hostname="127.0.0.1")
+                    continue
+                with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secured:
+                    chosen = secured.cipher()
+                    assert chosen is not None
+                    assert "GCM" in chosen[0] or "CHACHA20" in chosen[0]
 
 
 @pytest.mark.parametrize(

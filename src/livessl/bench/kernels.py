@@ -96,6 +96,18 @@ class Case:
     look_ups: int | None = None
 
 
+def table(report: KernelReport) -> str:
+    """The report, for people."""
+    lines = [
+        f"kernels {report.kernels}; a bare look-up takes {report.lookup_ns:.2f} ns",
+        f"{'':48}{'median ms':>10}{'p99 ms':>10}{'/ look-ups':>12}",
+    ]
+    for timing in report.timings:
+        ratio = "" if timing.ratio is None else f"{timing.ratio:12.2f}"
+        lines.append(f"{timing.name:<48}{timing.median_ms:10.3f}{timing.p99_ms:10.3f}{ratio}")
+    return "\n".join(lines)
+
+
 def array_specs(count: int) -> list[ArraySpec]:
     """The first `count` arrays."""
     shape = tetrahedron(0.5)
@@ -147,7 +159,7 @@ def measure(
     rounds: int = 200,
     arrays: Sequence[int] = (2, 4, 8),
     spacings_m: Sequence[float] = (0.1, 0.05, 0.02),
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> KernelReport:
     """Time every case on one thread.
 
@@ -159,7 +171,7 @@ def measure(
         How many take part, each at most `len(PLACES_M)`.
     spacings_m : sequence of float
         Of the grids that are searched.
-    progress : callable
+    progress : callable or None
         Gets the rounds done, and how many there are.
     """
     with threadpool_limits(limits=1):
@@ -181,7 +193,7 @@ def timed_ms(
     clock: Clock,
     cases: Sequence[Case],
     rounds: int,
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
     """Milliseconds (cases, rounds) that each case takes in each round, all of them once a round; warmed up before."""
     taken_ns = np.empty((len(cases), rounds))
@@ -193,7 +205,8 @@ def timed_ms(
             begun_ns = clock.monotonic_ns()
             case.run(number)
             taken_ns[index, number] = clock.monotonic_ns() - begun_ns
-        progress(number + 1, rounds)
+        if progress is not None:
+            progress(number + 1, rounds)
     return taken_ns / 1e6
 
 

@@ -7,7 +7,7 @@ being waited for has reached it, or at its deadline; who is late or missing cont
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -241,7 +241,7 @@ class Fusion:
             self._streams[array].left = True
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing."""
+        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         return [_status(stream, now_ns) for stream in self._streams.values()]
 
     def _went_back(self, now_ns: int) -> bool:
@@ -360,12 +360,12 @@ class Fusion:
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds: dict[str, Sound] = {}
+        sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
-                sounds[name] = _sound(pieces)
+                sounds.pieces[name] = pieces
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
@@ -386,7 +386,7 @@ class Fusion:
         parameters = self._parameters
         pre_roll = round(parameters.pre_roll_s / FRAME_S)
         span = range(max(event.start - pre_roll, self._heard_until), event.closed + 1)
-        sounds: dict[str, Sound] = {}
+        sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
         first, last = event.last_active, event.start
@@ -400,7 +400,7 @@ class Fusion:
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
-            sounds[name], powers[name] = _sound(pieces), power[mask]
+            sounds.pieces[name], powers[name] = pieces, power[mask]
             first, last = min(first, rasters[0]), max(last, rasters[-1])
         if not sounds:
             return []
@@ -455,9 +455,22 @@ class Fusion:
                 del stream.frames[first]
 
 
-def _sound(pieces: Sequence[Sequence[Frame]]) -> Sound:
-    segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-    return Sound(segments, pieces[0][0].sample_rate_hz)
+class _Sounds(Mapping[str, Sound]):
+    """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
+
+    def __init__(self) -> None:
+        self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
+
+    def __getitem__(self, array: str) -> Sound:
+        pieces = self.pieces[array]
+        segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
+        return Sound(segments, pieces[0][0].sample_rate_hz)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.pieces)
+
+    def __len__(self) -> int:
+        return len(self.pieces)
 
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:

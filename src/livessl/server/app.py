@@ -37,6 +37,9 @@ MAX_SAID_BYTES: Final = 4096
 MAX_HEAD_BYTES: Final = 16_384
 """Of a request: its line and all of its headers."""
 
+CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
+"""Of TLS 1.2: forward secret and authenticated. Those of 1.3 all are."""
+
 MAX_UNREAD_BYTES: Final = 131_072
 """What the system keeps for a client that does not read; left to itself it would be megabytes for each."""
 
@@ -107,6 +110,7 @@ class Server:
                 http="h11",  # the one that limits a request's head
                 h11_max_incomplete_event_size=MAX_HEAD_BYTES,
                 ssl_certfile=certificate,
+                ssl_ciphers=CIPHERS,
                 ssl_keyfile=None if http.private_key is None else site.file(http.private_key),
                 limit_concurrency=MAX_CONNECTIONS,
                 ws_max_size=MAX_SAID_BYTES,

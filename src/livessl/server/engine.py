@@ -64,8 +64,7 @@ class Engine:
         self._method = method
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
-        self._lock = threading.Lock()
-        self._tracks: dict[int, JsonObject] = {}
+        self._tracks: dict[int, JsonObject] = {}  # replaced, never changed: other threads read it
         self._states: dict[str, str] = {}
         self._replay_now_ns: int | None = None
         self._replay_heard_ns = 0
@@ -140,15 +139,12 @@ class Engine:
         return (self._clock.monotonic_ns() - self._began_ns) / 1e9
 
     def arrays(self) -> list[JsonObject]:
-        """How every array is doing; from any thread."""
-        with self._lock:
-            statuses = self._fusion.status(self.now_ns())
-        return [self._array(status) for status in statuses]
+        """How every array is doing; from any thread, and without waiting for a localization that is going on."""
+        return [self._array(status) for status in self._fusion.status(self.now_ns())]
 
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
-        with self._lock:
-            return list(self._tracks.values())
+        return list(self._tracks.values())
 
     def _array(self, status: ArrayStatus) -> JsonObject:
         ingest = self._receiver.ingest
@@ -211,11 +207,10 @@ class Engine:
 
     def _join(self, hello: wire.Hello) -> None:
         if hello.replay or self._replay_now_ns is not None:
-            with self._lock:
-                self._begin()
-                self._replay_now_ns = 0 if hello.replay else None
-                self._replaying = hello.replay
-                self._replay_heard_ns = self._clock.monotonic_ns()
+            self._begin()
+            self._replay_now_ns = 0 if hello.replay else None
+            self._replaying = hello.replay
+            self._replay_heard_ns = self._clock.monotonic_ns()
         for array, rate_hz in hello.arrays.items():
             self._fusion.prepare(array, rate_hz)
 
@@ -224,17 +219,13 @@ class Engine:
         if hello.replay:
             self._end_replay()
             return
-        with self._lock:
-            for array in hello.arrays:
-                self._fusion.leave(array)
+        for array in hello.arrays:
+            self._fusion.leave(array)
 
     def _end_replay(self) -> None:
         """Tell what is still open. Map, arrays and time stay as they were at the end, to be looked at."""
-        with self._lock:
-            outputs = self._fusion.flush(self.now_ns())
-        self._tell(outputs)
-        with self._lock:
-            ended, self._tracks = list(self._tracks.values()), {}
+        self._tell(self._fusion.flush(self.now_ns()))
+        ended, self._tracks = list(self._tracks.values()), {}
         for track in ended:
             self._publish({**track, "state": str(TrackState.END)})
         self._replaying = False
@@ -249,9 +240,7 @@ class Engine:
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
-        with self._lock:
-            outputs = self._fusion.step(batch, self.now_ns())
-        self._tell(outputs)
+        self._tell(self._fusion.step(batch, self.now_ns()))
 
     def _tell(self, outputs: Sequence[Output]) -> None:
         if self._messages is None:
@@ -283,9 +272,6 @@ class Engine:
         return stages
 
     def _keep_track(self, message: JsonObject, track: Track) -> None:
-        with self._lock:
-            if track.state is TrackState.END:
-                self._tracks.pop(track.id, None)
-            else:
-                self._tracks[track.id] = message
+        others = {number: other for number, other in self._tracks.items() if number != track.id}
+        self._tracks = others if track.state is TrackState.END else {**others, track.id: message}
         self._publish(message)

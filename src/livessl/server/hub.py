@@ -111,6 +111,11 @@ class Subscription:
             return False
         return True
 
+    @property
+    def lags(self) -> bool:
+        """Whether there is more to send."""
+        return bool(self._waiting)
+
     async def next(self) -> Told:
         """The next message, waiting for one; first of all how many were missed."""
         while not self._waiting:

@@ -367,11 +367,13 @@ async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -
     """Do the work until it ends or the client is gone."""
     tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
     try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises what was wrong, if anything
 
 
 def _refuse_strangers(socket: WebSocket) -> None:
@@ -401,6 +403,8 @@ async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, 
     while await _sent(socket.send_text(told.text)):
         if told.told_ns is not None:
             latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+        if subscription.lags:  # else all of it goes out in one turn, even to a client that has left meanwhile
+            await asyncio.sleep(0)
         told = await subscription.next()
 
 

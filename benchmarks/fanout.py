@@ -1,0 +1,123 @@
+"""How many messages a second one server's hub and sockets take to many clients, and what each costs.
+
+    python benchmarks/fanout.py --clients 50 --seconds 5 --arrays 2
+
+The real application (routes, hub, uvicorn's settings) tells updates as fast as its event loop gets through them; the
+clients are a process of their own and only count. One core for the server is what it means, so give it one (taskset).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import multiprocessing
+import resource
+from multiprocessing.connection import Connection
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.client import connect
+
+from livessl.bench import load
+from livessl.clock import SystemClock
+from livessl.config import parse_site
+from livessl.core.types import Contribution, Estimate, Status, Update
+from livessl.messages import JsonObject, Messages, Stages
+from livessl.server.app import Server
+from livessl.server.hub import LAGGING
+
+CLOCK = SystemClock()
+
+
+def update_of(arrays: int) -> JsonObject:
+    """An update as it is told when so many arrays heard the sound."""
+    site = parse_site(load.site_text(arrays, 0.5, "tcp://127.0.0.1:5570", 8000))
+    names = tuple(site.arrays)
+    estimate = Estimate(10**18, np.array([1.234, 5.678, 1.5]), 0.0123 * np.eye(3), 0.61, names)
+    contributions = tuple(Contribution(name, 0.2, 1e-3, 12.3, 4.5, 2.345) for name in names)
+    update = Update("lab-1", Status.LOCATED, estimate, 1e-3, contributions, 10**18)
+    return Messages(site, 0, utc=True).update(update, Stages(0.0, 0.001, 0.001, 0.001))
+
+
+def count(url: str, clients: int, seconds: float, parent: Connection) -> None:
+    """Count what comes to so many clients; tells the sum of messages and bytes."""
+    parent.send(asyncio.run(_count(url, clients, seconds, parent)))
+
+
+async def _count(url: str, clients: int, seconds: float, parent: Connection) -> tuple[int, int]:
+    address = f"ws{url.removeprefix('http')}/api/v1/live?kinds=update"
+    sockets = await asyncio.gather(*(connect(address, compression=None) for _ in range(clients)))
+    parent.send(None)
+    counts = await asyncio.gather(*(_one(socket, seconds) for socket in sockets))
+    await asyncio.gather(*(socket.close() for socket in sockets))
+    return sum(messages for messages, _ in counts), sum(size for _, size in counts)
+
+
+async def _one(socket: Any, seconds: float) -> tuple[int, int]:
+    messages = size = 0
+    end_ns = CLOCK.monotonic_ns() + round(seconds * 1e9)
+    while (left_s := (end_ns - CLOCK.monotonic_ns()) / 1e9) > 0:
+        try:
+            size += len(await asyncio.wait_for(socket.recv(), left_s))
+        except TimeoutError:
+            break
+        messages += 1
+    return messages, size
+
+
+async def tell(server: Server, message: JsonObject, until_ns: int) -> int:
+    """Tell updates as fast as the clients are sent them, a burst at a time; returns how many."""
+    hub, told = server._hub, 0
+    while CLOCK.monotonic_ns() < until_ns:
+        for _ in range(LAGGING // 2):
+            hub.publish(message, CLOCK.monotonic_ns())
+            told += 1
+        while any(subscription._waiting for subscription in hub._subscriptions):
+            await asyncio.sleep(0)
+    return told
+
+
+def processor_s() -> float:
+    """Of this process so far."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def main() -> None:
+    """Measure, and print a line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--clients", type=int, default=50)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--arrays", type=int, default=2, help="that contribute to an update: its size")
+    arguments = parser.parse_args()
+    site = parse_site(load.site_text(arguments.arrays, 0.5, "tcp://127.0.0.1:*", 0))
+    message = update_of(arguments.arrays)
+    server = Server(site, CLOCK)
+    running = Thread(target=server.run)
+    running.start()
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    counting = multiprocessing.get_context("spawn").Process(
+        target=count, args=(server.url, arguments.clients, arguments.seconds, theirs)
+    )
+    counting.start()
+    try:
+        ours.recv()
+        assert server._loop is not None
+        began_s, until_ns = processor_s(), CLOCK.monotonic_ns() + round(arguments.seconds * 1e9)
+        told = asyncio.run_coroutine_threadsafe(tell(server, message, until_ns), server._loop).result()
+        used_s = processor_s() - began_s
+        got, size = ours.recv()
+        counting.join()
+    finally:
+        server.stop()
+        running.join()
+    sent = told * arguments.clients
+    print(
+        f"{arguments.clients} clients, {size / max(1, got):.0f} bytes: {got / arguments.seconds:,.0f} messages/s; "
+        f"{1e6 * used_s / max(1, sent):.1f} us of the server's processor time each"
+    )
+
+
+if __name__ == "__main__":
+    main()

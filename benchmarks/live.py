@@ -1,0 +1,100 @@
+"""The service alone under load: `livessl bench --live` with an estimator that costs nothing, and a profile.
+
+    python benchmarks/live.py --arrays 64 --clients 20 --seconds 20 --profile server.pstats
+
+What the localization itself costs, the core's own benchmarks tell; here it says one place, after one pass over the
+sound it was given. The profile is of the thread that runs the fusion, by cProfile, which makes it slower.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import json
+import pstats
+import subprocess
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livessl.bench import live
+from livessl.cli import main as livessl
+from livessl.clock import SystemClock
+from livessl.core import estimators
+from livessl.core.estimators import Localization, PowerMaps, Sound
+from livessl.core.geometry import Grid
+from livessl.core.types import ArraySpec, HeardBy
+from livessl.server.engine import Engine
+
+
+class Nowhere:
+    """Says the middle of the room; looks at the sound, so that it is in the cache as if it had been used."""
+
+    name = "srp-phat"
+
+    def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
+        self._grid = grid
+        self._middle_m = (grid.lower_m + grid.upper_m) / 2
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """There is nothing to prepare."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        """One place for everything."""
+        loudest = max(float(segment.max()) for sound in sounds.values() for segment in sound.segments)
+        return Localization(self._middle_m + 0.01 * loudest, 0.01 * np.eye(3), 0.5, ())
+
+    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+        """A map without power."""
+        return PowerMaps(self._grid, np.zeros(self._grid.size, dtype=np.float32), {})
+
+
+def serve(site_file: Path, profile: Path | None) -> None:
+    """Be the server, with the estimator above, and perhaps profiled."""
+    estimators.ESTIMATORS["srp-phat"] = Nowhere
+    if profile is not None:
+        run = Engine._run
+        profiler = cProfile.Profile()
+
+        def profiled(engine: Engine) -> None:
+            profiler.runcall(run, engine)
+
+        Engine._run = profiled  # type: ignore[assignment, method-assign]
+    livessl(["serve", "--site", str(site_file)])
+    if profile is not None:
+        profiler.dump_stats(profile)
+
+
+def main() -> None:
+    """Measure, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--arrays", type=int, default=16)
+    parser.add_argument("--clients", type=int, default=20)
+    parser.add_argument("--watchers", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--profile", type=Path)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.serve is not None:
+        serve(arguments.serve, arguments.profile)
+        return
+    extra = [] if arguments.profile is None else ["--profile", str(arguments.profile)]
+
+    def start(site_file: Path) -> Any:
+        return subprocess.Popen([sys.executable, __file__, "--serve", str(site_file), *extra])  # noqa: S603 - ourselves
+
+    demand = live.Demand(
+        arguments.arrays, arguments.clients, arguments.seconds, watchers=arguments.watchers, spacing_m=0.5, rt60_s=0.0
+    )
+    outcome = live.measure(demand, SystemClock(), start=start)
+    print(json.dumps(outcome.json()) if arguments.json else live.table(outcome))
+    if arguments.profile is not None:
+        pstats.Stats(str(arguments.profile)).sort_stats("tottime").print_stats(25)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How fast livessl is on the machine at hand: measured by running it."""

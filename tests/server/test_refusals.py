@@ -1,0 +1,37 @@
+"""Who was turned away: every one counted, a bounded number remembered, each told once."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from livessl.clock import SystemClock
+from livessl.server.refusals import MAX_KNOWN, Refusals
+
+
+def test_each_is_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    refusals = Refusals(SystemClock())
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            refusals.note("http", "192.0.2.1", "no token")
+        refusals.note("http", "192.0.2.1", "too long")
+        refusals.note("nodes", "192.0.2.1", "no token")
+    assert refusals.counts() == {("http", "no token"): 3, ("http", "too long"): 1, ("nodes", "no token"): 1}
+    assert (refusals.count("http"), refusals.count("nodes"), refusals.count("cellar")) == (4, 1, 0)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{door}: 192.0.2.1 was refused: {reason} (told once, counted in /metrics)"
+        for door, reason in (("http", "no token"), ("http", "too long"), ("nodes", "no token"))
+    ]
+    newest = refusals.known()[0]
+    assert (newest.door, newest.count) == ("nodes", 1)
+    assert max(refusals.known(), key=lambda refused: refused.count).count == 3
+
+
+def test_many_addresses_cost_no_more_memory_nor_lines(caplog: pytest.LogCaptureFixture) -> None:
+    refusals = Refusals(SystemClock())
+    with caplog.at_level(logging.WARNING):
+        for number in range(10 * MAX_KNOWN):
+            refusals.note("http", f"2001:db8::{number:x}", "no token")
+    assert refusals.counts() == {("http", "no token"): 10 * MAX_KNOWN}
+    assert len(refusals.known()) == len(caplog.records) == MAX_KNOWN
