@@ -106,7 +106,7 @@ WHATS: Final = ("GCC", "peak", "map")
 TIMES: Final = {"median_ms": 2.0, "p95_ms": 3.0, "least_ms": 1.0}
 
 
-def live(arrays: int, clients: int, *, spin: bool = False) -> Json:
+def live(arrays: int, clients: int, spin: bool) -> Json:
     """A service that takes 10 % of a core and 0.5 % an array and 0.1 % a client; 100 MB and 2 MB an array."""
     return {
         "machine": MACHINE,
@@ -165,7 +165,7 @@ def write(folder: Path, files: dict[str, Json]) -> Path:
 
 
 def test_text_is_made_of_the_files(tmp_path: Path) -> None:
-    runs = {f"live-{n}-{c}": live(n, c) for n, c, *_ in performance.LIVE} | {"live-64-20-spin": live(64, 20, spin=True)}
+    runs = {performance._live_name(*demand): live(*demand) for demand in performance.LIVE}
     text = performance.document(write(tmp_path, measured() | runs))
     assert "540 of 540 maps" in text
     assert "takes 1.8 times what as many bare look-ups take on this machine, and 4.4 times without numba" in text
@@ -176,6 +176,12 @@ def test_text_is_made_of_the_files(tmp_path: Path) -> None:
 
 def test_text_without_the_service_says_so(tmp_path: Path) -> None:
     assert "Not measured here." in performance.document(write(tmp_path, measured()))
+
+
+def test_text_wants_all_of_the_service_or_nothing(tmp_path: Path) -> None:
+    folder = write(tmp_path, measured() | {"live-4-1": live(4, 1, False)})
+    with pytest.raises(ValueError, match=r"live-4-20.json, .*live-64-20-spin.json lacking"):
+        performance.document(folder)
 
 
 def test_files_of_two_machines_make_no_text(tmp_path: Path) -> None:
