@@ -34,6 +34,7 @@ from livessl.capture.recorded import (
     repeated,
     span_ns,
 )
+from livessl.capture.spool import SpoolError
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import (
     ConfigError,
@@ -79,6 +80,7 @@ _FAILURES: Final = (
     BindError,
     NotStartedError,
     SinkError,
+    SpoolError,
     StoreError,
     UndeliveredError,
     demo.DemoError,

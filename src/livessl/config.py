@@ -216,11 +216,24 @@ class SceneDeviceConfig(_Model):
 DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
+FileName = Annotated[str, Field(min_length=1)]
+"""A file or folder, looked up from the site file's folder."""
+
+
+class SpoolConfig(_Model):
+    """Where a node keeps the sound that the server may still need; without a folder in memory, never on a disk."""
+
+    directory: FileName | None = None
+    max_mb: Positive = 512.0
+    max_age_s: Positive = 3600.0
+
+
 class NodeConfig(_Model):
     """A capture node: one device, one or more arrays on its channels (counted from 1)."""
 
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
+    spool: SpoolConfig = SpoolConfig()
     arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
 
     @model_validator(mode="before")
@@ -250,10 +263,6 @@ class NodeConfig(_Model):
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
         return check_endpoint(endpoint)
-
-
-FileName = Annotated[str, Field(min_length=1)]
-"""A file or folder, looked up from the site file's folder."""
 
 
 class HttpConfig(_Model):
@@ -896,6 +905,11 @@ def _node_faults(site: Site) -> Iterator[_Finding]:
     claimed: dict[str, str] = {}
     for node_name, node in site.nodes.items():
         used: dict[int, str] = {}
+        if site.privacy == "positions-only" and node.spool.directory is not None:
+            yield (
+                ("nodes", node_name, "spool", "directory"),
+                "with privacy: positions-only no sound is kept on a disk; take it away, and it is kept in memory",
+            )
         for name, channels in node.arrays.items():
             here: _Place = ("nodes", node_name, "arrays", name)
             if name not in site.arrays:
