@@ -427,7 +427,7 @@ class Site(_Model):
             hang_over_s=a.hang_over_s,
         )
 
-    def make_fusion(self, method: str | None = None, *, updates: bool = True) -> Fusion:
+    def make_fusion(self, method: str | None = None, *, updates: bool = True, live: bool = False) -> Fusion:
         """A new fusion of this site's arrays, by the site's method or another of `ESTIMATORS`."""
         f, a = self.fusion, self.activity
         estimator = ESTIMATORS[method or f.method](self.processed, self.search_grid(), self.c_m_s)
@@ -441,7 +441,7 @@ class Site(_Model):
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,
         )
-        return Fusion(self.site, self.processed, estimator, parameters, updates=updates)
+        return Fusion(self.site, self.processed, estimator, parameters, updates=updates, newest_only=live)
 
     def node_of(self, array: str) -> str | None:
         """Name of the node that captures an array; a joint one's arrays are all on one."""

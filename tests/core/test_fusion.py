@@ -491,6 +491,20 @@ def test_updates_come_only_while_there_is_sound() -> None:
     assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate
 
 
+def test_a_live_fusion_that_is_behind_looks_at_the_newest_window_only() -> None:
+    arrivals = node("north", range(10, 20), range(30)) + node("south", range(10, 20), range(30))
+    site = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    said = play(site, arrivals, 16)  # in step: nothing is left out
+    assert len([output for _, output in said if isinstance(output, Update)]) == 3
+    assert site.updates_left_out == 0
+    behind = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    told = behind.step(
+        [message for when, message in sorted(arrivals, key=lambda arrival: arrival[0]) if when <= 17], now_ns(17)
+    )
+    assert [output.complete_ns for output in told if isinstance(output, Update)] == [now_ns(16)]
+    assert behind.updates_left_out == 2
+
+
 def test_offline_nobody_is_updated() -> None:
     arrivals = node("north", range(10, 20), range(40))
     said = play(fusion_of(updates=False), arrivals, 40)

@@ -221,6 +221,9 @@ class Fusion:
     parameters : FusionParameters
     updates : bool
         Whether to localize windows while a sound lasts; offline nobody looks at them.
+    newest_only : bool
+        Whether, of several windows that are due at once, the newest alone is localized: what is live must not fall
+        further behind. `updates_left_out` counts the others.
     """
 
     def __init__(
@@ -231,11 +234,13 @@ class Fusion:
         parameters: FusionParameters | None = None,
         *,
         updates: bool = True,
+        newest_only: bool = False,
     ) -> None:
         self._site = site
         self._estimator = estimator
         self._parameters = parameters or FusionParameters()
         self._updates = updates
+        self._newest_only = newest_only
         self._streams = {spec.name: _Stream(spec) for spec in arrays}
         self._tracker = Tracker()
         self._next: int | None = None
@@ -244,6 +249,8 @@ class Fusion:
         self._heard_until = -(2**63)
         self._now_ns = 0
         self._told_until = self._closing_until = -(2**63)
+        self._due: int | None = None
+        self.updates_left_out = 0
         self.unknown_arrays = 0
 
     def twin(self) -> Fusion:
@@ -389,6 +396,9 @@ class Fusion:
             outputs += self._close(self._next)
             self._next += 1
             self._prune()
+        due, self._due = self._due, None
+        if due is not None and self._event is not None:
+            outputs += self._update(self._event, due)
         return outputs
 
     def _may_close(self, raster: int) -> bool:
@@ -432,7 +442,11 @@ class Fusion:
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
-            outputs += self._update(event, raster)
+            if self._newest_only:
+                self.updates_left_out += self._due is not None
+                self._due = raster
+            else:
+                outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
             event.ended = True
             outputs += self._finish()

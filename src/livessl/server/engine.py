@@ -133,6 +133,11 @@ class Engine:
         return "live" if self._replay_now_ns is None else "replay"
 
     @property
+    def updates_left_out(self) -> int:
+        """Windows that were not localized, for newer ones were due."""
+        return self._settling.live.updates_left_out
+
+    @property
     def malformed(self) -> int:
         """Messages refused since the start."""
         return self._receiver.ingest.malformed
@@ -192,11 +197,12 @@ class Engine:
         return described
 
     def _begin_live(self) -> None:
-        self._begin([spec.name for spec in self._site.processed], self._store.settled(self._site.site))
+        arrays = [spec.name for spec in self._site.processed]
+        self._begin(arrays, self._store.settled(self._site.site), live=True)
 
-    def _begin(self, arrays: Iterable[str], settled: int | None) -> None:
+    def _begin(self, arrays: Iterable[str], settled: int | None, *, live: bool = False) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._settling = Settling(self._site.make_fusion(self._method), arrays, settled)
+        self._settling = Settling(self._site.make_fusion(self._method, live=live), arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
 

@@ -472,6 +472,11 @@ class _Metrics(Collector):
         yield CounterMetricFamily(
             "livessl_messages_superseded", "Messages that slow subscribers never got.", self._hub.superseded
         )
+        yield GaugeMetricFamily(
+            "livessl_updates_left_out",
+            "Windows since the server began this live run that gave way to newer ones.",
+            self._engine.updates_left_out,
+        )
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
         yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
         yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", self._engine.unsaved)
