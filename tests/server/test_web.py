@@ -118,7 +118,7 @@ def test_site(client: httpx.Client) -> None:
     assert found["room"] == {"size_m": [4.0, 5.0, 3.0]}
     assert found["grid"] == {"bounds_m": [[0, 4], [0, 5], [0, 3]], "spacing_m": 0.25, "shape": [16, 20, 12]}
     assert found["speed_of_sound_m_s"] == 343.0
-    assert found["method"] == "srp-phat"
+    assert found["method"] == "onset"
     north = found["arrays"]["north"]
     assert north["position_m"] == [1.9, 1.3, 1.4]
     assert np.shape(north["microphones_m"]) == (4, 3)
