@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import reduce
+from operator import add
 from typing import Final
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy as np
 from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
+from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
@@ -139,6 +142,8 @@ class _Stream:
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
+    listener: OnsetFrontEnd | None = None
+    onsets: dict[int, OnsetGCC] = field(default_factory=dict)
     counters: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
     )
@@ -170,6 +175,29 @@ class _Stream:
             pieces[-1].append(frame)
             there.append(raster)
         return pieces, there
+
+    def listen(self, rasters: Iterable[int], estimator: Estimator) -> None:
+        """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
+        for raster in rasters:
+            frame = self.frames.get(raster)
+            if frame is None:
+                if self.listener is not None:
+                    self.listener.reset()
+                continue
+            if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
+                self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
+            if self.listener is not None:
+                self.onsets[raster] = self.listener.push(frame.samples, quiet=not frame.active)
+
+    def forget(self) -> None:
+        """Forget what was listened to."""
+        self.listener = None
+        self.onsets.clear()
+
+    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
+        """All that was listened to at `rasters` together; None for nothing."""
+        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
+        return reduce(add, heard) if heard else None
 
 
 @dataclass(slots=True)
@@ -389,11 +417,13 @@ class Fusion:
     def _close(self, raster: int) -> list[Output]:
         active = any(stream.has_active(raster) for stream in self._streams.values())
         if active and self._event is None:
-            self._event = _OpenEvent(raster, raster, raster)
+            self._event = self._open(raster)
         event = self._event
         if event is None:
             return []
         event.closed = raster
+        for stream in self._streams.values():
+            stream.listen([raster], self._estimator)
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
@@ -408,6 +438,22 @@ class Fusion:
             outputs += self._finish()
         return outputs
 
+    def _open(self, raster: int) -> _OpenEvent:
+        """Begin an event, and listen to its pre-roll afresh, so that it is the same whatever came before.
+
+        Where a sound goes on that was cut for its length, the listeners go on, too.
+        """
+        span = range(self._span_start(raster), raster)
+        if raster != self._heard_until:
+            for stream in self._streams.values():
+                stream.forget()
+                stream.listen(span, self._estimator)
+        return _OpenEvent(raster, raster, raster)
+
+    def _span_start(self, start: int) -> int:
+        """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
+        return max(start - round(self._parameters.pre_roll_s / FRAME_S), self._heard_until)
+
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
         sounds = _Sounds()
@@ -416,26 +462,27 @@ class Fusion:
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
                 sounds.pieces[name] = pieces
+                sounds.onsets[name] = stream.onsets_at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
         found = self._estimator.locate(sounds)
         middle_ns = (window.start + window.stop) * FRAME_NS // 2
         estimate = _estimate(found, middle_ns, sounds)
-        status, _ = self._judge(estimate)
+        status, _ = self._judge(estimate, found.refused)
         loudest = max(float(power.max()) for power in powers.values())
         contributions = self._contributions(powers, estimate)
         complete_ns = window.stop * FRAME_NS
         update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
-        tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
+        trusted = [] if status is Status.REFUSED else [estimate]
+        tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None
         assert event is not None
         parameters = self._parameters
-        pre_roll = round(parameters.pre_roll_s / FRAME_S)
-        span = range(max(event.start - pre_roll, self._heard_until), event.closed + 1)
+        span = range(self._span_start(event.start), event.closed + 1)
         sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
@@ -455,7 +502,11 @@ class Fusion:
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
+            if any(raster not in stream.onsets for raster in there):  # some came late
+                stream.forget()
+                stream.listen(span, self._estimator)
             sounds.pieces[name], powers[name] = pieces, power[mask]
+            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
             first, last = min(first, rasters[0]), max(last, rasters[-1])
         if not sounds:
             return []
@@ -464,8 +515,11 @@ class Fusion:
         status = Status.REFUSED
         reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
         if len(sounds) >= parameters.min_arrays:
-            estimate = _estimate(self._estimator.locate(sounds), (start_ns + end_ns) // 2, sounds)
-            status, reason = self._judge(estimate)
+            found = self._estimator.locate(sounds)
+            estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
+            status, reason = self._judge(estimate, found.refused)
+            if status is Status.REFUSED:
+                estimate = None
         return [
             Event(
                 id=self._id(event.start),
@@ -484,14 +538,14 @@ class Fusion:
             )
         ]
 
-    def _judge(self, estimate: Estimate) -> tuple[Status, str | None]:
-        """Whether the estimate is a place, or only a direction, and why."""
+    def _judge(self, estimate: Estimate, refused: str | None) -> tuple[Status, str | None]:
+        """Whether the estimate is a place, only a direction, or neither, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         specs = [self._streams[name].spec for name in estimate.arrays]
         nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return Status.LOCATED, None
+            return (Status.LOCATED, None) if refused is None else (Status.REFUSED, refused)
         who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
         return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
@@ -515,11 +569,12 @@ class _Sounds(Mapping[str, Sound]):
 
     def __init__(self) -> None:
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
+        self.onsets: dict[str, OnsetGCC | None] = {}
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
         segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz)
+        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)
