@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from livessl.errors import RunError
 from livessl.messages import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
@@ -56,7 +57,7 @@ class Query:
     before: Cursor | None = None
 
 
-class StoreError(Exception):
+class StoreError(RunError):
     """The file cannot be used, or takes no more."""
 
 
