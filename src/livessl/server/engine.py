@@ -29,6 +29,9 @@ BATCH: Final = 200
 STATUS_NS: Final = 500_000_000
 """Between two reports on the arrays."""
 
+SAY_S: Final = 2.0
+"""A start that waits longer for the compiler says so."""
+
 REPLAY_SILENT_NS: Final = 5_000_000_000
 """A replay that sends nothing for so long is over, unless its node still says that it is there."""
 
@@ -76,7 +79,7 @@ class Engine:
         self.unkept = 0
         self.maps = Maps(clock)
         self.latency = Latency()
-        warm_up()
+        _warm_up()
         self._begin()
         self._receiver = Receiver(site, clock)
 
@@ -275,3 +278,13 @@ class Engine:
         others = {number: other for number, other in self._tracks.items() if number != track.id}
         self._tracks = others if track.state is TrackState.END else {**others, track.id: message}
         self._publish(message)
+
+
+def _warm_up() -> None:
+    """Have compiled what localizes, before anybody waits for it; read from numba's cache it takes a moment only."""
+    told = threading.Timer(SAY_S, _log.info, ["compiling the search, some seconds at the first start on this machine"])
+    told.start()
+    try:
+        warm_up()
+    finally:
+        told.cancel()
