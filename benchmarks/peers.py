@@ -475,7 +475,7 @@ def main() -> int:
     """Measure all of it and write peers.json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--rounds", type=int, default=20, help="of all codes, side by side (default 20)")
+    parser.add_argument("--rounds", type=int, default=15, help="of all codes, side by side (default 15)")
     parser.add_argument("--search-rounds", type=int, default=60, help="of our search and maps alone (default 60)")
     arguments = parser.parse_args()
     about = machine.describe()

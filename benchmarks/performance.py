@@ -31,8 +31,10 @@ HERE: Final = Path(__file__).parent
 DOCS: Final = HERE.parent / "docs"
 OURS: Final = "livessl, map, compiled"
 
-LIVE: Final = ((4, 1), (4, 20), (4, 100), (16, 20), (64, 20), (64, 20, "spin"))
-"""Arrays and clients of each run of the service; the last with a foreign process spinning on each core."""
+LIVE: Final = (
+    (4, 1, False), (4, 20, False), (4, 100, False), (16, 20, False), (64, 20, False), (64, 20, True)
+)  # fmt: skip
+"""Arrays and clients of each run of the service, and whether a foreign process spins on each core meanwhile."""
 
 TO_BUY: Final = (10, 100, 1000)
 USED: Final = 0.6
@@ -111,13 +113,21 @@ def _measure_kernels(folder: Path, rounds: int) -> None:
 
 
 def _measure_live(folder: Path, seconds: float) -> None:
-    for arrays, clients, *spin in LIVE:
+    for arrays, clients, spin in LIVE:
         about = machine.describe()
         command = [sys.executable, "-m", "livessl", "bench", "--live", "--json", *(["--spin"] if spin else [])]
         command += ["--arrays", str(arrays), "--clients", str(clients), "--seconds", str(seconds)]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603 - ours
-        name = "-".join(["live", str(arrays), str(clients), *map(str, spin)])
-        _write(folder / f"{name}.json", {"machine": about, **json.loads(done.stdout)})
+        _write(folder / f"{_live_name(arrays, clients, spin)}.json", {"machine": about, **json.loads(done.stdout)})
+
+
+def _live_name(arrays: int, clients: int, spin: bool) -> str:
+    return f"live-{arrays}-{clients}" + ("-spin" if spin else "")
+
+
+def _read(file: Path) -> Json:
+    report: Json = json.loads(file.read_text(encoding="utf-8"))
+    return report
 
 
 def _write(file: Path, report: Json) -> None:
@@ -130,15 +140,19 @@ def document(folder: Path) -> str:
     Raises
     ------
     FileNotFoundError
-        Where one is missing; those of the service may be.
+        Where one is missing; all of those of the service may be.
     ValueError
-        Where they are of different machines.
+        Where they are of different machines, or some of the service's are missing.
     """
-    measured, peers, exact = (
-        json.loads((folder / f"{name}.json").read_text(encoding="utf-8")) for name in ("kernels", "peers", "exactness")
-    )
-    live = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(folder.glob("live-*.json"))]
-    live.sort(key=lambda run: (run["demand"]["spin"], run["demand"]["arrays"], run["demand"]["clients"]))
+    measured, peers, exact = (_read(folder / f"{name}.json") for name in ("kernels", "peers", "exactness"))
+    files = [folder / f"{_live_name(*demand)}.json" for demand in LIVE]
+    missing = [file.name for file in files if not file.exists()]
+    if 0 < len(missing) < len(files):
+        raise ValueError(
+            f"{folder}: expected every run of the service or none, {', '.join(missing)} lacking; "
+            "measure them: python benchmarks/performance.py --measure live"
+        )
+    live = [] if missing else [_read(file) for file in files]
     sections = [
         _head([measured, peers, exact, *live]),
         _ratios(peers, exact),
@@ -421,9 +435,10 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
         return
     fits, most = _service_fits(live), max(carried)
     cpu, clients, memory = fits["processor, arrays"], fits["processor, clients"], fits["memory, arrays"]
+    base = max(0.0, cpu.offset)
     megabits = 8e-6 * peers["frame_bytes"] / FRAME_S
     yield _paragraph(
-        f"From the fits above: a server takes {_number(cpu.offset)} % of a core for itself and 20 clients,",
+        f"From the fits above: a server takes {_number(base)} % of a core for itself and 20 clients,",
         f"{_number(cpu.factor)} % for each array that sounds, {_number(clients.factor)} % for each further client, and",
         f"{_number(memory.offset)} MB and {_number(memory.factor)} MB an array. An array of four microphones sends",
         f"{_number(megabits)} Mbit/s while it sounds, and hardly anything while it is quiet. The most arrays that one",
@@ -434,7 +449,7 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
     rows = []
     for arrays in TO_BUY:
         servers = math.ceil(arrays / most)
-        cores = math.ceil((servers * max(0.0, cpu.offset) + arrays * cpu.factor) / 100.0 / USED)
+        cores = math.ceil((servers * base + arrays * cpu.factor) / 100.0 / USED)
         gigabytes = (servers * memory.offset + arrays * memory.factor) / 1000.0 / USED
         rows.append(
             (

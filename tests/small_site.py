@@ -44,6 +44,9 @@ SMALL: dict[str, Any] = {
 }
 """Two tetrahedra in a small room at a low rate: quick to localize in. Addresses are chosen by the system."""
 
+FIRST_RASTER = 999
+"""A frame's raster index is its number beyond this, where a test does not say otherwise."""
+
 Changes = dict[str, Any]
 """Dotted path to value; `...` takes the key away."""
 
@@ -123,9 +126,12 @@ def scene_parts(start_ns: int, count: int = 2) -> list[Part]:
     ]
 
 
-def frame(sequence: int = 1, raster: int = 1000, array: str = "north", *, active: bool = True, seed: int = 0) -> Frame:
-    """A frame of noise as the small site's nodes send it."""
+def frame(
+    sequence: int = 1, raster: int | None = None, array: str = "north", *, active: bool = True, seed: int = 0
+) -> Frame:
+    """A frame of noise as the small site's nodes send it; each later in time than the one numbered before it."""
     samples = hiss(0.05, seed=seed)
+    raster = FIRST_RASTER + sequence if raster is None else raster
     return Frame(array, sequence, raster, raster * 50_000_000, float(RATE_HZ), samples, 0.01, active)
 
 

@@ -131,3 +131,14 @@ def test_file_that_retention_does_not_reach_is_told_of() -> None:
     [warning] = site_of({"store": {"retention_days": 7}, "server.sinks": sinks}).warnings
     assert warning == "store.retention_days: 7 days do not reach server.sinks; rotate those files yourself"
     assert site_of({"server.sinks": sinks}).warnings == ()
+
+
+def test_no_sound_on_a_disk_where_only_positions_are_kept() -> None:
+    changes: dict[str, Any] = {"privacy": "positions-only", "nodes.lab-pc.spool": {"directory": "spool"}}
+    with pytest.raises(ConfigError) as caught:
+        site_of(changes)
+    (fault,) = caught.value.faults
+    assert fault.where.endswith("nodes.lab-pc.spool.directory")
+    assert "no sound is kept on a disk; take it away" in fault.what
+    assert site_of({**changes, "nodes.lab-pc.spool": {"directory": None}}).nodes["lab-pc"].spool.directory is None
+    assert site_of({**changes, "privacy": "recording"}).nodes["lab-pc"].spool.directory == "spool"

@@ -62,11 +62,15 @@ HELLOS = st.builds(
     arrays=st.dictionaries(NAMES, RATES, max_size=6),
     replay=st.booleans(),
     problem=TEXTS,
+    backlog=st.dictionaries(
+        NAMES, st.lists(RASTERS, min_size=2, max_size=2, unique=True).map(lambda ends: tuple(sorted(ends))), max_size=6
+    ),
 )
 ACKS = st.builds(
     Ack,
     run_id=NAMES,
-    sequences=st.dictionaries(NAMES, st.integers(0, 2**63 - 1), max_size=6),
+    received=st.dictionaries(NAMES, RASTERS, max_size=6),
+    settled=st.none() | RASTERS,
     who_are_you=st.booleans(),
     refused=TEXTS,
 )
@@ -75,8 +79,8 @@ BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
 EXAMPLES: list[WireMessage] = [
     frame(),
     mark(),
-    Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged"),
-    Ack("run", {"north": 7}),
+    Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged", backlog={"north": (7, 9)}),
+    Ack("run", {"north": 7}, 5),
     Bye("lab-pc", "run"),
 ]
 
@@ -161,7 +165,10 @@ JSON_VALUES = st.recursive(
 
 
 @given(
-    st.sampled_from([(3, "node run_id arrays replay problem"), (4, "run_id sequences who_are_you refused")]), st.data()
+    st.sampled_from(
+        [(3, "node run_id arrays replay problem backlog"), (4, "run_id received settled who_are_you refused")]
+    ),
+    st.data(),
 )
 @settings(max_examples=300, deadline=None)
 def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
@@ -175,7 +182,8 @@ def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str]
 
 
 def hello_with(**fields: Any) -> bytes:
-    whole = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None, **fields}
+    whole: dict[str, Any] = {"node": "a", "run_id": "b", "arrays": {"n": 16000}, "replay": False, "problem": None}
+    whole |= {"backlog": {}, **fields}
     return encode(EXAMPLES[2])[: struct.calcsize("<4sBBq")] + json.dumps(whole).encode()
 
 
@@ -206,6 +214,12 @@ def test_hello_of_plain_json_is_taken() -> None:
         {"problem": 3},
         {"problem": "p" * 1001},
         {"problem": "half a pair: \udc00"},
+        {"backlog": None},
+        {"backlog": {"n": 7}},
+        {"backlog": {"n": [7]}},
+        {"backlog": {"n": [7, 7]}},
+        {"backlog": {"n": [7, 8.5]}},
+        {"backlog": {"n": [7, 2**62]}},
         {"extra": 1},
     ],
     ids=str,

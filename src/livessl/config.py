@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from livessl.core.fusion import Fusion
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
-METHODS: Final = ("srp-phat", "cepstral", "averaged")
+METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
 """Names of `livessl.core.estimators.ESTIMATORS`: who checks a site file need not load what localizes."""
 
 COINCIDENT_M: Final = 1e-3
@@ -222,11 +222,24 @@ class SceneDeviceConfig(_Model):
 DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
+FileName = Annotated[str, Field(min_length=1)]
+"""A file or folder, looked up from the site file's folder."""
+
+
+class SpoolConfig(_Model):
+    """Where a node keeps the sound that the server may still need; without a folder in memory, never on a disk."""
+
+    directory: FileName | None = None
+    max_mb: Positive = 512.0
+    max_age_s: Positive = 3600.0
+
+
 class NodeConfig(_Model):
     """A capture node: one device, one or more arrays on its channels (counted from 1)."""
 
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
+    spool: SpoolConfig = SpoolConfig()
     arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
 
     @model_validator(mode="before")
@@ -256,10 +269,6 @@ class NodeConfig(_Model):
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
         return check_endpoint(endpoint)
-
-
-FileName = Annotated[str, Field(min_length=1)]
-"""A file or folder, looked up from the site file's folder."""
 
 
 class HttpConfig(_Model):
@@ -424,7 +433,7 @@ class Site(_Model):
             hang_over_s=a.hang_over_s,
         )
 
-    def make_fusion(self, method: str | None = None, *, updates: bool = True) -> Fusion:
+    def make_fusion(self, method: str | None = None, *, updates: bool = True, live: bool = False) -> Fusion:
         """A new fusion of this site's arrays, by the site's method or another of `METHODS`."""
         from livessl.core.estimators import ESTIMATORS
         from livessl.core.fusion import Fusion, FusionParameters
@@ -441,7 +450,7 @@ class Site(_Model):
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,
         )
-        return Fusion(self.site, self.processed, estimator, parameters, updates=updates)
+        return Fusion(self.site, self.processed, estimator, parameters, updates=updates, newest_only=live)
 
     def node_of(self, array: str) -> str | None:
         """Name of the node that captures an array; a joint one's arrays are all on one."""
@@ -905,6 +914,11 @@ def _node_faults(site: Site) -> Iterator[_Finding]:
     claimed: dict[str, str] = {}
     for node_name, node in site.nodes.items():
         used: dict[int, str] = {}
+        if site.privacy == "positions-only" and node.spool.directory is not None:
+            yield (
+                ("nodes", node_name, "spool", "directory"),
+                "with privacy: positions-only no sound is kept on a disk; take it away, and it is kept in memory",
+            )
         for name, channels in node.arrays.items():
             here: _Place = ("nodes", node_name, "arrays", name)
             if name not in site.arrays:

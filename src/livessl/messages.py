@@ -90,6 +90,8 @@ class Messages:
             "late_frames": event.late_frames,
             "latency_s": round(event.latency_s if stages is None else stages.total, 4),
             "latency_stages_s": _stages(stages),
+            "late": event.late,
+            "replaces": [],
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -68,6 +68,10 @@ class Hello:
         The frames carry past times; the server shall follow them instead of its clock.
     problem : str or None
         What is wrong with its device now, in words.
+    backlog : dict of str to (int, int)
+        Of the arrays that have kept frames from before this connection: their oldest raster index, and the one from
+        which on frames are live. What lies between comes in order of time, as the live sound leaves room; another
+        greeting says when all of it has been sent.
     """
 
     node: str
@@ -75,14 +79,31 @@ class Hello:
     arrays: dict[str, float]
     replay: bool = False
     problem: str | None = None
+    backlog: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The server's answer and heartbeat: the last sequence number it holds of each array of this node's run."""
+    """The server's answer and heartbeat.
+
+    Parameters
+    ----------
+    run_id : str
+        Of the node's greeting.
+    received : dict of str to int
+        Raster index, of each array, up to which the server has all frames that the node sent: they need not be sent
+        again while this server lives.
+    settled : int or None
+        Raster index before which everything has become events, and these are stored: no frame of it is needed again.
+    who_are_you : bool
+        The server does not know this connection, or misses frames of it: greet, and send again.
+    refused : str or None
+        Why the node may not join.
+    """
 
     run_id: str
-    sequences: dict[str, int]
+    received: dict[str, int]
+    settled: int | None = None
     who_are_you: bool = False
     refused: str | None = None
 
@@ -241,6 +262,8 @@ def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
     for name, valid in checks.items():
         if not valid(fields[name]):
             raise WireError(f"{what}: field {name!r} has a wrong type or value")
+    if type_ is Hello:
+        fields["backlog"] = {array: tuple(rasters) for array, rasters in fields["backlog"].items()}
     return type_(**fields)
 
 
@@ -266,8 +289,12 @@ def _is_rate(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_RATE_HZ
 
 
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+def _is_raster(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_RASTER
+
+
+def _is_span(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_raster, value)) and value[0] < value[1]
 
 
 def _is_flag(value: Any) -> bool:
@@ -285,8 +312,15 @@ _FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
         "arrays": _is_map_of(_is_rate),
         "replay": _is_flag,
         "problem": _is_text,
+        "backlog": _is_map_of(_is_span),
     },
-    Ack: {"run_id": _is_name, "sequences": _is_map_of(_is_sequence), "who_are_you": _is_flag, "refused": _is_text},
+    Ack: {
+        "run_id": _is_name,
+        "received": _is_map_of(_is_raster),
+        "settled": lambda value: value is None or _is_raster(value),
+        "who_are_you": _is_flag,
+        "refused": _is_text,
+    },
     Bye: {"node": _is_name, "run_id": _is_name},
 }
 

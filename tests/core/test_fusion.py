@@ -20,6 +20,7 @@ from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
 from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.joint import joined
+from livessl.core.onset import OnsetGCC
 from livessl.core.types import (
     FRAME_NS,
     GCC,
@@ -70,6 +71,9 @@ class Scripted:
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         self.prepared.append((array, sample_rate_hz))
+
+    def listener(self, array: str, sample_rate_hz: float) -> None:
+        return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
@@ -488,6 +492,20 @@ def test_updates_come_only_while_there_is_sound() -> None:
     assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate
 
 
+def test_a_live_fusion_that_is_behind_looks_at_the_newest_window_only() -> None:
+    arrivals = node("north", range(10, 20), range(30)) + node("south", range(10, 20), range(30))
+    site = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    said = play(site, arrivals, 16)  # in step: nothing is left out
+    assert len([output for _, output in said if isinstance(output, Update)]) == 3
+    assert site.updates_left_out == 0
+    behind = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    told = behind.step(
+        [message for when, message in sorted(arrivals, key=lambda arrival: arrival[0]) if when <= 17], now_ns(17)
+    )
+    assert [output.complete_ns for output in told if isinstance(output, Update)] == [now_ns(16)]
+    assert behind.updates_left_out == 2
+
+
 def test_offline_nobody_is_updated() -> None:
     arrivals = node("north", range(10, 20), range(40))
     said = play(fusion_of(updates=False), arrivals, 40)
@@ -559,9 +577,9 @@ def test_array_starts_then_is_healthy_then_lost() -> None:
     assert status.age_s == pytest.approx(0.1)
     assert (status.power, status.noise_power, status.clock) == (1e-7, 1e-7, ClockState.LOCKED)
     assert status.counters["marks"] == 10
-    assert status_of(fusion, "north", 49).state is ArrayState.HEALTHY
-    status = status_of(fusion, "north", 50)  # two seconds later
-    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 2 s")
+    assert status_of(fusion, "north", 39).state is ArrayState.HEALTHY
+    status = status_of(fusion, "north", 40)  # one and a half seconds later
+    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 1.5 s")
     play(fusion, node("north", (), range(60, 62)), 62, start=61)
     assert status_of(fusion, "north", 62).state is ArrayState.HEALTHY
     assert status_of(fusion, "south", 62).state is ArrayState.STARTING
@@ -669,3 +687,94 @@ def test_memory_does_not_grow(arrays: tuple[str, ...]) -> None:
             # an event of 20 frames, and 15 for pre-roll, window and hang-over before it
             assert len(held) <= len(arrays) * (20 + 15 + 2)
     assert max(sizes[1:]) <= sizes[0] + 200  # counters get longer
+
+
+class Ear:
+    """Stands for a front end: it remembers what it heard, and says of each frame its number."""
+
+    sample_rate_hz = RATE_HZ
+
+    def __init__(self, heard: list[tuple[int, bool] | None]) -> None:
+        self.heard = heard
+
+    def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
+        self.heard.append((int(samples[0, 0]), quiet))
+        return OnsetGCC(np.array([[samples[0, 0]]], np.float32), 1.0)
+
+    def reset(self) -> None:
+        self.heard.append(None)
+
+
+class Listening(Scripted):
+    """An estimator that hears every frame."""
+
+    def __init__(self, refused: str | None = None) -> None:
+        super().__init__()
+        self.heard: list[tuple[int, bool] | None] = []
+        self.sums: list[tuple[float, float]] = []
+        self.refused = refused
+
+    def listener(self, array: str, sample_rate_hz: float) -> Any:
+        assert (array, sample_rate_hz) == ("north", RATE_HZ)
+        return Ear(self.heard)
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        onsets = sounds["north"].onsets
+        assert onsets is not None
+        self.sums.append((float(onsets.lags.sum()), onsets.weight))
+        return replace(super().locate(sounds), refused=self.refused)
+
+
+def numbered(raster: int, active: bool) -> Frame:
+    return frame("north", raster, active, 1e-2 if active else 1e-7, samples=np.full((4, 20), raster, np.float32))
+
+
+def test_a_listener_hears_each_frame_of_an_event_once_and_in_order() -> None:
+    estimator = Listening()
+    arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 15)) for k in range(4, 40) if k != 13]
+    events = events_of(play(fusion_of(estimator, updates=True), arrivals, 60))
+    before = [(k, True) for k in range(4, 12)]  # 0.4 s of pre-roll
+    after = [(k, True) for k in range(15, 21)]
+    assert estimator.heard == [*before, (12, False), None, (14, False), *after]
+    assert len(events) == 1
+    assert estimator.sums[-1] == (sum(range(4, 13)) + 14, 10.0)  # up to the last active one
+
+
+def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
+    on_time, late = Listening(), Listening()
+    arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
+    events_of(play(fusion_of(on_time), arrivals, 60))
+    held = [(21.0 if frame.raster == START + 13 else when, frame) for when, frame in arrivals]
+    (event,) = (event for _, event in events_of(play(fusion_of(late), held, 60)))
+    assert event.late_frames == 1
+    assert late.sums == on_time.sums
+    assert None in late.heard  # it had been missing at first
+    assert None not in on_time.heard
+
+
+@pytest.mark.parametrize("refused", [None, "too unsure"])
+def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None) -> None:
+    estimator = Scripted()
+    place = estimator.locate
+    estimator.locate = lambda sounds: replace(place(sounds), refused=refused)  # type: ignore[method-assign]
+    arrivals = node("north", range(12, 30), range(60)) + node("south", range(12, 30), range(60))
+    said = [output for _, output in play(fusion_of(estimator, updates=True), arrivals, 70)]
+    (event,) = (output for output in said if isinstance(output, Event))
+    expected = Status.LOCATED if refused is None else Status.REFUSED
+    assert (event.status, event.reason, event.estimate is None) == (expected, refused, refused is not None)
+    assert {output.status for output in said if isinstance(output, Update)} == {expected}
+    assert any(isinstance(output, Track) for output in said) == (refused is None)
+
+
+def test_microphone_that_dies_amid_sound_is_found_too() -> None:
+    """While there is sound no mark comes; a frame's samples tell the same."""
+    fusion = fusion_of()
+    samples = np.full((4, 20), 0.1, np.float32)
+    samples[2] = 0.0
+    arrivals: Arrivals = [(k + 1.0, frame("north", k, samples=samples.copy())) for k in range(30)]
+    play(fusion, arrivals, 19)
+    assert status_of(fusion, "north", 20).state is ArrayState.HEALTHY
+    play(fusion, arrivals[20:], 30, start=20)
+    status = status_of(fusion, "north", 30)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"

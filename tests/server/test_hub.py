@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from livessl.messages import API_VERSION, JsonObject
-from livessl.server.hub import BACKLOG, LAGGING, Filter, Hub, Subscription
+from livessl.server.hub import BACKLOG, LAGGING, PAST, Filter, Hub, Subscription
 
 
 def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = (), sound: int | None = None) -> JsonObject:
@@ -213,3 +213,35 @@ def test_text_is_made_once_for_all() -> None:
 
     first, second = asyncio.run(texts())
     assert first is second
+
+
+def numbers(subscription: Subscription) -> list[Any]:
+    return [message.get("seq", message) for message in drained(subscription)]
+
+
+def test_client_that_comes_back_gets_what_it_missed_in_order() -> None:
+    hub = Hub(first_seq=100)
+    for k in range(10):
+        hub.publish(update(k) if k % 2 else event(k))
+    back = hub.subscribe(Filter(), since_seq=104)
+    events_only = hub.subscribe(Filter(frozenset({"event"})), since_seq=104)
+    hub.publish(event(11))
+    assert numbers(back) == [105, 106, 107, 108, 109, 110, 111]
+    assert numbers(events_only) == [105, 107, 109, 111]
+    assert numbers(hub.subscribe(Filter(), since_seq=111)) == []
+    assert numbers(hub.subscribe(Filter())) == []
+
+
+def test_client_that_comes_back_is_told_what_is_gone() -> None:
+    hub = Hub(first_seq=100)
+    for k in range(PAST + 50):
+        hub.publish(event(k))
+    gap, *rest = drained(hub.subscribe(Filter(), since_seq=110))
+    assert (gap["kind"], gap["missed"]) == ("gap", 40)
+    assert "after number 110 are gone, up to 150; GET events" in gap["reason"]
+    assert [message["seq"] for message in rest] == list(range(151, 101 + PAST + 50))
+    gap, *rest = drained(hub.subscribe(Filter(), since_seq=7))  # of the server's life before
+    assert (gap["kind"], gap["missed"], len(rest)) == ("gap", None, PAST)
+    (gap,) = drained(hub.subscribe(Filter(), since_seq=10**6))
+    assert gap["missed"] is None
+    assert "number 1000000 has not been told" in gap["reason"]

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from livessl.core.types import FRAME_NS
 from livessl.messages import JsonObject
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 
@@ -228,3 +229,37 @@ def test_quotes_in_a_zone_are_only_quotes() -> None:
     store = filled(3)
     assert ids(store, zone="' OR 1=1 --") == []
     assert store.get("' OR 1=1 --") is None
+
+
+def test_settled_events_take_the_place_of_provisional_ones(tmp_path: Path) -> None:
+    path = tmp_path / "events.db"
+    store = Store(path)
+    assert store.settled("lab") is None
+    for n in range(3):
+        store.add(event(n), START_NS + n * NS, provisional=True)
+    raster = (START_NS + 2 * NS) // FRAME_NS
+    assert [old["id"] for old in store.provisional(raster)] == ["e-0", "e-1"]
+    store.settle("lab", [(event(7), START_NS)], ["e-0"], raster)
+    assert ids(store) == [2, 1, 7]
+    assert store.provisional(raster + 100) == [event(2)]  # e-1 has come to stay
+    store.close()
+    again = Store(path)
+    assert again.settled("lab") == raster
+    assert again.settled("elsewhere") is None
+    assert again.provisional(raster + 100) == [event(2)]
+    again.close()
+
+
+def test_settling_is_all_or_nothing(tmp_path: Path) -> None:
+    store = filled(1, tmp_path / "events.db")
+    large = {**event(6), "note": "x" * 500_000}
+    pages = store._writing.rows("PRAGMA page_count")[0][0]
+    store._writing.rows(f"PRAGMA max_page_count = {pages + 3}")  # the disk is as good as full
+    with pytest.raises(StoreError, match="2 events were not kept: database or disk is full; free space"):
+        store.settle("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000)
+    assert ids(store) == [0]
+    assert store.settled("lab") is None
+    store._writing.rows("PRAGMA max_page_count = 1000000")
+    store.settle("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000)
+    assert ids(store) == [6, 5]
+    store.close()

@@ -53,7 +53,7 @@ def server() -> Iterator[Server]:
     """A server that has just heard the scene, live."""
     with running_server(site_of({"zones.room": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})) as server:
         node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
-        start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
+        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events")
         yield server
@@ -432,10 +432,25 @@ def test_live_begins_with_a_greeting(server: Server) -> None:
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 
+def test_live_goes_on_where_a_client_was(server: Server) -> None:
+    with live(server) as socket:
+        hello, first, second = (json.loads(socket.recv(timeout=5)) for _ in range(3))
+    with live(server, f"?since_seq={first['seq']}") as socket:
+        greeting, following = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert greeting["kind"] == "hello"
+    assert following == second
+    assert hello["last_seq"] > 1_600_000_000_000  # above all numbers of an earlier life
+    with live(server, "?since_seq=5") as socket:
+        _, gap = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+    assert (gap["kind"], gap["missed"]) == ("gap", None)
+
+
 @pytest.mark.parametrize(
     ("query", "said"),
     [
         ("?kinds=events", "kinds: expected some of arrays, event, track, update"),
+        ("?since_seq=-1", "since_seq: expected the seq of a message"),
+        ("?since_seq=x", "since_seq: expected the seq of a message"),
         ("?zone=hall", "zone: none of that name; zones are door, room"),
     ],
 )
@@ -501,7 +516,7 @@ def test_answers_say_where_their_time_went() -> None:
     """One machine, one clock: every stage is positive, and they add up to what the client sees at least."""
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
         node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
-        start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
+        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events")
         told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]

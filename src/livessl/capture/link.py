@@ -1,28 +1,33 @@
-"""A node's link to the server: sends, keeps what is not yet acknowledged, reconnects for ever. It never blocks."""
+"""A node's link to the server: sends, keeps what is not yet settled, reconnects for ever. It never blocks.
+
+Live sound goes first. What was kept while the server was away follows in order of time in the spare bandwidth, a few
+frames ahead of the server's word for them.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, Final
 
 import zmq
 
 from livessl import wire
+from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
-from livessl.core.types import Mark, Message
+from livessl.core.types import Frame, Mark, Message
 from livessl.keys import NodeKeys
 
-SPOOL_BYTES: Final = 64 * 1024 * 1024
-"""Sound kept for a server that is away: half a minute of six arrays. Oldest first out, counted."""
+BACKLOG_FRAMES: Final = 16
+"""Kept frames on their way at a time: what live sound may have to wait behind, a quarter of a second at 3 MB/s."""
 
 HELLO_NS: Final = 1_000_000_000
 """How often a node introduces itself while nobody answers, or while it has nothing else to say."""
 
 SILENT_NS: Final = 2_000_000_000
-"""The server acknowledges at least twice a second; so long without a word means that it is gone."""
+"""The server acknowledges four times a second; so long without a word means that it is gone."""
 
 ANSWER_NS: Final = 10_000_000_000
 """A replay, which somebody waits for, gives up after so long; a node never does."""
@@ -30,19 +35,65 @@ ANSWER_NS: Final = 10_000_000_000
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class _Kept:
-    array: str
-    sequence: int
-    data: bytes
-    is_mark: bool
+class Dealer:
+    """The socket: it connects, and reconnects, by itself.
+
+    Parameters
+    ----------
+    endpoint : str
+        The server's ZeroMQ address.
+    keys : NodeKeys or None
+        Ours and the server's; None where the site uses none.
+    """
+
+    def __init__(self, endpoint: str, keys: NodeKeys | None = None) -> None:
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # what cannot go out now waits in our spool, not in ZeroMQ's
+        self._socket.setsockopt(zmq.SNDHWM, 200)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
+        if keys is not None:
+            self._socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
+            self._socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
+            self._socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
+        self._socket.connect(endpoint)
+
+    def send(self, data: bytes) -> bool:
+        """Whether the message could be handed over."""
+        try:
+            self._socket.send(data, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def receive(self) -> bytes | None:
+        """The next message; None where there is none."""
+        try:
+            return self._socket.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+
+    def wait(self, milliseconds: int) -> None:
+        """Until there is a message, at most."""
+        self._socket.poll(milliseconds)
+
+    def close(self, linger_ms: int) -> None:
+        """End the connection, once; what was handed over has so long to go out."""
+        if self._socket.closed:
+            return
+        self._socket.setsockopt(zmq.LINGER, linger_ms)
+        self._socket.close()
+        self._context.term()
 
 
 class Link:
-    """DEALER socket, sequence numbers, spool.
+    """Greetings, order, acknowledgements.
 
-    Frames stay in the spool until the server has acknowledged them; after an interruption they are sent again. Marks
-    say how things are now, so only the newest of an array waits for the server to come back.
+    Frames stay in the spool until the server needs them no more; what it has not got is sent again after an
+    interruption. Marks say how things are now, so only the newest of an array waits for the server to come back.
 
     Parameters
     ----------
@@ -53,33 +104,42 @@ class Link:
     clock : Clock
     keys : NodeKeys or None
         Ours and the server's; None where the site uses none.
+    spool : Spool or None
+        Where frames are kept; None keeps them in memory. It is closed with the link.
+    dealer : Dealer or None
+        The connection, instead of one of its own.
     """
 
-    def __init__(self, endpoint: str, hello: wire.Hello, clock: Clock, keys: NodeKeys | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        hello: wire.Hello,
+        clock: Clock,
+        keys: NodeKeys | None = None,
+        *,
+        spool: Spool | None = None,
+        dealer: Dealer | None = None,
+    ) -> None:
         self.endpoint = endpoint
-        self._hello = hello
         self._clock = clock
+        self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # what cannot go out now waits in our spool, not in ZeroMQ's
-        self._socket.setsockopt(zmq.SNDHWM, 200)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
-        self._hint = ""
-        if keys is not None:
-            self._hint = " And are the keys right: is this node's enrolled there, is server.public the server's?"
-            self._socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
-            self._socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
-            self._socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
-        self._socket.connect(endpoint)
-        self._unsent: deque[_Kept] = deque()
-        self._unacknowledged: deque[_Kept] = deque()
-        self._bytes = 0
+        self._dealer = Dealer(endpoint, keys) if dealer is None else dealer
+        self._hint = (
+            ""
+            if keys is None
+            else " And are the keys right: is this node's enrolled there, is server.public the server's?"
+        )
+        self._marks: dict[str, Mark] = {}  # while the server is away
+        self._live: deque[Kept | Mark] = deque()
+        self._backlog = deque(self._spool.frames())
+        self._hello = replace(hello, backlog=_spans(self._backlog))
+        self._backlog_sent: deque[Kept] = deque()
+        self._live_sent: deque[Kept] = deque()
+        self._received: dict[str, int] = {}
+        self._backlog_ns = 0
         self._heard_ns = self._hello_ns = self._sent_ns = -SILENT_NS
-        self._greeted = self._missed = False
+        self._greeted = self._missed = self._owes_hello = False
         self._complaint: str | None = None
         self.dropped = 0
 
@@ -95,8 +155,14 @@ class Link:
 
     @property
     def pending(self) -> int:
-        """Messages not yet acknowledged."""
-        return len(self._unsent) + len(self._unacknowledged)
+        """Messages that the server has not got yet."""
+        sent = len(self._live_sent) + len(self._backlog_sent)
+        return len(self._live) + len(self._marks) + len(self._backlog) + sent
+
+    @property
+    def kept(self) -> int:
+        """Frames that the server may still need, whether or not it has got them."""
+        return len(self._spool)
 
     def tell(self, problem: str | None) -> None:
         """Let the server know what is wrong with the device, or that nothing is any more."""
@@ -107,15 +173,12 @@ class Link:
     def send(self, messages: Iterable[Message]) -> None:
         """Queue messages and move what can be moved."""
         for message in messages:
-            kept = _Kept(message.array, message.sequence, wire.encode(message), isinstance(message, Mark))
-            if kept.is_mark and not self.connected:
-                self._forget_mark(message.array)
-            self._unsent.append(kept)
-            self._bytes += len(kept.data)
-        while self._bytes > SPOOL_BYTES:
-            oldest = (self._unacknowledged or self._unsent).popleft()
-            self._bytes -= len(oldest.data)
-            self.dropped += 1
+            if isinstance(message, Frame):
+                self._keep(message)
+            elif self._greeted:
+                self._live.append(message)
+            else:
+                self._marks[message.array] = message
         self.service()
 
     def service(self) -> None:
@@ -136,17 +199,48 @@ class Link:
             if now_ns - self._hello_ns >= HELLO_NS:
                 self._say_hello()
             return
-        if not self._unsent and now_ns - self._sent_ns >= HELLO_NS:
+        if self._owes_hello or (not self._live and now_ns - self._sent_ns >= HELLO_NS):
             self._say_hello()  # no sound for a while, but we are there
-        while self._unsent:
-            kept = self._unsent[0]
-            if not self._try_send(kept.data):
+        if not self._owes_hello:
+            self._send_waiting(now_ns)
+
+    def _keep(self, frame: Frame) -> None:
+        kept, gone = self._spool.append(frame)
+        (self._live if self._greeted else self._backlog).append(kept)
+        self._marks.pop(frame.array, None)  # a mark before it says how things were
+        if gone:
+            self._give_up(gone)
+
+    def _give_up(self, gone: Sequence[Kept]) -> None:
+        """Count what had to go before the server got it; it must not be sent any more."""
+        lost = [kept for kept in gone if not self._is_received(kept)]
+        queues: Sequence[deque[Any]] = (self._backlog, self._live, self._backlog_sent, self._live_sent)
+        for kept in lost:
+            for queue in queues:
+                if kept in queue:
+                    queue.remove(kept)
+        if lost and not self.dropped:
+            _log.warning("the spool is full, and the oldest sound goes; see to the server, or raise spool.max_mb")
+        self.dropped += len(lost)
+
+    def _send_waiting(self, now_ns: int) -> None:
+        while self._live:
+            first = self._live[0]
+            if not self._try_send(self._data(first)):
                 return
-            self._unsent.popleft()
-            if kept.is_mark:
-                self._bytes -= len(kept.data)
-            else:
-                self._unacknowledged.append(kept)
+            self._live.popleft()
+            if isinstance(first, Kept):
+                self._live_sent.append(first)
+        if self._backlog_sent and now_ns - self._backlog_ns >= SILENT_NS:
+            self._backlog_sent.clear()  # the server has them, or does not want them
+        while self._backlog and len(self._backlog_sent) < BACKLOG_FRAMES:
+            if not self._try_send(self._data(self._backlog[0])):
+                return
+            self._backlog_sent.append(self._backlog.popleft())
+            self._backlog_ns = now_ns
+        if self._hello.backlog and not self._backlog:
+            self._hello = replace(self._hello, backlog={})
+            self._say_hello()
 
     def wait_connected(self, stop: Callable[[], bool]) -> None:
         """Return when the server has answered, one way or the other, on `stop`, or after `ANSWER_NS`."""
@@ -154,21 +248,16 @@ class Link:
             if self._clock.monotonic_ns() - self._begun_ns > ANSWER_NS:
                 return
             self.service()
-            self._socket.poll(20)
+            self._dealer.wait(20)
 
     def close(self, *, bye: bool) -> None:
         """End the connection; with `bye` the server knows that it is on purpose."""
-        if bye and self._try_send(wire.encode(wire.Bye(self._hello.node, self._hello.run_id))):
-            self._socket.setsockopt(zmq.LINGER, 500)
-        self._socket.close()
-        self._context.term()
+        said = bye and self._try_send(wire.encode(wire.Bye(self._hello.node, self._hello.run_id)))
+        self._dealer.close(500 if said else 0)
+        self._spool.close()
 
     def _receive(self) -> None:
-        while True:
-            try:
-                data = self._socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                return
+        while (data := self._dealer.receive()) is not None:
             try:
                 message = wire.decode(data)
             except wire.WireError as error:
@@ -191,37 +280,67 @@ class Link:
             return
         self._heard_ns = self._clock.monotonic_ns()
         self._complaint = None
+        self._received = ack.received
+        for array, received in ack.received.items():
+            if ack.settled is not None:
+                self._spool.forget(array, min(ack.settled, received + 1))
+        self._live_sent = deque(kept for kept in self._live_sent if not self._is_received(kept))
+        self._backlog_sent = deque(kept for kept in self._backlog_sent if not self._is_received(kept))
         if not self._greeted:
             _log.info("connected to the server at %s", self.endpoint)
-        self._greeted = True
-        while self._unacknowledged:
-            kept = self._unacknowledged[0]
-            if kept.sequence > ack.sequences.get(kept.array, 0):
-                break
-            self._unacknowledged.popleft()
-            self._bytes -= len(kept.data)
+            self._greeted = True
+            self._line_up()
+
+    def _is_received(self, kept: Kept) -> bool:
+        return kept.array in self._received and kept.raster <= self._received[kept.array]
+
+    def _line_up(self) -> None:
+        """Everything that the server has not got follows in order of time; what is cut from now on is live."""
+        frames = [kept for kept in self._spool.frames() if kept.array in self._hello.arrays]
+        self._backlog = deque(kept for kept in frames if not self._is_received(kept))
+        self._hello = replace(self._hello, backlog=_spans(self._backlog))
+        self._live.extend(self._marks.values())
+        self._marks.clear()
+        self._say_hello()
 
     def _lose(self) -> None:
-        """The server may not have what it did not acknowledge: line it up again."""
+        """The server may not have got what it has not acknowledged: it is lined up again when it answers."""
         self._greeted = False
-        self._unsent.extendleft(reversed(self._unacknowledged))
-        self._unacknowledged.clear()
+        self._received = {}
+        self._marks.update({message.array: message for message in self._live if isinstance(message, Mark)})
+        for queue in (self._live, self._live_sent, self._backlog_sent):
+            queue.clear()
+        self._backlog = deque(self._spool.frames())
+        self._hello = replace(self._hello, backlog=_spans(self._backlog))  # the next server may be another
 
     def _say_hello(self) -> None:
-        if self._try_send(wire.encode(self._hello)):
+        self._owes_hello = not self._try_send(wire.encode(self._hello))
+        if not self._owes_hello:
             self._hello_ns = self._clock.monotonic_ns()
 
-    def _forget_mark(self, array: str) -> None:
-        for index, kept in enumerate(self._unsent):
-            if kept.is_mark and kept.array == array:
-                self._bytes -= len(kept.data)
-                del self._unsent[index]
-                return
-
-    def _try_send(self, data: bytes) -> bool:
+    def _data(self, message: Kept | Mark) -> bytes | None:
+        if isinstance(message, Mark):
+            return wire.encode(replace(message, lost_frames=message.lost_frames + self.dropped))
         try:
-            self._socket.send(wire.stamped(data, self._clock.now_ns()), zmq.NOBLOCK)
-        except zmq.Again:
+            return self._spool.read(message)
+        except SpoolError as error:
+            _log.error("%s", error)
+            self.dropped += 1
+            return None
+
+    def _try_send(self, data: bytes | None) -> bool:
+        """Whether it is on its way, or there is nothing to send."""
+        if data is None:
+            return True
+        if not self._dealer.send(wire.stamped(data, self._clock.now_ns())):
             return False
         self._sent_ns = self._clock.monotonic_ns()
         return True
+
+
+def _spans(frames: Iterable[Kept]) -> dict[str, tuple[int, int]]:
+    """Of each array the raster interval of its first frame, and that after its last."""
+    spans: dict[str, tuple[int, int]] = {}
+    for kept in frames:
+        spans[kept.array] = (spans.get(kept.array, (kept.raster, 0))[0], kept.raster + 1)
+    return spans

@@ -11,6 +11,7 @@ from livessl.capture.devices import Device, Placed
 from livessl.capture.line import Line, played_messages
 from livessl.capture.link import Link
 from livessl.capture.recorded import Part, lines_of
+from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
 from livessl.errors import RunError
@@ -39,7 +40,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
     """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
     config: NodeConfig = site.nodes[name]
     line = Line(site, config.arrays, device.sample_rate_hz)
-    link = _link(site, name, config.server, [line], clock, run_id)
+    link = _link(site, name, config.server, [line], clock, run_id, _spool(site, name))
     problem = None
     try:
         with device:
@@ -74,7 +75,7 @@ def capture_recordings(
         Where the server has not acknowledged everything.
     """
     lines, placed = lines_of(site, parts)
-    link = _link(site, name, site.nodes[name].server, lines, clock, run_id)
+    link = _link(site, name, site.nodes[name].server, lines, clock, run_id, _spool(site, name))
     for end_ns in _sent(link, lines, placed, clock, stop):
         if progress is not None:
             progress(end_ns)
@@ -101,7 +102,7 @@ def send_session(
         Where the server refuses it, or has not acknowledged everything.
     """
     lines, placed = lines_of(site, parts)
-    link = _link(site, "replay", endpoint, lines, clock, run_id, replay=True)
+    link = _link(site, "replay", endpoint, lines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
@@ -114,11 +115,28 @@ def send_session(
     _finish(link, clock, stop)
 
 
+def _spool(site: Site, name: str) -> Spool:
+    spool = site.nodes[name].spool
+    directory = None if spool.directory is None else site.file(spool.directory) / name
+    kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s)
+    if len(kept):
+        _log.info("the spool holds %d frames of an earlier run; they are sent again", len(kept))
+    return kept
+
+
 def _link(
-    site: Site, name: str, endpoint: str, lines: Sequence[Line], clock: Clock, run_id: str, *, replay: bool = False
+    site: Site,
+    name: str,
+    endpoint: str,
+    lines: Sequence[Line],
+    clock: Clock,
+    run_id: str,
+    spool: Spool,
+    *,
+    replay: bool = False,
 ) -> Link:
     rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, node_keys(site, name))
+    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, node_keys(site, name), spool=spool)
 
 
 def _sent(link: Link, lines: Sequence[Line], placed: Sequence[Placed], pace: Clock, stop: Stop) -> Iterator[int]:

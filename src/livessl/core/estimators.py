@@ -8,14 +8,16 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from livessl.core import peaks
+from livessl.core import certainty, peaks
+from livessl.core.certainty import Signs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
-from livessl.core.gcc import GCCPhat, microphone_pairs, uses_envelope
+from livessl.core.gcc import GCCPhat, LagSampling, microphone_pairs, require_band, uses_envelope
 from livessl.core.geometry import Grid
+from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.search import PeakSearch
 from livessl.core.srp import SRPFunctional, SRPMapper
 from livessl.core.steering import alias_free_hz
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +26,8 @@ class Sound:
 
     segments: tuple[Float32Array, ...]
     sample_rate_hz: float
+    onsets: OnsetGCC | None = None
+    """What the estimator's listener made of its frames and those around them, where there is one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,10 @@ class Localization:
     confidence: float
     evidence: tuple[HeardBy, ...]
     proven: bool = True
+    signs: Signs | None = None
+    """What the confidence was worked out from, where it is a probability."""
+    refused: str | None = None
+    """Why it should not be relied on, where it should not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +74,10 @@ class Estimator(Protocol):
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out what an array at a sampling rate needs; `locate` does it otherwise."""
+        ...
+
+    def listener(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:
+        """Make what is to hear every frame of an array, in order; None where segments are all that is asked for."""
         ...
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -113,6 +125,10 @@ class SrpPhat:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
         self._correlator(array, sample_rate_hz)
+
+    def listener(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:  # noqa: ARG002 - an Estimator
+        """None: segments are all it needs."""
+        return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Find the highest places of the arrays' summed maps, refine them below the grid, take the best."""
@@ -211,6 +227,69 @@ class Averaged(SrpPhat):
     front_end: FrontEnd = staticmethod(averaged)
 
 
+class Onset(SrpPhat):
+    """The default: the directions of onsets, noise and reverberation taken for what they are (`livessl.core.onset`).
+
+    It is SRP-PHAT of another correlation. Places are searched for on nodes `SEARCH_SPACING_M` apart or nearer, whatever
+    the grid of the maps, and refined below that, so that the answer does not depend on the grid. It tells how
+    sure it is by probability, and refuses what is too unsure (`livessl.core.certainty`).
+
+    Parameters
+    ----------
+    arrays : sequence of ArraySpec
+    grid : Grid
+    c_m_s : float
+    """
+
+    name = "onset"
+
+    def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
+        super().__init__(arrays, Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M)), c_m_s, band_limit=False)
+        self._samplings: dict[str, tuple[float, LagSampling]] = {}
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Work out an array's tables for a sampling rate."""
+        self._sampling(array, sample_rate_hz)
+
+    def listener(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd:
+        """The onset front end of an array."""
+        return OnsetFrontEnd(self._arrays[array], sample_rate_hz, self._sampling(array, sample_rate_hz))
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        """Find the highest place of the summed maps, refine it, and judge it."""
+        evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
+        find = self._search.among(evidence)
+        found = find(_STARTS)
+        functional = SRPFunctional(evidence, self._c_m_s)
+        starts_m = np.stack([self._grid.node_m(peak.node) for peak in found])
+        position, power = peaks.refine(functional, starts_m, self._grid)
+        rivals = find(1, without=[certainty.neighbourhood(position, self._grid)])
+        rival_power = rivals[0].power if rivals else 0.0
+        judged = certainty.judge(functional, evidence, position, power, rival_power, self._grid)
+        confidence, proven = judged.signs.confidence, found[0].proven
+        return Localization(position, judged.covariance_m2, confidence, evidence, proven, judged.signs, judged.refused)
+
+    def _heard(self, array: str, sound: Sound) -> HeardBy:
+        onsets = sound.onsets
+        if onsets is None:
+            onsets = self.listener(array, sound.sample_rate_hz).listen(sound.segments)
+        sampling = self._sampling(array, sound.sample_rate_hz)
+        values = sampling.fine(onsets.lags / np.float32(max(onsets.weight, 1.0)))
+        spec = self._arrays[array]
+        return HeardBy(spec, GCC(microphone_pairs(len(spec.microphones_m)), sampling.fine_lags_s, values))
+
+    def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
+        known = self._samplings.get(array)
+        if known is not None and known[0] == sample_rate_hz:
+            return known[1]
+        spec = self._arrays[array]
+        require_band(spec, sample_rate_hz)
+        sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
+        self._samplings[array] = (sample_rate_hz, sampling)
+        self._search.prepare(array, sampling.fine_lags_s)
+        return sampling
+
+
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
     """Cut-offs in steps of a third of an octave from a band's upper edge down, as far as some band is left."""
     low, high = band_hz
@@ -218,6 +297,11 @@ def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
     return tuple(float(cut_off) for cut_off in high * 2.0 ** (-steps / 3.0))
 
 
+SEARCH_SPACING_M: Final = 0.1
+"""6 kHz turns a 0.5 m array's phases by less than half a period over so far, nearly everywhere: no peak is missed."""
+
+_STARTS: Final = 3
+"""Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
 MAP_SPACING_M: Final = 0.1
 """Maps are not drawn finer than this: a screen shows no more of a room."""
 
@@ -230,6 +314,6 @@ _NODES_ASKED: Final = 4096
 _LEAST_CUT_OFF_HZ: Final = 100.0
 
 ESTIMATORS: Final[dict[str, Callable[[Sequence[ArraySpec], Grid, float], Estimator]]] = {
-    each.name: each for each in (SrpPhat, Cepstral, Averaged)
+    each.name: each for each in (Onset, SrpPhat, Cepstral, Averaged)
 }
 """Name in the site file and on the command line, and what makes it."""

@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import reduce
+from operator import add
 from typing import Final
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy as np
 from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
+from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
@@ -37,8 +40,8 @@ from livessl.core.types import (
     Window,
 )
 
-LOST_NS: Final = 2_000_000_000
-"""An array not heard from for so long is lost; marks come every 50 ms."""
+LOST_NS: Final = 1_500_000_000
+"""An array not heard from for so long is lost: marks come every 50 ms, and everyone shall know within 2 s."""
 
 TROUBLE_NS: Final = 10_000_000_000
 """How long a fault keeps an array degraded after it was last seen."""
@@ -68,6 +71,7 @@ class ArrayState(StrEnum):
 
     STARTING = "starting"
     HEALTHY = "healthy"
+    QUIET = "quiet"
     DEGRADED = "degraded"
     LOST = "lost"
 
@@ -133,16 +137,26 @@ class _Stream:
     power: float | None = None
     active: bool = False
     rate_hz: float | None = None
-    silent_since_ns: int | None = None
+    dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
+    dead_since_ns: int = 0
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
+    listener: OnsetFrontEnd | None = None
+    onsets: dict[int, OnsetGCC] = field(default_factory=dict)
     counters: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
     )
 
     def worry(self, now_ns: int, what: str) -> None:
         self.trouble_ns, self.trouble = now_ns, what
+
+    def find_dead(self, now_ns: int, alive: Iterable[bool]) -> None:
+        """Take note of the channels that had anything but zeros."""
+        dead = tuple(k for k, lives in enumerate(alive, start=1) if not lives)
+        if dead and not self.dead:
+            self.dead_since_ns = now_ns
+        self.dead = dead
 
     def has_active(self, raster: int) -> bool:
         frame = self.frames.get(raster)
@@ -162,6 +176,29 @@ class _Stream:
             there.append(raster)
         return pieces, there
 
+    def listen(self, rasters: Iterable[int], estimator: Estimator) -> None:
+        """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
+        for raster in rasters:
+            frame = self.frames.get(raster)
+            if frame is None:
+                if self.listener is not None:
+                    self.listener.reset()
+                continue
+            if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
+                self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
+            if self.listener is not None:
+                self.onsets[raster] = self.listener.push(frame.samples, quiet=not frame.active)
+
+    def forget(self) -> None:
+        """Forget what was listened to."""
+        self.listener = None
+        self.onsets.clear()
+
+    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
+        """All that was listened to at `rasters` together; None for nothing."""
+        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
+        return reduce(add, heard) if heard else None
+
 
 @dataclass(slots=True)
 class _OpenEvent:
@@ -169,6 +206,7 @@ class _OpenEvent:
     last_active: int
     closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
+    ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
 
 
 class Fusion:
@@ -183,6 +221,9 @@ class Fusion:
     parameters : FusionParameters
     updates : bool
         Whether to localize windows while a sound lasts; offline nobody looks at them.
+    newest_only : bool
+        Whether, of several windows that are due at once, the newest alone is localized: what is live must not fall
+        further behind. `updates_left_out` counts the others.
     """
 
     def __init__(
@@ -193,11 +234,13 @@ class Fusion:
         parameters: FusionParameters | None = None,
         *,
         updates: bool = True,
+        newest_only: bool = False,
     ) -> None:
         self._site = site
         self._estimator = estimator
         self._parameters = parameters or FusionParameters()
         self._updates = updates
+        self._newest_only = newest_only
         self._streams = {spec.name: _Stream(spec) for spec in arrays}
         self._tracker = Tracker()
         self._next: int | None = None
@@ -205,7 +248,46 @@ class Fusion:
         self._event: _OpenEvent | None = None
         self._heard_until = -(2**63)
         self._now_ns = 0
+        self._told_until = self._closing_until = -(2**63)
+        self._due: int | None = None
+        self.updates_left_out = 0
         self.unknown_arrays = 0
+
+    def twin(self) -> Fusion:
+        """Another of the same site around the same estimator, at its beginning, that makes events only."""
+        specs = [stream.spec for stream in self._streams.values()]
+        return Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+
+    def begin(self, raster: int) -> None:
+        """Take it that everything before this raster interval has been told."""
+        self._heard_until = raster
+
+    def leave_out(self, told: int, closing: int) -> None:
+        """Tell no event that another fusion tells: of sound before `told`, or that comes to its end by `closing`."""
+        self._told_until, self._closing_until = told, closing
+
+    @property
+    def closed(self) -> int | None:
+        """The last raster interval that was closed; None before the first."""
+        return None if self._next is None else self._next - 1
+
+    @property
+    def hears(self) -> bool:
+        """Whether a sound goes on."""
+        return self._event is not None
+
+    @property
+    def needed_from(self) -> int | None:
+        """Before this raster interval no frame will be looked at again; None at the beginning."""
+        if self._next is None:
+            return None
+        begin = self._next if self._event is None else self._event.start
+        return max(self._heard_until, begin - round(self._parameters.pre_roll_s / FRAME_S))
+
+    @property
+    def parameters(self) -> FusionParameters:
+        """How arrays are joined."""
+        return self._parameters
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
@@ -299,6 +381,7 @@ class Fusion:
         stream.counters["frames"] += 1
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
+            stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -313,6 +396,9 @@ class Fusion:
             outputs += self._close(self._next)
             self._next += 1
             self._prune()
+        due, self._due = self._due, None
+        if due is not None and self._event is not None:
+            outputs += self._update(self._event, due)
         return outputs
 
     def _may_close(self, raster: int) -> bool:
@@ -341,22 +427,46 @@ class Fusion:
     def _close(self, raster: int) -> list[Output]:
         active = any(stream.has_active(raster) for stream in self._streams.values())
         if active and self._event is None:
-            self._event = _OpenEvent(raster, raster, raster)
+            self._event = self._open(raster)
         event = self._event
         if event is None:
             return []
         event.closed = raster
+        for stream in self._streams.values():
+            stream.listen([raster], self._estimator)
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
+            event.ended = True
             return self._finish()
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
-            outputs += self._update(event, raster)
+            if self._newest_only:
+                self.updates_left_out += self._due is not None
+                self._due = raster
+            else:
+                outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
+            event.ended = True
             outputs += self._finish()
         return outputs
+
+    def _open(self, raster: int) -> _OpenEvent:
+        """Begin an event, and listen to its pre-roll afresh, so that it is the same whatever came before.
+
+        Where a sound goes on that was cut for its length, the listeners go on, too.
+        """
+        span = range(self._span_start(raster), raster)
+        if raster != self._heard_until:
+            for stream in self._streams.values():
+                stream.forget()
+                stream.listen(span, self._estimator)
+        return _OpenEvent(raster, raster, raster)
+
+    def _span_start(self, start: int) -> int:
+        """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
+        return max(start - round(self._parameters.pre_roll_s / FRAME_S), self._heard_until)
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
@@ -366,41 +476,51 @@ class Fusion:
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
                 sounds.pieces[name] = pieces
+                sounds.onsets[name] = stream.onsets_at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
         found = self._estimator.locate(sounds)
         middle_ns = (window.start + window.stop) * FRAME_NS // 2
         estimate = _estimate(found, middle_ns, sounds)
-        status, _ = self._judge(estimate)
+        status, _ = self._judge(estimate, found.refused)
         loudest = max(float(power.max()) for power in powers.values())
         contributions = self._contributions(powers, estimate)
         complete_ns = window.stop * FRAME_NS
         update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
-        tracks: list[Track] = self._tracker.step(middle_ns, [estimate])
+        trusted = [] if status is Status.REFUSED else [estimate]
+        tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None
         assert event is not None
         parameters = self._parameters
-        pre_roll = round(parameters.pre_roll_s / FRAME_S)
-        span = range(max(event.start - pre_roll, self._heard_until), event.closed + 1)
+        span = range(self._span_start(event.start), event.closed + 1)
         sounds = _Sounds()
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
+        if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
+            return []
         first, last = event.last_active, event.start
         for name, stream in self._streams.items():
-            if not any(stream.has_active(raster) for raster in span):
+            active = [raster for raster in span if stream.has_active(raster)]
+            if not active:
                 continue
-            _, there = stream.segments(span)
+            # beyond its hang-over may lie the run-up to its next sound, which comes when that begins
+            own_end = active[-1] + round(parameters.hang_over_s / FRAME_S) + 1
+            _, there = stream.segments(range(span.start, min(span.stop, own_end)))
             power = np.array([stream.frames[raster].power for raster in there])
             mask = exact_mask(power, parameters.threshold)
             rasters = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
+            if any(raster not in stream.onsets for raster in there):  # some came late
+                stream.forget()
+                stream.listen(span, self._estimator)
             sounds.pieces[name], powers[name] = pieces, power[mask]
+            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
             first, last = min(first, rasters[0]), max(last, rasters[-1])
         if not sounds:
             return []
@@ -409,8 +529,11 @@ class Fusion:
         status = Status.REFUSED
         reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
         if len(sounds) >= parameters.min_arrays:
-            estimate = _estimate(self._estimator.locate(sounds), (start_ns + end_ns) // 2, sounds)
-            status, reason = self._judge(estimate)
+            found = self._estimator.locate(sounds)
+            estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
+            status, reason = self._judge(estimate, found.refused)
+            if status is Status.REFUSED:
+                estimate = None
         return [
             Event(
                 id=self._id(event.start),
@@ -429,14 +552,14 @@ class Fusion:
             )
         ]
 
-    def _judge(self, estimate: Estimate) -> tuple[Status, str | None]:
-        """Whether the estimate is a place, or only a direction, and why."""
+    def _judge(self, estimate: Estimate, refused: str | None) -> tuple[Status, str | None]:
+        """Whether the estimate is a place, only a direction, or neither, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         specs = [self._streams[name].spec for name in estimate.arrays]
         nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return Status.LOCATED, None
+            return (Status.LOCATED, None) if refused is None else (Status.REFUSED, refused)
         who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
         return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
@@ -460,11 +583,12 @@ class _Sounds(Mapping[str, Sound]):
 
     def __init__(self) -> None:
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
+        self.onsets: dict[str, OnsetGCC | None] = {}
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
         segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz)
+        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)
@@ -499,10 +623,7 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
     stream.counters["overflows"], stream.counters["lost_frames"] = mark.overflows, mark.lost_frames
     if stream.watermark is None or mark.raster >= stream.watermark:
         stream.mark, stream.power, stream.active = mark, mark.power, False
-        if min(mark.channel_power, default=1.0) > 0.0:
-            stream.silent_since_ns = None
-        elif stream.silent_since_ns is None:
-            stream.silent_since_ns = now_ns
+        stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
 def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
@@ -540,11 +661,11 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
     if stream.left:
         return ArrayState.LOST, "its node has ended"
     if age_ns >= LOST_NS:
-        silence = f"nothing heard from it for {age_ns / 1e9:.0f} s"
+        silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
         return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
-    if stream.silent_since_ns is not None and now_ns - stream.silent_since_ns >= SILENT_NS and stream.mark:
-        dead = [k + 1 for k, power in enumerate(stream.mark.channel_power) if power == 0.0]
-        which = "all channels are" if len(dead) == len(stream.mark.channel_power) else f"microphone {dead} is"
+    if stream.dead and now_ns - stream.dead_since_ns >= SILENT_NS:
+        every = len(stream.dead) == len(stream.spec.microphones_m)
+        which = "all channels are" if every else f"microphone {list(stream.dead)} is"
         return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
     if troubled:
         return ArrayState.DEGRADED, stream.trouble

@@ -46,6 +46,16 @@ def microphone_pairs(count: int) -> IntArray:
     return np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
 
 
+def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:
+    """Raise ValueError where a sampling rate does not exceed twice the upper edge of an array's band."""
+    high = spec.band_hz[1]
+    if high >= sample_rate_hz / 2:
+        raise ValueError(
+            f"array {spec.name!r}: band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, "
+            f"got {sample_rate_hz:g} Hz; lower the array's band_hz"
+        )
+
+
 class GCCPhat:
     """GCC-PHAT of one array at one sampling rate, with its constants worked out once.
 
@@ -72,12 +82,7 @@ class GCCPhat:
     def __init__(
         self, spec: ArraySpec, sample_rate_hz: float, c_m_s: float, front_end: FrontEnd = whole_segment
     ) -> None:
-        high = spec.band_hz[1]
-        if high >= sample_rate_hz / 2:
-            raise ValueError(
-                f"array {spec.name!r}: band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, "
-                f"got {sample_rate_hz:g} Hz; lower the array's band_hz"
-            )
+        require_band(spec, sample_rate_hz)
         self.pairs = microphone_pairs(len(spec.microphones_m))
         self._band_hz = spec.band_hz
         self._rate_hz = sample_rate_hz
@@ -117,18 +122,28 @@ class CrossSpectra:
     pairs : (P, 2) int64
     sample_rate_hz : float
     band_hz : (float, float)
+    weights : (L, B) float32 or None
+        Of each frame's bins in the band; the correlations are then sums and no means.
     """
 
-    def __init__(self, spectra: Spectra, pairs: IntArray, sample_rate_hz: float, band_hz: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        spectra: Spectra,
+        pairs: IntArray,
+        sample_rate_hz: float,
+        band_hz: tuple[float, float],
+        weights: Float32Array | None = None,
+    ) -> None:
         self.n_fft = spectra.n_fft
         self.sample_rate_hz = sample_rate_hz
         self.low, high = band_bins(spectra.n_fft, sample_rate_hz, band_hz)
         inside = _phase_only(spectra.values[:, :, self.low : high])
         first, second = pairs.T
         self.whitened = np.zeros((len(pairs), high - self.low), dtype=np.complex64)
-        for frame in inside:
-            self.whitened += np.conj(frame)[first] * frame[second]
-        self.share = max(1, high - self.low) * max(1, len(inside))
+        for index, frame in enumerate(inside):
+            conjugate = np.conj(frame) if weights is None else np.conj(frame) * weights[index]
+            self.whitened += conjugate[first] * frame[second]
+        self.share = max(1, high - self.low) * max(1, len(inside)) if weights is None else 1
 
     def bins_below(self, cut_off_hz: float) -> int:
         """How many of the band's bins lie at or below a cut-off."""

@@ -150,7 +150,7 @@ class Mark:
     channel_power : tuple of float
         In-band mean power of each channel, full scale squared; 0 is a dead channel.
     overflows, lost_frames : int
-        Since the node started: blocks that followed a loss of samples; frames thrown away for a gap or a full queue.
+        Since the node started: blocks that followed a loss of samples; frames thrown away for a gap or a full spool.
     drift_ppm : float
         Rate of the device's clock against site time, parts per million; 0 until it is known.
     clock : ClockState
@@ -355,6 +355,8 @@ class Event:
         Frames that came after their window had closed.
     latency_s : float
         From the end of the sound to this answer.
+    late : bool
+        Whether sound took part in it that came after its windows had closed.
     complete_ns : int
         Site time at which all had happened that the answer waits for: the sound, and the quiet that ends it.
     """
@@ -371,6 +373,7 @@ class Event:
     heard_by: tuple[str, ...] = ()
     late_frames: int = 0
     latency_s: float = 0.0
+    late: bool = False
     complete_ns: int = 0
 
     @property

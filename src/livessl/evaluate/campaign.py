@@ -23,6 +23,8 @@ import pyarrow.parquet as pq
 from scipy.signal import butter, sosfilt
 from threadpoolctl import threadpool_limits
 
+from livessl.evaluate.localizer import SCHEMA as LOCALIZER_SCHEMA
+from livessl.evaluate.localizer import LocalizerPosition, LocalizerSettings
 from livessl.evaluate.paper import Settings
 from livessl.evaluate.unit import Clips, Position
 from livessl.simulate.scene import read_sounds
@@ -54,8 +56,19 @@ SCHEMA: Final = pa.schema(
 class Job:
     """What a worker needs: small enough to be sent to each once."""
 
-    settings: Settings
+    settings: Settings | LocalizerSettings
     clips: Clips
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Of the rows that `unit` makes."""
+        return SCHEMA if isinstance(self.settings, Settings) else LOCALIZER_SCHEMA
+
+    def unit(self) -> Position | LocalizerPosition:
+        """What turns the number of a position into its rows."""
+        if isinstance(self.settings, Settings):
+            return Position(self.settings, self.clips)
+        return LocalizerPosition(self.settings, self.clips)
 
     @property
     def digest(self) -> str:
@@ -139,7 +152,7 @@ def run_campaign(
     parts = out / "parts"
     _claim(out, job)
     parts.mkdir(exist_ok=True)
-    _unpack(out / "results.parquet", parts)
+    _unpack(out / "results.parquet", parts, job.schema)
     total = job.settings.positions
     wanted = [number for number in range(total) if not _part(parts, number).exists()]
     finished = total - len(wanted)
@@ -156,7 +169,7 @@ def run_campaign(
                 finished += 1
                 if progress is not None:
                     progress(finished, total)
-    return _joined(out, [_part(parts, number) for number in range(total)])
+    return _joined(out, [_part(parts, number) for number in range(total)], job.schema)
 
 
 def read_costs(out: Path) -> list[Mapping[str, float]]:
@@ -173,7 +186,7 @@ def compute(job: Job, number: int) -> Done:
     with threadpool_limits(limits=1):  # sums in another order would differ in the last bit
         rows = _worker(job).rows(number)
     after = os.times()
-    table = pa.Table.from_pylist(rows, schema=SCHEMA)
+    table = pa.Table.from_pylist(rows, schema=job.schema)
     buffer = BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -181,18 +194,18 @@ def compute(job: Job, number: int) -> Done:
     return Done(number, buffer.getvalue(), cpu_s, peak_mib)
 
 
-_kept: dict[str, Position] = {}
+_kept: dict[str, Position | LocalizerPosition] = {}
 _keeping = threading.Lock()
 _sent: list[Job] = []
 
 
-def _worker(job: Job) -> Position:
+def _worker(job: Job) -> Position | LocalizerPosition:
     """Give what this process has made for a job, or make it: matrices that every position needs."""
     with _keeping:
         key = job.digest
         if key not in _kept:
             _kept.clear()
-            _kept[key] = Position(job.settings, job.clips)
+            _kept[key] = job.unit()
         return _kept[key]
 
 
@@ -252,11 +265,11 @@ def _claim(out: Path, job: Job) -> None:
     _write(path, text.encode())
 
 
-def _unpack(results: Path, parts: Path) -> None:
+def _unpack(results: Path, parts: Path, schema: pa.Schema) -> None:
     """Make the parts that results were joined from, where they are not there."""
     if not results.exists():
         return
-    table = pq.read_table(results, schema=SCHEMA)
+    table = pq.read_table(results, schema=schema)
     numbers, first, counts = np.unique(table.column("position").to_numpy(), return_index=True, return_counts=True)
     for number, start, count in zip(numbers, first, counts, strict=True):
         path = _part(parts, int(number))
@@ -266,11 +279,11 @@ def _unpack(results: Path, parts: Path) -> None:
             _write(path, buffer.getvalue())
 
 
-def _joined(out: Path, parts: list[Path]) -> Path:
+def _joined(out: Path, parts: list[Path], schema: pa.Schema) -> Path:
     path = out / "results.parquet"
     temporary = path.with_suffix(".tmp")
     # one by one: a thousand positions fit no worker's memory as Python objects, and need not
-    tables = [pq.read_table(part, schema=SCHEMA) for part in parts]
+    tables = [pq.read_table(part, schema=schema) for part in parts]
     pq.write_table(pa.concat_tables(tables).unify_dictionaries().combine_chunks(), temporary, compression="zstd")
     temporary.replace(path)
     return path

@@ -12,6 +12,8 @@ from livessl.config import load_site
 from livessl.evaluate.layout import layout_of
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
 
+HALVES: Final = ("development", "test")
+LOCALIZER: Final = "localizer"
 REPORT: Final = "report"
 """Runs nothing: reports campaigns that were run."""
 
@@ -20,8 +22,8 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments to an argparse parser."""
     parser.add_argument(
         "experiment",
-        choices=[*sorted(EXPERIMENTS), REPORT],
-        help=f"{REPORT}: only what --with names, reported together",
+        choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
+        help=f"{LOCALIZER}: onset against srp-phat; {REPORT}: only what --with names, reported together",
     )
     parser.add_argument(
         "--site", type=Path, help="site file with a room and arrays instead of the paper's, for one-array or diversity"
@@ -52,6 +54,7 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
     parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
+    parser.add_argument("--half", choices=HALVES, default="test", help=f"{LOCALIZER}: half of the clips (default test)")
     parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
 
@@ -117,6 +120,8 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
         return write_report(arguments.out, arguments.others)
     if arguments.events is None:
         raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
+    if arguments.experiment == LOCALIZER:
+        return _run_localizer(arguments, jobs, progress)
     for folder in arguments.others:
         require_campaign(folder)  # now, not when hours are over
     settings = settings_of(arguments)
@@ -126,6 +131,27 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
         Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress
     )
     return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
+
+
+def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
+    from livessl.evaluate.campaign import Job, read_clips, run_campaign
+    from livessl.evaluate.localizer import POSITIONS, RT60S_S, SNRS_DB, LocalizerSettings
+    from livessl.evaluate.localizer_report import write_localizer_report
+
+    settings = LocalizerSettings(
+        positions=arguments.positions or POSITIONS,
+        rt60s_s=RT60S_S if arguments.rt is None else reverberation_times_s(arguments.rt),
+        snrs_db=SNRS_DB if arguments.snr is None else (arguments.snr,),
+        seed=arguments.seed,
+        sample_rate_hz=float(arguments.sample_rate),
+        spacing_m=arguments.grid or LocalizerSettings.spacing_m,
+        half=arguments.half,
+    )
+    classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
+    clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
+    job = Job(settings, clips)
+    results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress)
+    return [results, *write_localizer_report(arguments.out)]
 
 
 def reverberation_times_s(text: str) -> tuple[float, ...]:

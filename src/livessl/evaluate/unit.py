@@ -100,7 +100,7 @@ class Position:
         found: list[list[tuple[_Heard, ...]]] = [[] for _ in experiment.systems]
         for name, (clip, sound) in chosen.items():
             for r, rt60_s in enumerate(settings.rt60s_s):
-                wet = _convolved(sound, responses[r])
+                wet = convolved(sound, responses[r])
                 heads.append(
                     {
                         "position": number,
@@ -199,7 +199,7 @@ def t30_s(response: Float32Array, sample_rate_hz: float, band_hz: tuple[float, f
     return float(-60.0 / slope)
 
 
-def _convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
+def convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
     """What each microphone hears: (K, n), of responses (K, m) whose common silence at the end is left out."""
     heard = np.flatnonzero(responses.any(axis=0))
     responses = responses[:, : int(heard[-1]) + 1]

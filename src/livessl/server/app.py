@@ -90,7 +90,7 @@ class Server:
         self._on_event = on_event
         self._clock = clock
         self._retention_days = site.store.retention_days
-        self._hub = Hub()
+        self._hub = Hub(clock.now_ns() // 1_000_000)  # fewer than a message a millisecond: no number comes twice
         self._loop: asyncio.AbstractEventLoop | None = None
         with ExitStack() as undo:  # what is open when a later step fails
             self._http = _listen(http.host, http.port)

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from livessl import wire
-from livessl.clock import Clock, utc_text
+from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site
-from livessl.core.fusion import ArrayStatus
+from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
+from livessl.core.settling import Settled, Settling
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
-from livessl.server.receiver import Joined, Left, Receiver
+from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.refusals import Refusals
 from livessl.server.store import Store, StoreError
 
@@ -32,10 +35,31 @@ STATUS_NS: Final = 500_000_000
 SAY_S: Final = 2.0
 """A start that waits longer for the compiler says so."""
 
+WATCH_NS: Final = 100_000_000
+"""Between two looks whether an array's state has changed; then it is reported at once."""
+
+RETRY_NS: Final = 1_000_000_000
+"""Events that the store did not take are offered to it again this often."""
+
+MAX_UNSAVED: Final = 10_000
+"""Events that wait for the store, about 10 MB; beyond it the oldest are given up, and counted."""
+
 REPLAY_SILENT_NS: Final = 5_000_000_000
 """A replay that sends nothing for so long is over, unless its node still says that it is there."""
 
+_ANSWER: Final = ("time_utc", "duration_s", "position_m", "covariance_m2", "confidence", "arrays", "status")
+"""Where these are the same, an event is no news."""
+
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Unsaved:
+    """Events and their start times, the ids they take the place of, and the raster interval they settle all before."""
+
+    events: Sequence[tuple[JsonObject, int]]
+    replaced: Sequence[str]
+    until: int
 
 
 class Engine:
@@ -72,15 +96,18 @@ class Engine:
         self._replay_now_ns: int | None = None
         self._replay_heard_ns = 0
         self._replaying = False
-        self._status_ns = 0
+        self._status_ns = self._watch_ns = self._retry_ns = 0
+        self._unsaved: deque[_Unsaved] = deque()
         self._failure: BaseException | None = None
         self._started_ns, self._began_ns = clock.now_ns(), clock.monotonic_ns()
         self.events = 0
         self.unkept = 0
+        self.unsaved = 0
+        """Events that wait for the store to take them."""
         self.maps = Maps(clock)
         self.latency = Latency()
         _warm_up()
-        self._begin()
+        self._begin_live()
         self._receiver = Receiver(site, clock)
 
     @property
@@ -107,6 +134,11 @@ class Engine:
     def mode(self) -> str:
         """Live; or replay from a recorded session's first sound on, until a live node comes."""
         return "live" if self._replay_now_ns is None else "replay"
+
+    @property
+    def updates_left_out(self) -> int:
+        """Windows that were not localized, for newer ones were due."""
+        return self._settling.live.updates_left_out
 
     @property
     def malformed(self) -> int:
@@ -143,27 +175,37 @@ class Engine:
 
     def arrays(self) -> list[JsonObject]:
         """How every array is doing; from any thread, and without waiting for a localization that is going on."""
-        return [self._array(status) for status in self._fusion.status(self.now_ns())]
+        return [self._array(status) for status in self._settling.status(self.now_ns())]
 
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
         return list(self._tracks.values())
 
     def _array(self, status: ArrayStatus) -> JsonObject:
-        ingest = self._receiver.ingest
+        ingest, settling = self._receiver.ingest, self._settling
         described = array_status(status, self._site.node_of(status.name))
-        described["counters"]["duplicates"] = ingest.duplicates[status.name]
-        described["counters"]["sequence_gaps"] = ingest.sequence_gaps[status.name]
+        counters: dict[str, int] = described["counters"]
+        counters["duplicates"] = ingest.duplicates[status.name] + settling.duplicates.get(status.name, 0)
+        counters["sequence_gaps"] = ingest.sequence_gaps[status.name]
+        counters["backfilled"] = settling.backfilled.get(status.name, 0)
+        counters["too_late"] = settling.too_late.get(status.name, 0)
         problem = ingest.problem_of(status.name)
         if problem is not None:
             described["reason"] = problem
-            if described["state"] == "healthy":
-                described["state"] = "degraded"
+            if described["state"] == ArrayState.HEALTHY:
+                described["state"] = str(ArrayState.DEGRADED)
+        if described["state"] == ArrayState.LOST and ingest.is_live(status.name, self._clock.monotonic_ns()):
+            described["state"] = str(ArrayState.QUIET)
+            described["reason"] = problem or "its node is there, but no sound comes from its device"
         return described
 
-    def _begin(self) -> None:
+    def _begin_live(self) -> None:
+        arrays = [spec.name for spec in self._site.processed]
+        self._begin(arrays, self._store.settled(self._site.site), live=True)
+
+    def _begin(self, arrays: Iterable[str], settled: int | None, *, live: bool = False) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._fusion = self._site.make_fusion(self._method)
+        self._settling = Settling(self._site.make_fusion(self._method, live=live), arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
 
@@ -179,10 +221,10 @@ class Engine:
     def _turn(self) -> None:
         batch: list[Message] = []
         for item in self._receiver.take(BATCH, WAIT_S):
-            if isinstance(item, Joined | Left):
+            if isinstance(item, Joined | Greeted | Left):
                 self._step(batch)
                 batch = []
-                self._join(item.hello) if isinstance(item, Joined) else self._leave(item.hello)
+                self._meet(item)
             else:
                 batch.append(item)
         self._step(batch)
@@ -194,12 +236,26 @@ class Engine:
                 self._replay_heard_ns = now_ns  # a gap in the recording
             else:
                 self._end_replay()
-        if now_ns - self._status_ns >= STATUS_NS:
-            self._status_ns = now_ns
-            self._tell_arrays()
+        if self._unsaved and now_ns - self._retry_ns >= RETRY_NS:
+            self._save()
+        if now_ns - self._watch_ns >= WATCH_NS:
+            self._watch_ns = now_ns
+            self._watch_arrays(now_ns)
 
-    def _tell_arrays(self) -> None:
+    def _meet(self, item: Joined | Greeted | Left) -> None:
+        if isinstance(item, Left):
+            self._leave(item.hello)
+            return
+        if isinstance(item, Joined):
+            self._join(item.hello)
+        for array in item.hello.arrays:
+            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
+
+    def _watch_arrays(self, now_ns: int) -> None:
         arrays = self.arrays()
+        if now_ns - self._status_ns < STATUS_NS and all(a["state"] == self._states.get(a["name"]) for a in arrays):
+            return
+        self._status_ns = now_ns
         for array in arrays:
             before = self._states.get(array["name"])
             if before not in (None, array["state"]):
@@ -210,12 +266,15 @@ class Engine:
 
     def _join(self, hello: wire.Hello) -> None:
         if hello.replay or self._replay_now_ns is not None:
-            self._begin()
+            if hello.replay:
+                self._begin(hello.arrays, None)
+            else:
+                self._begin_live()
             self._replay_now_ns = 0 if hello.replay else None
             self._replaying = hello.replay
             self._replay_heard_ns = self._clock.monotonic_ns()
         for array, rate_hz in hello.arrays.items():
-            self._fusion.prepare(array, rate_hz)
+            self._settling.live.prepare(array, rate_hz)
 
     def _leave(self, hello: wire.Hello) -> None:
         _log.info("node %r has ended", hello.node)
@@ -223,11 +282,11 @@ class Engine:
             self._end_replay()
             return
         for array in hello.arrays:
-            self._fusion.leave(array)
+            self._settling.leave(array)
 
     def _end_replay(self) -> None:
         """Tell what is still open. Map, arrays and time stay as they were at the end, to be looked at."""
-        self._tell(self._fusion.flush(self.now_ns()))
+        self._tell(self._settling.flush(self.now_ns()))
         ended, self._tracks = list(self._tracks.values()), {}
         for track in ended:
             self._publish({**track, "state": str(TrackState.END)})
@@ -243,27 +302,24 @@ class Engine:
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
-        self._tell(self._fusion.step(batch, self.now_ns()))
+        self._tell(self._settling.step(batch, self.now_ns()))
+        if not self._unsaved:
+            self._receiver.ingest.settled = self._settling.settled
 
-    def _tell(self, outputs: Sequence[Output]) -> None:
+    def _tell(self, outputs: Sequence[Output | Settled]) -> None:
         if self._messages is None:
             return
         for output in outputs:
-            if isinstance(output, Event):
-                event = self._messages.event(output, self._stages(output, "event"))
-                try:
-                    self._store.add(event, output.start_ns)
-                except StoreError as error:  # better to lose the history than the present
-                    self.unkept += 1
-                    _log.error("%s", error)
-                self.events += 1
-                self._publish(event)
+            if isinstance(output, Settled):
+                self._tell_settled(output, self._messages)
+            elif isinstance(output, Event):
+                self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
                 self._publish(self._messages.update(output, self._stages(output, "update")))
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
-                self.maps.show(output, self._fusion.power_maps)
+                self.maps.show(output, self._settling.live.power_maps)
 
     def _stages(self, answer: Update | Event, kind: str) -> Stages | None:
         """Where an answer's time went; a recording's was long ago."""
@@ -273,6 +329,70 @@ class Engine:
         if stages is not None:
             self.latency.located(kind, stages)
         return stages
+
+    def _tell_provisional(self, output: Event, messages: Messages) -> None:
+        """An event that cannot wait for an array that is late or away."""
+        event = messages.event(output, self._stages(output, "event"))
+        try:
+            self._store.add(event, output.start_ns, provisional=True)
+        except StoreError as error:  # it will be settled, and is then kept until the store takes it
+            _log.error("%s", error)
+        self._publish_event(event)
+
+    def _tell_settled(self, settled: Settled, messages: Messages) -> None:
+        """Events that stay: those that are news are told, once they are stored."""
+        before = [] if self._replay_now_ns is not None else self._store.provisional(settled.until)
+        events = []
+        for output in settled.events:
+            stages = None if output.late or before else self._stages(output, "event")
+            events.append((messages.event(output, stages), output.start_ns))
+        if self._replay_now_ns is not None:
+            self._keep_replayed(events)
+            return
+        replaced = {old["id"]: _overlapped(old, [event for event, _ in events]) for old in before}
+        known = {old["id"]: old for old in before}
+        news = []
+        for k, (event, start_ns) in enumerate(events):
+            event["replaces"] = [old for old, by in replaced.items() if by is event and old != event["id"]]
+            same = known.get(event["id"])
+            if same is not None and not event["replaces"] and all(same[key] == event[key] for key in _ANSWER):
+                events[k] = (same, start_ns)
+            else:
+                news.append(event)
+        self._unsaved.append(_Unsaved(events, [old for old, by in replaced.items() if by is not None], settled.until))
+        self._save()
+        for event in news:
+            self._publish_event(event)
+
+    def _keep_replayed(self, events: Sequence[tuple[JsonObject, int]]) -> None:
+        for event, start_ns in events:
+            try:
+                self._store.add(event, start_ns)
+            except StoreError as error:  # better to lose the history than the present
+                self.unkept += 1
+                _log.error("%s", error)
+            self._publish_event(event)
+
+    def _save(self) -> None:
+        """Offer the store what it has not taken yet; until it has, no node forgets the sound of it."""
+        self._retry_ns = self._clock.monotonic_ns()
+        while self._unsaved:
+            first = self._unsaved[0]
+            try:
+                self._store.settle(self._site.site, first.events, first.replaced, first.until)
+            except StoreError as error:
+                _log.error("%s", error)
+                break
+            self._unsaved.popleft()
+        waiting = sum(len(unsaved.events) for unsaved in self._unsaved)
+        while waiting > MAX_UNSAVED:
+            lost = len(self._unsaved.popleft().events)
+            self.unkept, waiting = self.unkept + lost, waiting - lost
+        self.unsaved = waiting
+
+    def _publish_event(self, event: JsonObject) -> None:
+        self.events += 1
+        self._publish(event)
 
     def _keep_track(self, message: JsonObject, track: Track) -> None:
         others = {number: other for number, other in self._tracks.items() if number != track.id}
@@ -288,3 +408,14 @@ def _warm_up() -> None:
         warm_up()
     finally:
         told.cancel()
+
+
+def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:
+    """The event that shares some of its time with an old one."""
+    begin_ns = utc_ns(old["time_utc"])
+    end_ns = begin_ns + old["duration_s"] * 1e9
+    for event in events:
+        start_ns = utc_ns(event["time_utc"])
+        if start_ns < end_ns and begin_ns < start_ns + event["duration_s"] * 1e9:
+            return event
+    return None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
-from collections.abc import Hashable, Mapping
+from collections import OrderedDict, deque
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -16,6 +16,9 @@ of the same sound, track, or of the arrays says again is left out."""
 
 BACKLOG: Final = 256
 """Messages a client may lag by. Beyond it the oldest are dropped, events last, and the client told."""
+
+PAST: Final = 2048
+"""Messages kept for clients that come back: a minute or more of one sound that never ends, about 3 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,7 @@ class Subscription:
     """One client's queue: everything, in order, as long as the client keeps up; then states only as they are now."""
 
     wanted: Filter
+    past: deque[Told] = field(default_factory=deque)
     _waiting: OrderedDict[int, Told] = field(default_factory=OrderedDict)
     _newest: dict[Hashable, int] = field(default_factory=dict)
     _news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -117,14 +121,16 @@ class Subscription:
         return bool(self._waiting)
 
     async def next(self) -> Told:
-        """The next message, waiting for one; first of all how many were missed."""
+        """The next message, waiting for one; first of all the past that was asked for, then how many were missed."""
+        if self.past:
+            return self.past.popleft()
         while not self._waiting:
             self._news.clear()
             await self._news.wait()
         if self._missed:
             missed, self._missed = self._missed, 0
             reason = f"this client reads too slowly; {missed} messages were dropped, events last"
-            return Told({"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason})
+            return _gap(missed, reason)
         seq, told = self._waiting.popitem(last=False)
         self._forget(told, seq)
         return told
@@ -135,11 +141,19 @@ class Subscription:
 
 
 class Hub:
-    """Numbers messages and hands them to every subscriber. All calls on the event loop's thread."""
+    """Numbers messages and hands them to every subscriber. All calls on the event loop's thread.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    first_seq : int
+        The number before the first. A server that starts again begins above all that it told before.
+    """
+
+    def __init__(self, first_seq: int = 0) -> None:
         self._subscriptions: set[Subscription] = set()
-        self.last_seq = 0
+        self._past: deque[Told] = deque(maxlen=PAST)
+        self._first_seq = first_seq
+        self.last_seq = first_seq
         self.superseded = 0
         """Messages that a slow client never got, for a newer one of the same thing or for want of room."""
 
@@ -148,11 +162,26 @@ class Hub:
         """How many subscribe."""
         return len(self._subscriptions)
 
-    def subscribe(self, wanted: Filter) -> Subscription:
-        """Begin to receive; end with `unsubscribe`."""
+    def subscribe(self, wanted: Filter, since_seq: int | None = None) -> Subscription:
+        """Begin to receive, first everything after a number if one is given; end with `unsubscribe`."""
         subscription = Subscription(wanted)
+        if since_seq is not None:
+            subscription.past.extend(self._after(since_seq, wanted))
         self._subscriptions.add(subscription)
         return subscription
+
+    def _after(self, since_seq: int, wanted: Filter) -> Iterator[Told]:
+        """What was told after a number, and before it what is gone, if anything is."""
+        oldest = self.last_seq - len(self._past) + 1
+        if since_seq > self.last_seq:
+            yield _gap(None, f"number {since_seq} has not been told; the last one is {self.last_seq}")
+        elif since_seq < oldest - 1:
+            missed = oldest - 1 - since_seq if since_seq >= self._first_seq else None
+            gone = "" if missed is None else f"{missed} messages "
+            yield _gap(
+                missed, f"{gone}after number {since_seq} are gone, up to {oldest - 1}; GET events has the events"
+            )
+        yield from (t for t in self._past if t.message["seq"] > since_seq and wanted.passes(t.message))
 
     def unsubscribe(self, subscription: Subscription) -> None:
         """Receive no more."""
@@ -162,5 +191,10 @@ class Hub:
         """Number a message and offer it to everyone."""
         self.last_seq += 1
         told = Told({"v": API_VERSION, "seq": self.last_seq, **message}, told_ns)
+        self._past.append(Told(told.message))  # its delay is not that of the way to a client
         for subscription in self._subscriptions:
             self.superseded += subscription.offer(self.last_seq, told)
+
+
+def _gap(missed: int | None, reason: str) -> Told:
+    return Told({"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason})

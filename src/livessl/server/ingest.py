@@ -10,11 +10,17 @@ from livessl import wire
 from livessl.config import Site
 from livessl.core.types import Frame, Message
 
-ACK_NS: Final = 500_000_000
+ACK_NS: Final = 250_000_000
 """Every node hears from us at least this often."""
+
+SOON_NS: Final = 20_000_000
+"""A node that sends what it has kept hears from us this often: it sends a few frames ahead of our word for them."""
 
 GONE_NS: Final = 2_000_000_000
 """A node silent for so long no longer holds its name and its arrays."""
+
+THERE_NS: Final = 1_400_000_000
+"""A node that has nothing else to say greets once a second; a dead one is not there any more when its array is lost."""
 
 NOTICE_NS: Final = 60_000_000_000
 """One notice a minute about senders of rubbish, not one a message."""
@@ -30,15 +36,37 @@ class Peer:
     hello: wire.Hello
     heard_ns: int
     sequences: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
+    live: dict[str, int] = field(default_factory=dict)
+    acked_ns: int = 0
     ended: bool = False
+
+    def is_backlog(self, message: Message) -> bool:
+        """Whether it is older than what the node calls live."""
+        return message.array in self.hello.backlog and message.raster < self.hello.backlog[message.array][1]
+
+    def greet(self, hello: wire.Hello) -> None:
+        """Take in what the node says that it has kept: it has nothing older, and nothing at all where it says none."""
+        for array, (oldest, _) in hello.backlog.items():
+            self.received[array] = max(self.received.get(array, oldest - 1), oldest - 1)
+        for array in self.live.keys() - hello.backlog.keys():
+            self.received[array] = max(self.received.get(array, self.live[array]), self.live[array])
+        self.hello = hello
+
+    def take(self, frame: Frame) -> None:
+        """The frame is here, and with it all before it in the order that it belongs to."""
+        waits = frame.array in self.hello.backlog and not self.is_backlog(frame)
+        known = self.live if waits else self.received
+        known[frame.array] = max(known.get(frame.array, frame.raster), frame.raster)
 
 
 @dataclass(slots=True)
 class Arrival:
-    """What one piece of data brought."""
+    """What one piece of data brought: `joined` with a new run, `greeted` where a known one has kept other frames."""
 
     message: Message | None = None
     joined: wire.Hello | None = None
+    greeted: wire.Hello | None = None
     left: wire.Hello | None = None
     reply: wire.Ack | None = None
 
@@ -55,7 +83,7 @@ class Ingest:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
-        self._acked_ns = 0
+        self.settled: int | None = None
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
         names = [spec.name for spec in site.processed]
@@ -65,6 +93,13 @@ class Ingest:
     def problem_of(self, array: str) -> str | None:
         """What the node says is wrong with the device that an array is on."""
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
+
+    def is_live(self, array: str, now_ns: int) -> bool:
+        """Whether the node that an array is on has said anything in the last moments."""
+        return any(
+            array in peer.hello.arrays and not peer.ended and now_ns - peer.heard_ns < THERE_NS
+            for peer in self._peers.values()
+        )
 
     def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Arrival:
         """Take in one message from one peer; `enrolled` is whose key it has shown, where the site uses keys."""
@@ -76,7 +111,7 @@ class Ingest:
             return self._greet(routing_id, message, now_ns, enrolled)
         peer = self._peers.get(routing_id)
         if peer is None or peer.ended:
-            return Arrival(reply=wire.Ack(run_id="?", sequences={}, who_are_you=True))
+            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))
         peer.heard_ns = now_ns
         if isinstance(message, wire.Bye):
             peer.ended = True
@@ -89,7 +124,7 @@ class Ingest:
                 now_ns,
             )
         rate_hz = peer.hello.arrays[message.array]
-        if isinstance(message, Frame) and message.sample_rate_hz != rate_hz:
+        if isinstance(message, Frame) and message.sample_rate_hz != rate_hz and not peer.is_backlog(message):
             return self._reject(
                 wire.WireError(
                     f"node {peer.hello.node!r} sent {message.sample_rate_hz:g} Hz of array {message.array!r}, "
@@ -97,32 +132,41 @@ class Ingest:
                 ),
                 now_ns,
             )
-        if self._is_duplicate(peer, message):
+        if isinstance(message, Frame) and peer.is_backlog(message):
+            peer.take(message)
+            return Arrival(message=message)
+        missing = self._missing_before(peer, message)
+        if missing is None:
+            self.duplicates[message.array] += 1
             return Arrival()
+        self.sequence_gaps[message.array] += missing
+        if missing:
+            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # it shall send them again
+        if isinstance(message, Frame):
+            peer.take(message)
         return Arrival(message=message)
 
-    def _is_duplicate(self, peer: Peer, message: Message) -> bool:
-        """Whether the frame was here before; counts it, and the frames that are missing before a new message."""
+    def _missing_before(self, peer: Peer, message: Message) -> int | None:
+        """How many frames should have come before a message of live sound; None where it was here before."""
         array, number = message.array, message.sequence
         last = peer.sequences.get(array)
         is_frame = isinstance(message, Frame)
         if is_frame and last is not None and number <= last:
-            self.duplicates[array] += 1
-            return True
-        if last is not None:
-            self.sequence_gaps[array] += max(0, number - last - is_frame)
+            return None
         peer.sequences[array] = number if last is None else max(last, number)
-        return False
+        return 0 if last is None else max(0, number - last - is_frame)
 
-    def acknowledgements(self, now_ns: int) -> list[tuple[bytes, wire.Ack]]:
-        """Replies due by now; also forgets nodes that have been silent for long."""
-        if now_ns - self._acked_ns < ACK_NS:
-            return []
-        self._acked_ns = now_ns
+    def acknowledgements(self, now_ns: int, *, soon: bool = True) -> list[tuple[bytes, wire.Ack]]:
+        """Replies due by now, `soon` also those to nodes that wait for them; forgets nodes that are long silent."""
         self._peers = {
             key: peer for key, peer in self._peers.items() if now_ns - peer.heard_ns < 30 * GONE_NS and not peer.ended
         }
-        return [(peer.routing_id, _ack(peer)) for peer in self._peers.values()]
+        due = []
+        for peer in self._peers.values():
+            if now_ns - peer.acked_ns >= (SOON_NS if soon and peer.hello.backlog else ACK_NS):
+                peer.acked_ns = now_ns
+                due.append((peer.routing_id, self._ack(peer)))
+        return due
 
     def live_nodes(self, now_ns: int) -> list[wire.Hello]:
         """Nodes heard from lately."""
@@ -133,12 +177,23 @@ class Ingest:
         if refusal is not None:
             return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
-        peer = Peer(routing_id, hello, now_ns, same_run.sequences if same_run else {})
+        peer = Peer(routing_id, hello, now_ns)
+        if same_run is not None:
+            moved = same_run.routing_id != routing_id or hello.backlog.keys() - same_run.hello.backlog.keys()
+            peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
+            peer.received, peer.live = same_run.received, same_run.live
+        peer.greet(hello)
         others = {k: other for k, other in self._peers.items() if other.hello.node != hello.node and k != routing_id}
         self._peers = {**others, routing_id: peer}  # replaced, never changed: other threads read it
         if same_run is None:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
-        return Arrival(joined=None if same_run else hello, reply=_ack(peer))
+        reply = self._ack(peer)
+        if same_run is None:
+            return Arrival(joined=hello, reply=reply)
+        return Arrival(greeted=hello if hello.backlog != same_run.hello.backlog else None, reply=reply)
+
+    def _ack(self, peer: Peer) -> wire.Ack:
+        return wire.Ack(peer.hello.run_id, dict(peer.received), self.settled)
 
     def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
         """A key speaks for the node that it was enrolled for, and for the arrays that are that node's."""
@@ -193,7 +248,3 @@ class Ingest:
             self._notice_ns = now_ns
             _log.warning("message refused (%d so far): %s", self.malformed, error)
         return Arrival()
-
-
-def _ack(peer: Peer) -> wire.Ack:
-    return wire.Ack(peer.hello.run_id, dict(peer.sequences))

@@ -28,6 +28,9 @@ POLL_MS: Final = 20
 QUEUE_MESSAGES: Final = 1000
 """Ten seconds of five arrays. When it is full the socket is left alone, and nodes keep their sound themselves."""
 
+BUSY_MESSAGES: Final = 100
+"""While so many wait, nodes are not asked for what they have kept: live sound would wait behind it."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -50,13 +53,20 @@ class Joined:
 
 
 @dataclass(frozen=True, slots=True)
+class Greeted:
+    """A node tells anew what it has kept: more after an interruption, nothing when all of it is sent."""
+
+    hello: wire.Hello
+
+
+@dataclass(frozen=True, slots=True)
 class Left:
     """A node has ended on purpose."""
 
     hello: wire.Hello
 
 
-Item = Message | Joined | Left
+Item = Message | Joined | Greeted | Left
 
 
 class Receiver:
@@ -132,8 +142,7 @@ class Receiver:
             while not self._stop.is_set():
                 if self._socket.poll(POLL_MS):
                     self._drain()
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
-                    self._reply(routing_id, ack)
+                self._acknowledge()
         except BaseException as error:
             self._fail(error)
             _log.exception("the receiving thread has failed")
@@ -153,6 +162,8 @@ class Receiver:
             arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
             if arrival.joined is not None:
                 self._put(Joined(arrival.joined))
+            if arrival.greeted is not None:
+                self._put(Greeted(arrival.greeted))
             if arrival.left is not None:
                 self._put(Left(arrival.left))
             if arrival.message is not None:
@@ -166,10 +177,14 @@ class Receiver:
             try:
                 self._queue.put(item, timeout=0.1)
             except Full:
-                for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns()):
-                    self._reply(routing_id, ack)
+                self._acknowledge()
             else:
                 return
+
+    def _acknowledge(self) -> None:
+        soon = self._queue.qsize() < BUSY_MESSAGES
+        for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
+            self._reply(routing_id, ack)
 
     def _reply(self, routing_id: bytes, ack: wire.Ack) -> None:
         try:

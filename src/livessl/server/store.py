@@ -6,10 +6,13 @@ import json
 import re
 import sqlite3
 import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
 from livessl.messages import JsonObject
 
@@ -84,6 +87,8 @@ class Store:
                     "time_ns INTEGER, confidence REAL, json TEXT)"
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
+                db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
+                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
             if path is not None:
                 self._reading = _Connection(f"{path.resolve().as_uri()}?mode=ro")
         except sqlite3.Error as error:
@@ -91,30 +96,66 @@ class Store:
                 f"server.events_db: cannot use {path}: {error}; name a file in a writable folder"
             ) from error
 
-    def add(self, event: JsonObject, time_ns: int) -> None:
-        """Keep an event; one of the same id is replaced.
+    def add(self, event: JsonObject, time_ns: int, *, provisional: bool = False) -> None:
+        """Keep an event; one of the same id is replaced. A provisional one stays until its time is settled.
 
         Raises
         ------
         StoreError
             Where the file is locked, or its disk is full.
         """
+        with self._kept(f"event {event['id']!r} was") as db:
+            self._insert(db, event, time_ns)
+            if provisional:
+                db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
+
+    def settle(self, site: str, events: Sequence[tuple[JsonObject, int]], replaced: Iterable[str], raster: int) -> None:
+        """Keep events that stay, in place of others; before a raster interval all others stay too. All or nothing.
+
+        Raises
+        ------
+        StoreError
+            Where the file is locked, or its disk is full.
+        """
+        with self._kept(f"{len(events)} events were") as db:
+            db.executemany("DELETE FROM events WHERE id = ?", [(old,) for old in replaced])
+            for event, time_ns in events:
+                self._insert(db, event, time_ns)
+            db.execute(
+                "DELETE FROM provisional WHERE NOT EXISTS (SELECT 1 FROM events WHERE events.id = provisional.id "
+                "AND time_ns >= ?)",
+                (raster * FRAME_NS,),
+            )
+            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, raster))
+
+    def settled(self, site: str) -> int | None:
+        """The raster interval before which all sound of the site has become events that stay."""
+        rows = self._reading.rows("SELECT raster FROM settled WHERE site = ?", (site,))
+        return None if not rows else int(rows[0][0])
+
+    def provisional(self, raster: int) -> list[JsonObject]:
+        """Events before a raster interval that may still be replaced."""
+        sql = "SELECT json FROM events JOIN provisional USING (id) WHERE time_ns < ? ORDER BY time_ns"
+        return [json.loads(text) for (text,) in self._writing.rows(sql, (raster * FRAME_NS,))]
+
+    def _insert(self, db: sqlite3.Connection, event: JsonObject, time_ns: int) -> None:
+        db.execute(
+            "INSERT INTO events (id, time_ns, confidence, json) VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE "
+            "SET time_ns = excluded.time_ns, confidence = excluded.confidence, json = excluded.json",
+            (event["id"], time_ns, event["confidence"], json.dumps(event)),
+        )
+        if self._bounded:
+            db.execute(
+                "DELETE FROM events WHERE number <= (SELECT max(number) FROM events) - ?", (MAX_EVENTS_IN_MEMORY,)
+            )
+
+    @contextmanager
+    def _kept(self, what: str) -> Iterator[sqlite3.Connection]:
         try:
             with self._writing.lock, self._writing.db as db:
-                db.execute(
-                    "INSERT INTO events (id, time_ns, confidence, json) VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE "
-                    "SET time_ns = excluded.time_ns, confidence = excluded.confidence, json = excluded.json",
-                    (event["id"], time_ns, event["confidence"], json.dumps(event)),
-                )
-                if self._bounded:
-                    db.execute(
-                        "DELETE FROM events WHERE number <= (SELECT max(number) FROM events) - ?",
-                        (MAX_EVENTS_IN_MEMORY,),
-                    )
+                yield db
         except sqlite3.Error as error:
-            raise StoreError(
-                f"server.events_db: event {event['id']!r} was not kept: {error}; free space or release the file"
-            ) from error
+            raise StoreError(f"server.events_db: {what} not kept: {error}; free space or release the file") from error
 
     def expire(self, before_ns: int) -> int:
         """Delete what began before a time, so that the file holds nothing of it any more; returns how many.

@@ -161,6 +161,9 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         if engine.unkept:
             reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
             status = "degraded" if status == "ok" else status
+        if engine.unsaved:
+            reasons.append(f"server.events_db: {engine.unsaved} events wait for it; free space or release the file")
+            status = "degraded" if status == "ok" else status
         if engine.failure is not None:
             status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
             response.status_code = 503
@@ -311,16 +314,21 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
 def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub: Hub) -> None:
     @app.websocket("/api/v1/live")
     async def live(
-        socket: WebSocket, kinds: str | None = None, min_confidence: str = "0", zone: str | None = None
+        socket: WebSocket,
+        kinds: str | None = None,
+        min_confidence: str = "0",
+        zone: str | None = None,
+        since_seq: str | None = None,
     ) -> None:
         await socket.accept()  # a reason can only be told to a client that is connected
         try:
             _refuse_strangers(socket)
             wanted = _filter(site, kinds, min_confidence, zone)
+            since = _number("since_seq", since_seq)
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
             return
-        subscription = hub.subscribe(wanted)
+        subscription = hub.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
             "seq": hub.last_seq,
@@ -381,6 +389,12 @@ def _refuse_strangers(socket: WebSocket) -> None:
     origin = socket.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
         raise ValueError("origin: pages of other servers may not listen")
+
+
+def _number(name: str, text: str | None) -> int | None:
+    if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ValueError(f"{name}: expected the seq of a message")
+    return None if text is None else int(text)
 
 
 def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
@@ -458,8 +472,14 @@ class _Metrics(Collector):
         yield CounterMetricFamily(
             "livessl_messages_superseded", "Messages that slow subscribers never got.", self._hub.superseded
         )
+        yield GaugeMetricFamily(
+            "livessl_updates_left_out",
+            "Windows since the server began this live run that gave way to newer ones.",
+            self._engine.updates_left_out,
+        )
         yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
         yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
+        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", self._engine.unsaved)
         yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
         yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
         yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)

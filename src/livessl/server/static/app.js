@@ -366,7 +366,7 @@ function readTheme() {
   const read = (name) => style.getPropertyValue(`--${name}`).trim();
   const names = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
   colours = Object.fromEntries(names.map((name) => [name, read(name)]));
-  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
+  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), quiet: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
   table = ramp(light.matches ? "light" : "dark");
   const g = find("ramp").getContext("2d");
   const image = g.createImageData(256, 8);

@@ -11,6 +11,7 @@ const TROUBLES = {
   lost_frames: "lost frames",
   overflows: "overflows",
   late: "late",
+  too_late: "too late",
   duplicates: "duplicates",
   rejected: "rejected",
   sequence_gaps: "sequence gaps",
@@ -21,6 +22,7 @@ const SHAPES = {
   healthy: ["circle", { cx: 8, cy: 8, r: 6 }, "M5.2 8.2l2 2 3.6-4"],
   degraded: ["path", { d: "M8 1.8L15 14H1z" }, "M8 6v4M8 11.6v.8"],
   lost: ["rect", { x: 2, y: 2, width: 12, height: 12 }, "M5.2 5.2l5.6 5.6M10.8 5.2l-5.6 5.6"],
+  quiet: ["path", { d: "M8 1.8L15 14H1z" }, "M5.8 11h4.4"],
   starting: ["circle", { cx: 8, cy: 8, r: 6, "stroke-dasharray": "2.5 2.2" }, ""],
   unknown: ["circle", { cx: 8, cy: 8, r: 6, "stroke-dasharray": "2.5 2.2" }, "M8 8.5v.8M6.3 6.4a1.7 1.7 0 1 1 1.7 1.7"],
 };
@@ -52,7 +54,7 @@ export function effectiveState(held, nowMs, link) {
   if (link !== "live") return "unknown";
   const age = ageS(held, nowMs);
   const { state } = held.array;
-  return age !== null && age > LOST_S && state !== "starting" ? "lost" : state;
+  return age !== null && age > LOST_S && state !== "starting" && state !== "quiet" ? "lost" : state;
 }
 
 export class ArraysPanel {
@@ -164,7 +166,7 @@ export class ArraysPanel {
   }
 
   #facts(card, array) {
-    const { frames = 0, marks = 0, ...others } = array.counters ?? {};
+    const { frames = 0, marks = 0, backfilled = 0, ...others } = array.counters ?? {};
     const facts = [];
     if (Number.isFinite(array.drift_ppm)) facts.push([`drift ${signed(array.drift_ppm, 1)} ppm`, ""]);
     if (array.clock) facts.push([`clock ${array.clock}`, array.clock === "stepped" ? "trouble" : ""]);
@@ -172,6 +174,7 @@ export class ArraysPanel {
     if (array.node) facts.push([`node ${array.node}`, ""]);
     facts.push([`${frames.toLocaleString("en").replaceAll(",", "\u202f")} frames`, ""]);
     facts.push([`${marks.toLocaleString("en").replaceAll(",", "\u202f")} marks`, ""]);
+    if (backfilled > 0) facts.push([`${backfilled} kept and sent later`, ""]);
     for (const [key, count] of Object.entries(others)) {
       if (count > 0) facts.unshift([`${TROUBLES[key] ?? key.replaceAll("_", " ")} ${count}`, "trouble"]);
     }

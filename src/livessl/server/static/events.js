@@ -28,8 +28,9 @@ export class EventList {
     this.#trim();
   }
 
-  /** One more, on top; or the same one anew, where it was. */
+  /** One more in its place by time, mostly on top; or the same one anew, where it was. What it replaces goes. */
   add(event, nowMs) {
+    for (const id of event.replaces ?? []) this.#remove(id);
     const before = this.rows.get(event.id);
     const row = this.#row(event, nowMs);
     if (before) {
@@ -37,18 +38,24 @@ export class EventList {
       this.rows.set(event.id, row);
     } else {
       row.root.classList.add("fresh");
-      this.rows = new Map([[event.id, row], ...this.rows]);
-      this.list.prepend(row.root);
+      const rows = [...this.rows];
+      const at = rows.findIndex(([, { event: other }]) => other.time_utc <= event.time_utc);
+      const place = event.late && at >= 0 ? at : 0;
+      rows.splice(place, 0, [event.id, row]);
+      this.list.insertBefore(row.root, rows[place + 1]?.[1].root ?? null);
+      this.rows = new Map(rows);
     }
     this.#trim();
   }
 
+  #remove(id) {
+    this.rows.get(id)?.root.remove();
+    this.rows.delete(id);
+    if (this.pinned === id) this.#pin(null);
+  }
+
   #trim() {
-    for (const [id, row] of [...this.rows].slice(MOST_ROWS)) {
-      row.root.remove();
-      this.rows.delete(id);
-      if (this.pinned === id) this.#pin(null);
-    }
+    for (const [id] of [...this.rows].slice(MOST_ROWS)) this.#remove(id);
     this.empty.hidden = this.rows.size > 0;
     this.count.textContent = this.rows.size === MOST_ROWS ? `the last ${MOST_ROWS}` : this.rows.size ? String(this.rows.size) : "";
   }

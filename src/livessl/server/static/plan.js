@@ -339,7 +339,7 @@ export class Plan {
   /** The same shapes as in the arrays panel: circle, triangle, square. */
   #shape(x, y, radius, state) {
     const { g } = this;
-    if (state === "degraded") {
+    if (state === "degraded" || state === "quiet") {
       const r = radius * 1.3;
       g.moveTo(x, y - r);
       g.lineTo(x + r * 0.95, y + r * 0.62);

@@ -1,0 +1,187 @@
+"""Breaks things on purpose and counts what is lost.
+
+`python benchmarks/faults.py replayed --seeds 1000` in simulated time, `processes --out FOLDER` with real processes, and
+`wire` with damaged messages. What came out is in docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import random
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "faults")]
+
+from mutation import campaign
+from processes import NODES, Playing, make_recordings, play
+from scenarios import HARMLESS, difference, nodes_killed, undisturbed
+
+
+def replayed(seed: int) -> list[str]:
+    """What went wrong with a seed, by every fault."""
+    logging.disable(logging.CRITICAL)
+    expected = undisturbed(seed)
+    wrong = {name: difference(seed, fault, expected) for name, fault in HARMLESS.items()}
+    with tempfile.TemporaryDirectory() as spools:
+        wrong["nodes killed"] = nodes_killed(seed, Path(spools), expected)
+    return [f"seed {seed}, {name}: {what}" for name, what in wrong.items() if what is not None]
+
+
+def undisturbed_processes(site: Playing, rng: random.Random, end_s: float) -> None:
+    """Nothing happens."""
+    site.sleep_until(end_s)
+
+
+def server_killed(site: Playing, rng: random.Random, end_s: float) -> None:
+    """50 times, at random moments of the scene."""
+    for moment_s in sorted(rng.uniform(0.0, end_s - 5.0) for _ in range(50)):
+        site.sleep_until(moment_s)
+        site.kill("server")
+        site.start_server()
+
+
+def nodes_killed_9(site: Playing, rng: random.Random, end_s: float) -> None:
+    """20 times, one or the other; it starts again at once."""
+    for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(20)):
+        site.sleep_until(moment_s)
+        name = rng.choice(list(NODES))
+        site.kill(name)
+        site.start_node(name)
+
+
+def link_cut(site: Playing, rng: random.Random, end_s: float) -> None:
+    """One node's link for 60 s, then the other's, then both."""
+    for k, names in enumerate((["a"], ["b"], ["a", "b"])):
+        site.sleep_until(10.0 + 80.0 * k)
+        for name in names:
+            site.proxies[name].weather.cut = True
+        site.sleep_until(70.0 + 80.0 * k)
+        for name in names:
+            site.proxies[name].weather.cut = False
+
+
+def loss_and_jitter(site: Playing, rng: random.Random, end_s: float) -> None:
+    """5 % of pieces lost, 200 ms of jitter."""
+    for proxy in site.proxies.values():
+        proxy.weather.loss, proxy.weather.jitter_s = 0.05, 0.2
+    site.sleep_until(end_s)
+
+
+def stopped(site: Playing, rng: random.Random, end_s: float) -> None:
+    """Server and nodes with SIGSTOP for up to 5 s, 30 times, and torn connections."""
+    for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(30)):
+        site.sleep_until(moment_s)
+        if rng.random() < 0.3:
+            site.proxies[rng.choice(list(NODES))].tear()
+        else:
+            site.stop(rng.choice(["server", *NODES]), rng.uniform(0.1, 5.0))
+
+
+PROCESSES = {
+    "undisturbed": undisturbed_processes,
+    "server killed 50 times": server_killed,
+    "nodes killed 20 times": nodes_killed_9,
+    "links cut for 60 s": link_cut,
+    "5 % loss, 200 ms jitter": loss_and_jitter,
+    "processes stopped, connections torn": stopped,
+}
+
+
+def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
+    """Play the same 40 sounds under each fault; what was stored, against the undisturbed run."""
+    recordings = folder / "recordings"
+    if not recordings.exists():
+        recordings.mkdir(parents=True)
+        make_recordings(recordings, 40, gap_s=6.0)
+    results = []
+    for name in names:
+        path = folder / f"{name.replace(' ', '-').replace('%', 'percent').replace(',', '')}.json"
+        if not path.exists():
+            directory = path.with_suffix("")  # it stays, with what the processes said, where anything goes wrong
+            shutil.rmtree(directory, ignore_errors=True)
+            events = play(recordings, directory, PROCESSES[name], seed=len(name))
+            shutil.copy(directory / "said.txt", path.with_suffix(".txt"))
+            shutil.rmtree(directory)
+            path.write_text(json.dumps(events), encoding="utf-8")
+        got = json.loads(path.read_text(encoding="utf-8"))
+        results.append(compared(name, got, json.loads((folder / "undisturbed.json").read_text(encoding="utf-8"))))
+        print(results[-1], flush=True)
+    return results
+
+
+def compared(name: str, got: list[dict[str, Any]], expected: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many of the expected events are there once, by start; how far off their positions are."""
+    doubled = sum(1 for one, other in pairwise(got) if other["at_s"] < one["at_s"] + one["duration_s"])
+    pairs = [(event, [e for e in got if abs(e["at_s"] - event["at_s"]) < 0.5]) for event in expected]
+    there = [(event, found[0]) for event, found in pairs if len(found) == 1]
+    whole = [(event, found) for event, found in there if found["arrays"] == event["arrays"]]
+    off_m = [math.dist(event["position_m"], found["position_m"]) for event, found in whole if event["position_m"]]
+    return {
+        "fault": name,
+        "events": len(got),
+        "once": len(there),
+        "doubled": doubled,
+        "of_all_arrays": len(whole),
+        "late": sum(event["late"] for event in got),
+        "largest_difference_m": max(off_m, default=None),
+    }
+
+
+def damaged(count: int) -> int:
+    """Damaged messages in ten parts; the memory after each."""
+    logging.disable(logging.CRITICAL)
+    outcomes: Counter[str] = Counter()
+    began = time.monotonic()
+    for part in range(10):
+        outcomes += campaign(count // 10, part)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        print(f"{outcomes.total()} messages, {dict(outcomes)}, at most {peak_mb:.1f} MB", flush=True)
+    print(f"{time.monotonic() - began:.0f} s")
+    return 0
+
+
+def main() -> int:
+    """Run a campaign; 1 where anything went wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    campaigns = parser.add_subparsers(dest="campaign", required=True)
+    sub = campaigns.add_parser("replayed", help="simulated time: every fault for each seed")
+    sub.add_argument("--seeds", type=int, default=1000, help="how many worlds (1000)")
+    sub.add_argument("--first", type=int, default=0, help="the first seed (0)")
+    sub.add_argument("--jobs", type=int, default=2, help="processes (2)")
+    sub = campaigns.add_parser("processes", help="real processes and sockets: 40 sounds under each fault")
+    sub.add_argument("--out", type=Path, required=True, help="folder for recordings and results; what is there stays")
+    sub.add_argument("--fault", choices=list(PROCESSES), action="append", help="only these (all)")
+    sub = campaigns.add_parser("wire", help="damaged messages, given to the server's ingest")
+    sub.add_argument("--count", type=int, default=1_000_000, help="how many (1 000 000)")
+    arguments = parser.parse_args()
+    if arguments.campaign == "wire":
+        return damaged(arguments.count)
+    began = time.monotonic()
+    if arguments.campaign == "processes":
+        results = processes(arguments.out, arguments.fault or list(PROCESSES))
+        return 0 if all(result["events"] == result["once"] == 40 for result in results) else 1
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        seeds = range(arguments.first, arguments.first + arguments.seeds)
+        wrong: list[str] = []
+        for seed, lines in zip(seeds, pool.map(replayed, seeds), strict=True):
+            wrong += lines
+            print(f"{seed}: {len(wrong)} wrong so far", *lines, sep="\n", flush=True)
+    runs = arguments.seeds * (len(HARMLESS) + 1)
+    print(f"{runs} runs of 8 sounds, {len(wrong)} went wrong, {time.monotonic() - began:.0f} s")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""How sure a place is: a covariance, a probability, and whether to answer at all. It sees evidence, and no sound.
+
+The numbers fitted here come from simulated events: `livessl evaluate localizer --half development`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core import peaks
+from livessl.core.geometry import Grid
+from livessl.core.srp import PairTerms, SRPFunctional
+from livessl.core.types import FloatArray, HeardBy, IntArray
+
+NEAR_M: Final = 0.5
+"""The confidence is the probability that the place is right to within so much."""
+
+LEAST_CONFIDENCE: Final = 0.8
+"""Below it a place is refused."""
+
+_LOGISTIC: Final = (-3.34, 2.69, 1.03)
+"""Intercept, weight of the margin and of the standing in the log-odds of a right place."""
+
+_DELAYS: Final = 3.0
+"""Independent delays of the arrays of four microphones that the numbers were fitted with."""
+
+_INFLATION: Final = 1.6
+"""What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """What the confidence goes by.
+
+    Parameters
+    ----------
+    margin : float
+        How far the place stands out from the best other one: 1 - (power there) / (power here), 0 to 1.
+    standing : float
+        Sum over the arrays of the mean height of an array's GCCs at the place over their root mean square, never below
+        0, in proportion to its independent delays: an array that disagrees, or hears only noise, adds nothing.
+    """
+
+    margin: float
+    standing: float
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the place is right to within `NEAR_M`."""
+        intercept, of_margin, of_standing = _LOGISTIC
+        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What a place is worth.
+
+    Parameters
+    ----------
+    covariance_m2 : (3, 3) float64
+    signs : Signs
+    refused : str or None
+        Why the place should not be relied on, where it should not.
+    """
+
+    covariance_m2: FloatArray
+    signs: Signs
+    refused: str | None
+
+
+def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
+    """Nodes (3, 2), first and last along each axis, that are the same place: within `peaks.RIVAL_DISTANCE_M`."""
+    reach = min(peaks.RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
+    axes = [np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach) for axis in range(3)]
+    return np.array([[axis[0], axis[-1]] for axis in axes], dtype=np.int64)
+
+
+def judge(
+    functional: SRPFunctional,
+    evidence: Sequence[HeardBy],
+    position_m: FloatArray,
+    power: float,
+    rival_power: float,
+    grid: Grid,
+) -> Judgement:
+    """Judge the place found.
+
+    Parameters
+    ----------
+    functional : SRPFunctional
+        Of the evidence.
+    evidence : sequence of HeardBy
+    position_m : (3,) float64
+        The highest place.
+    power, rival_power : float
+        The functional there, and the highest outside its `neighbourhood`.
+    grid : Grid
+    """
+    terms = functional.pair_terms(position_m)
+    margin = float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
+    signs = Signs(margin, sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True)))
+    covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    refused = None
+    if signs.confidence < LEAST_CONFIDENCE:
+        refused = (
+            f"too unsure: right to within {NEAR_M:g} m by a probability of {signs.confidence:.2f}, of at least "
+            f"{LEAST_CONFIDENCE:g} wanted"
+        )
+    return Judgement(covariance_m2, signs, refused)
+
+
+def _standing(heard: HeardBy, term: PairTerms) -> float:
+    noise = float(np.sqrt(np.square(heard.gcc.values).mean(dtype=np.float64)))
+    delays = len(heard.spec.microphones_m) - 1
+    return delays / _DELAYS * max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0

@@ -1,0 +1,182 @@
+"""The onset front end: frame after frame of one array, a GCC that weighs each moment and band by how direct it is.
+
+Reverberation is the past. In each band of the short-time spectrum the power P that begins now competes with what the
+past explains, I = max(N, max_s lambda^s P(t - s)): the stationary noise N, and all that was loud before, decaying. What
+exceeds it, S = max(P - I, 0), is taken to come straight from a source, so that the coherence to expect between two
+microphones is gamma = S / (S + I), and their phases weigh
+
+    w = gamma^2 / (1 - gamma^2) = S^2 / (I (I + 2 S)),
+
+the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma
+where the textbook would estimate it from long averages, which reverberation spoils. The GCC is
+sum_t w conj(U_i) U_k, U = X/|X|, summed over the band and *not* normalised: a moment or a band with more evidence
+counts for more, and sums over frames make a window or an event. It knows no geometry and no other array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy.fft
+
+from livessl.core.activity import band_bins
+from livessl.core.frontends import Spectra, fast_length
+from livessl.core.gcc import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
+from livessl.core.types import ArraySpec, ComplexArray, Float32Array
+
+WINDOW_S: Final = 0.032
+"""Length of the Hann window; 16 ms and 64 ms did no better, and 16 ms less well for tones in noise."""
+
+HOP_S: Final = 0.005
+"""8 ms cost a tenth of the accuracy in noise, 4 ms gain no more."""
+
+PAST_S: Final = 0.1
+"""Time constant of the past's decay; between 0.06 and 0.2 s little changes."""
+
+_STRONGEST: Final = 10.0
+"""Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
+
+_WARM_UP_S: Final = 0.1
+"""Quiet to be heard before the noise is known well enough to tell an onset from it."""
+
+_NOISE_S: Final = 1.0
+"""Time over which the noise is averaged; after so long a sound without any quiet its least power must do."""
+
+_LOUD: Final = 3.0
+"""Power above so many times the noise is no noise, quiet though the frame be called: an onset's foot."""
+
+_LEAST_POWER: Final = 2.0**-30 / 12.0
+"""Rounding to 16 bits, full scale squared: below it nothing is heard."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnsetGCC:
+    """What some frames of one array say of the directions of onsets in them. Those of more frames add up.
+
+    Parameters
+    ----------
+    lags : (P, C) float32, or complex64 where the envelope is used
+        Weighted sums at the near-Nyquist lags of `LagSampling`.
+    weight : float
+        Sum of the weights: a single direct sound in all of them gives `lags` of this height.
+    """
+
+    lags: ComplexArray | Float32Array
+    weight: float
+
+    def __add__(self, other: OnsetGCC) -> OnsetGCC:
+        """Both together."""
+        return OnsetGCC(self.lags + other.lags, self.weight + other.weight)
+
+
+class OnsetFrontEnd:
+    """Listens to one array at one sampling rate, frame after frame, each transformed once.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+    sample_rate_hz : float
+    sampling : LagSampling
+        For the array's band, rate and size.
+    """
+
+    def __init__(self, spec: ArraySpec, sample_rate_hz: float, sampling: LagSampling) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self._sampling = sampling
+        self._band_hz = spec.band_hz
+        self._pairs = microphone_pairs(len(spec.microphones_m))
+        self._envelope = uses_envelope(spec.band_hz)
+        length = round(WINDOW_S * sample_rate_hz)
+        self._hop = round(HOP_S * sample_rate_hz)
+        self._n_fft = fast_length(length + max(length, sampling.room))
+        self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
+        self._band = slice(*band_bins(self._n_fft, sample_rate_hz, spec.band_hz))
+        self._least = np.float32(_LEAST_POWER * np.square(self._window).sum())
+        hop_s = self._hop / sample_rate_hz
+        self._decay = np.float32(np.exp(-hop_s / PAST_S))
+        self._warm_up = round(_WARM_UP_S / hop_s)
+        self._noise_hops = round(_NOISE_S / hop_s)
+        self._tail: Float32Array = np.zeros((len(spec.microphones_m), 0), dtype=np.float32)
+        self._noise: Float32Array | None = None
+        self._past: Float32Array = np.zeros(0, dtype=np.float32)
+        self._quiet_hops = self._hops = 0
+
+    @property
+    def nothing(self) -> OnsetGCC:
+        """The sum of no frames."""
+        shape = (len(self._pairs), self._sampling.count)
+        return OnsetGCC(np.zeros(shape, np.complex64) if self._envelope else np.zeros(shape, np.float32), 0.0)
+
+    def reset(self) -> None:
+        """Forget all: samples are missing, and what comes does not continue what was."""
+        self._tail = self._tail[:, :0]
+        self._noise = None
+        self._quiet_hops = self._hops = 0
+
+    def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
+        """Take the next frame and give what its windows say; a window that it does not complete waits for the next.
+
+        Parameters
+        ----------
+        samples : (K, n) float32
+            Continuing those before.
+        quiet : bool
+            Whether there is no sound in it; the noise is learned from such frames.
+        """
+        heard = np.concatenate([self._tail, samples], axis=1)
+        length = len(self._window)
+        hops = max(0, (heard.shape[1] - length) // self._hop + 1)
+        self._tail = heard[:, hops * self._hop :].copy()
+        if hops == 0:
+            return self.nothing
+        cut = np.lib.stride_tricks.sliding_window_view(heard, length, axis=1)[:, :: self._hop][:, :hops]
+        spectra = scipy.fft.rfft(cut.swapaxes(0, 1) * self._window, self._n_fft, axis=2)
+        inside = spectra[:, :, self._band]
+        weights = self._weights((inside.real**2 + inside.imag**2).mean(axis=1), quiet=quiet)
+        cross = CrossSpectra(Spectra(spectra, self._n_fft), self._pairs, self.sample_rate_hz, self._band_hz, weights)
+        return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), float(weights.sum()))
+
+    def listen(self, pieces: Iterable[Float32Array]) -> OnsetGCC:
+        """Sum over pieces (K, n) of sound without their context: each is taken to begin out of silence."""
+        total = self.nothing
+        silence = np.zeros((len(self._tail), round(2.0 * _WARM_UP_S * self.sample_rate_hz)), dtype=np.float32)
+        for piece in pieces:
+            self.reset()
+            self.push(silence, quiet=True)
+            total += self.push(piece, quiet=False)
+        return total
+
+    def _weights(self, powers: Float32Array, *, quiet: bool) -> Float32Array:
+        """Weights (T, B) of the next windows from their power spectra (T, B), means over the microphones."""
+        powers = _smoothed(powers)
+        weights = np.zeros_like(powers)
+        for power, weight in zip(powers, weights, strict=True):
+            if self._noise is None:
+                self._noise, self._past = power.copy(), power.copy()
+            interference = np.maximum(np.maximum(self._noise, self._past), self._least)
+            if self._quiet_hops >= self._warm_up or self._hops >= self._noise_hops:
+                direct = np.maximum(power - interference, 0.0)
+                weight[:] = np.minimum(direct**2 / (interference * (interference + 2.0 * direct)), _STRONGEST)
+            self._past = np.maximum(self._past * self._decay, power)
+            self._hops += 1
+            self._learn(power, quiet=quiet)
+        return weights
+
+    def _learn(self, power: Float32Array, *, quiet: bool) -> None:
+        assert self._noise is not None
+        if not quiet:
+            self._noise += (np.minimum(power, self._noise) - self._noise) / np.float32(self._noise_hops)
+            return
+        self._quiet_hops += 1
+        if self._quiet_hops > self._warm_up:
+            power = np.minimum(power, _LOUD * np.maximum(self._noise, self._least))
+        self._noise += (power - self._noise) / np.float32(min(self._quiet_hops, self._noise_hops))
+
+
+def _smoothed(powers: Float32Array) -> Float32Array:
+    """Mean over three bins, the transform's resolution before its zero padding."""
+    padded = np.pad(powers, ((0, 0), (1, 1)), mode="edge")
+    return np.asarray((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / np.float32(3.0))

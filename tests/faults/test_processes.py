@@ -1,0 +1,92 @@
+"""Real processes over real sockets, killed with -9: the same events as if nothing had happened."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import Event, Playing, make_recordings, play, wait_for
+
+pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
+
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("recordings")
+    make_recordings(directory, COUNT, gap_s=2.0)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Event]:
+    def nothing(site: Playing, rng: random.Random, end_s: float) -> None:
+        site.sleep_until(end_s)
+
+    events = play(recordings, tmp_path_factory.mktemp("undisturbed"), nothing)
+    assert len(events) == COUNT
+    return events
+
+
+def assert_same(events: list[Event], expected: list[Event]) -> None:
+    assert [event["arrays"] for event in events] == [event["arrays"] for event in expected]
+    for event, other in zip(events, expected, strict=True):
+        assert event["at_s"] == pytest.approx(other["at_s"], abs=1e-6)
+        assert math.dist(event["position_m"], other["position_m"]) < 1e-6
+    assert all(one["at_s"] + one["duration_s"] <= other["at_s"] for one, other in pairwise(events))
+
+
+def test_server_killed_amid_sounds(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
+    def kills(site: Playing, rng: random.Random, end_s: float) -> None:
+        for event in undisturbed[:3]:
+            site.sleep_until(event["at_s"] + rng.uniform(0.0, event["duration_s"] + 0.5))
+            site.kill("server")
+            site.start_server()
+
+    assert_same(play(recordings, tmp_path, kills), undisturbed)
+
+
+def test_link_cut_and_torn(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
+    def cuts(site: Playing, rng: random.Random, end_s: float) -> None:
+        site.sleep_until(undisturbed[0]["at_s"] + 0.1)
+        site.proxies["a"].weather.cut = True
+        site.sleep_until(undisturbed[2]["at_s"] + 0.1)
+        site.proxies["a"].weather.cut = False
+        site.proxies["b"].tear()
+
+    events = play(recordings, tmp_path, cuts)
+    assert_same(events, undisturbed)
+    assert events[1]["late"]
+
+
+def array_state(site: Playing, name: str) -> dict[str, Any]:
+    answer = site.get("arrays")
+    found: dict[str, Any] = next((a for a in answer["arrays"] if a["name"] == name), {}) if answer else {}
+    return found
+
+
+def test_dead_node_and_cut_cable_show_within_two_seconds(recordings: Path, tmp_path: Path) -> None:
+    with Playing(recordings, tmp_path) as site:
+        site.start_server()
+        site.wait_ready()
+        for name in ("a", "b"):
+            site.start_node(name)
+        wait_for(lambda: {array_state(site, a).get("state") for a in ("north", "south")} == {"healthy"}, "arrays", 60)
+        site.proxies["b"].weather.cut = True
+        began = time.monotonic()
+        wait_for(lambda: array_state(site, "south")["state"] == "lost", "the cut cable to show", 5)
+        assert time.monotonic() - began < 2.0
+        assert array_state(site, "north")["state"] == "healthy"
+        site.kill("a")
+        began = time.monotonic()
+        wait_for(lambda: array_state(site, "north")["state"] == "lost", "the dead node to show", 5)
+        assert time.monotonic() - began < 2.0
+        site.start_node("a")
+        site.proxies["b"].weather.cut = False
+        wait_for(lambda: {array_state(site, a).get("state") for a in ("north", "south")} == {"healthy"}, "arrays", 60)

@@ -1,0 +1,438 @@
+"""A whole site in one thread and in simulated time: nodes, network, server, and everything that can befall them.
+
+Links, spools, wire, ingest, engine, fusion and store are the real ones; sockets, clocks and the estimator are not. The
+estimator's answer is a fingerprint of the very samples it was given, so that two runs that used other frames differ.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from livessl import wire
+from livessl.capture.link import Dealer, Link
+from livessl.capture.spool import Spool
+from livessl.clock import utc_ns
+from livessl.config import Site
+from livessl.core.estimators import ESTIMATORS, Localization, PowerMaps, Sound
+from livessl.core.types import FRAME_NS, Frame, HeardBy, Mark, Message
+from livessl.server.engine import Engine
+from livessl.server.ingest import Ingest
+from livessl.server.latency import Arrivals
+from livessl.server.receiver import Greeted, Item, Joined, Left
+from livessl.server.store import Query, Store, StoreError
+from small_site import RATE_HZ, site_of
+
+START = 20 * 1_767_225_600
+"""Raster index at which every world begins."""
+
+HANG_OVER, PRE_ROLL = 6, 8
+WORLD: dict[str, Any] = {
+    "nodes": {
+        "a": {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {"north": [1, 2, 3, 4]}},
+        "b": {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {"south": [1, 2, 3, 4]}},
+    }
+}
+ARRAY_OF = {"a": "north", "b": "south"}
+
+Event = dict[str, Any]
+
+
+class Fingerprint:
+    """Says a place that depends on every sample."""
+
+    name = "fingerprint"
+
+    def __init__(self, arrays: object, grid: object, c_m_s: float) -> None:
+        pass
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        pass
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        position = np.zeros(3)
+        for k, name in enumerate(sorted(sounds)):
+            for n, segment in enumerate(sounds[name].segments):
+                ramp = np.arange(1, segment.shape[1] + 1) / 100.0
+                position += (k + 1) * np.array([segment.sum(), (segment * ramp).sum() / (n + 1), segment.shape[1]])
+        return Localization(position, 0.01 * np.eye(3), 0.5, ())
+
+    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+        raise AssertionError("nobody looks at maps here")
+
+
+ESTIMATORS["fingerprint"] = Fingerprint
+
+
+class HandClock:
+    """Time that the world moves; a stamp may be off."""
+
+    def __init__(self) -> None:
+        self.time_ns = START * FRAME_NS
+        self.offset_ns = 0
+
+    def now_ns(self) -> int:
+        return self.time_ns + self.offset_ns
+
+    def monotonic_ns(self) -> int:
+        return self.time_ns
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        raise AssertionError("nobody sleeps here")
+
+
+@dataclass
+class Wire:
+    """One connection: messages on their way, in order, each with the time it arrives."""
+
+    routing_id: bytes
+    up: deque[tuple[int, bytes]] = field(default_factory=deque)
+    down: deque[tuple[int, bytes]] = field(default_factory=deque)
+
+
+class Cable(Dealer):
+    """What a node's link has for a socket."""
+
+    def __init__(self, world: World, node: str) -> None:
+        self._world = world
+        self._node = node
+
+    def send(self, data: bytes) -> bool:
+        return self._world.send_up(self._node, data)
+
+    def receive(self) -> bytes | None:
+        return self._world.receive_down(self._node)
+
+    def wait(self, milliseconds: int) -> None:
+        raise AssertionError("nobody waits here")
+
+    def close(self, linger_ms: int) -> None:
+        self._world.wires.pop(self._node, None)
+
+
+@dataclass
+class Microphones:
+    """What an array sends, interval by interval, as a segmenter does: marks, frames around sound, and a run-up."""
+
+    array: str
+    active: frozenset[int]
+    sequence: int = 0
+    began: int | None = None
+
+    def hear(self, raster: int) -> list[Message]:
+        if self.began is None:
+            self.began = raster
+        if not any(raster - k in self.active for k in range(HANG_OVER + 1) if raster - k >= self.began):
+            return [Mark(self.array, self.sequence, raster, 1e-7, 1e-7, (1e-7,) * 4)]
+        messages: list[Message] = []
+        if raster in self.active and not any(raster - k in self.active for k in range(1, HANG_OVER + 1)):
+            quiet = 0
+            while quiet < PRE_ROLL and raster - quiet - 1 >= self.began and self._is_quiet(raster - quiet - 1):
+                quiet += 1
+            messages += [self._frame(r) for r in range(raster - quiet, raster)]
+        return [*messages, self._frame(raster)]
+
+    def _is_quiet(self, raster: int) -> bool:
+        return not any(raster - k in self.active for k in range(HANG_OVER + 1))
+
+    def _frame(self, raster: int) -> Frame:
+        self.sequence += 1
+        rng = np.random.default_rng([raster, len(self.array), ord(self.array[0])])
+        samples = (rng.integers(-8, 8, (4, 10)) / 16).astype(np.float32)  # sums of these are exact
+        active = raster in self.active
+        power = 1e-2 * rng.uniform(0.5, 1.0) if active else float(rng.choice([1e-7, 2e-3]))
+        return Frame(self.array, self.sequence, raster, raster * FRAME_NS, float(RATE_HZ), samples, power, active)
+
+
+class Post:
+    """The receiver without its socket and thread."""
+
+    def __init__(self, site: Site, clock: HandClock) -> None:
+        self.ingest = Ingest(site)
+        self.arrivals = Arrivals()
+        self.failure = None
+        self.queue: deque[Item] = deque()
+        self._clock = clock
+
+    def take(self, most: int, wait_s: float) -> list[Item]:
+        return [self.queue.popleft() for _ in range(min(most, len(self.queue)))]
+
+    def receive(self, routing_id: bytes, data: bytes) -> list[tuple[bytes, wire.Ack]]:
+        arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns())
+        if arrival.joined is not None:
+            self.queue.append(Joined(arrival.joined))
+        if arrival.greeted is not None:
+            self.queue.append(Greeted(arrival.greeted))
+        if arrival.left is not None:
+            self.queue.append(Left(arrival.left))
+        if arrival.message is not None:
+            self.queue.append(arrival.message)
+        return [] if arrival.reply is None else [(routing_id, arrival.reply)]
+
+    def acknowledgements(self) -> list[tuple[bytes, wire.Ack]]:
+        return self.ingest.acknowledgements(self._clock.monotonic_ns())
+
+
+class DiedError(Exception):
+    """The server died in the middle of something."""
+
+
+class FragileStore(Store):
+    """A store whose process may die just before or just after an event is kept, or whose disk is full."""
+
+    def __init__(self) -> None:
+        super().__init__(None)
+        self.dies: str | None = None
+        self.full = False
+
+    def add(self, event: Event, time_ns: int, *, provisional: bool = False) -> None:
+        if self.full:
+            raise StoreError("disk full")
+        super().add(event, time_ns, provisional=provisional)
+
+    def settle(self, *arguments: Any) -> None:
+        if self.full:
+            raise StoreError("disk full")
+        if self.dies == "before":
+            raise DiedError
+        super().settle(*arguments)
+        if self.dies == "after":
+            raise DiedError
+
+
+@dataclass
+class Node:
+    """A node's process, while it lives."""
+
+    name: str
+    microphones: Microphones
+    link: Link
+    stopped: bool = False
+    next_raster: int | None = None
+
+
+class World:
+    """Nodes a and b with an array each, and a server.
+
+    Parameters
+    ----------
+    seed : int
+        Of the sounds, the delays, and whatever chance decides.
+    sounds : int
+        How many, a second and a half or more apart.
+    delay_ticks : (int, int)
+        Least and greatest delay of a message, in intervals; messages of a connection stay in order.
+    spools : Path or None
+        Where the nodes keep their frames; None keeps them in memory.
+    """
+
+    def __init__(
+        self, seed: int, sounds: int = 8, delay_ticks: tuple[int, int] = (0, 1), spools: Path | None = None
+    ) -> None:
+        self.rng = random.Random(seed)
+        self.site = site_of(WORLD)
+        self.clock = HandClock()
+        self.store = FragileStore()
+        self.wires: dict[str, Wire] = {}
+        self.cut: set[str] = set()
+        self.published: list[Event] = []
+        self.delay_ticks = delay_ticks
+        self._spools = spools
+        self._connections = self._runs = 0
+        self.raster = START
+        self.sounds = self._make_sounds(sounds)
+        self.server: Engine | None = None
+        self.nodes: dict[str, Node] = {}
+        self.down: dict[str, list[tuple[int, int]]] = {"a": [], "b": []}
+        self.start_server()
+        for name in ARRAY_OF:
+            self.start_node(name)
+
+    @property
+    def end(self) -> int:
+        """The raster interval after the last sound."""
+        return max(max(active) for _, active in self.sounds) + 2 * HANG_OVER
+
+    def _make_sounds(self, count: int) -> list[tuple[str, frozenset[int]]]:
+        """(array, its active intervals) of every sound."""
+        sounds: list[tuple[str, frozenset[int]]] = []
+        at = START + 30
+        for _ in range(count):
+            length = self.rng.randint(2, 30)
+            for array in self.rng.choice([("north", "south")] * 4 + [("north",), ("south",)]):
+                first = at + self.rng.randint(0, 2)
+                pauses = {k for k in range(length) if self.rng.random() < 0.2}
+                sounds.append((array, frozenset(first + k for k in range(length) if k not in pauses or k == 0)))
+            at += length + self.rng.randint(30, 60)
+        return sounds
+
+    def start_server(self) -> None:
+        with patch("livessl.server.engine.Receiver", Post):
+            self.server = Engine(self.site, self.clock, self.store, self.published.append, "fingerprint")
+
+    def kill_server(self) -> None:
+        self.server = None
+        self.wires.clear()
+
+    def start_node(self, name: str) -> None:
+        array = ARRAY_OF[name]
+        self._runs += 1
+        active = frozenset(r for of, rasters in self.sounds for r in rasters if of == array)
+        spool = Spool(None if self._spools is None else self._spools / name)
+        hello = wire.Hello(name, f"run-{self._runs}", {array: float(RATE_HZ)})
+        self.nodes[name] = Node(
+            name, Microphones(array, active), Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
+        )
+        if self.down[name]:
+            self.down[name][-1] = (self.down[name][-1][0], self.raster)
+
+    def kill_node(self, name: str) -> None:
+        """Its files stay as they are; whatever was in memory is gone."""
+        node = self.nodes.pop(name)
+        node.link._spool.close()
+        self.wires.pop(name, None)
+        self.down[name].append((self.raster, 2**62))
+
+    def reset(self, name: str) -> None:
+        """The connection breaks: what was on its way is lost, in both directions."""
+        self.wires.pop(name, None)
+
+    def send_up(self, node: str, data: bytes) -> bool:
+        if node in self.cut:
+            if node in self.wires and len(self.wires[node].up) < 200:
+                self.wires[node].up.append((2**62, data))  # the system's buffers take it, and nothing arrives
+                return True
+            return False
+        if node not in self.wires:
+            if self.server is None:
+                return False
+            self._connections += 1
+            self.wires[node] = Wire(self._connections.to_bytes(5, "big"))
+        up = self.wires[node].up
+        if len(up) >= 200:
+            return False
+        up.append((self._arrival(up), data))
+        return True
+
+    def receive_down(self, node: str) -> bytes | None:
+        connection = self.wires.get(node)
+        if connection is None or not connection.down or connection.down[0][0] > self.clock.time_ns:
+            return None
+        return connection.down.popleft()[1]
+
+    def _arrival(self, queue: deque[tuple[int, bytes]]) -> int:
+        delay = self.rng.uniform(*self.delay_ticks) * FRAME_NS
+        return max(self.clock.time_ns + round(delay), queue[-1][0] if queue else 0)
+
+    def heal(self, node: str) -> None:
+        """The link is there again; TCP may have held on to what was under way, or have given up."""
+        self.cut.discard(node)
+        if node in self.wires and self.rng.random() < 0.5:
+            connection = self.wires[node]
+            connection.up = deque((self.clock.time_ns, data) for _, data in connection.up)
+        else:
+            self.wires.pop(node, None)
+
+    def tick(self) -> None:
+        """One raster interval passes."""
+        self.clock.time_ns += FRAME_NS // 2
+        self._serve()
+        self.clock.time_ns += FRAME_NS - FRAME_NS // 2
+        self.raster += 1
+        for node in self.nodes.values():
+            first = self.raster - 1 if node.next_raster is None else node.next_raster
+            if not node.stopped:  # else its device's buffer holds what is heard
+                node.link.send([m for raster in range(first, self.raster) for m in node.microphones.hear(raster)])
+                first = self.raster
+            node.next_raster = first
+        self._serve()
+        for node in self.nodes.values():
+            if not node.stopped:
+                node.link.service()
+
+    def _serve(self) -> None:
+        if self.server is None:
+            return
+        post: Post = self.server._receiver  # type: ignore[assignment]
+        replies: list[tuple[bytes, wire.Ack]] = []
+        for name, connection in self.wires.items():
+            while name not in self.cut and connection.up and connection.up[0][0] <= self.clock.time_ns:
+                replies += post.receive(connection.routing_id, connection.up.popleft()[1])
+        replies += post.acknowledgements()
+        by_id = {connection.routing_id: name for name, connection in self.wires.items()}
+        for routing_id, ack in replies:
+            to = by_id.get(routing_id)
+            if to is not None and to not in self.cut:
+                down = self.wires[to].down
+                down.append((self._arrival(down), wire.encode(ack)))
+        try:
+            while True:
+                self.server._turn()
+                if not post.queue:
+                    break
+        except DiedError:
+            self.store.dies = None
+            self.kill_server()
+
+    def run(self, ticks: int) -> None:
+        """Let time pass."""
+        for _ in range(ticks):
+            self.tick()
+
+    def recover(self, ticks: int = 200) -> None:
+        """Everything is started and connected again; let it settle."""
+        for name in list(self.cut):
+            self.heal(name)
+        self.store.dies, self.store.full = None, False
+        if self.server is None:
+            self.start_server()
+        for name in ARRAY_OF:
+            if name not in self.nodes:
+                self.start_node(name)
+            self.nodes[name].stopped = False
+        self.run(max(0, self.end - self.raster) + ticks)
+
+    def events(self) -> list[Event]:
+        """What is stored, oldest first, without what depends on when it was found out."""
+        found, _ = self.store.find(Query(limit=1000))
+        timeless = ("latency_s", "latency_stages_s", "late", "replaces", "late_frames", "start_s")
+        return [{key: value for key, value in event.items() if key not in timeless} for event in reversed(found)]
+
+    @property
+    def published_events(self) -> list[Event]:
+        """What subscribers were told."""
+        return [message for message in self.published if message["kind"] == "event"]
+
+    def groups(self) -> list[frozenset[int]]:
+        """The sounds, each with the intervals in which any array hears it."""
+        merged: list[frozenset[int]] = []
+        for _, active in sorted(self.sounds, key=lambda sound: min(sound[1])):
+            if merged and min(active) <= max(merged[-1]) + HANG_OVER:
+                merged[-1] |= active
+            else:
+                merged.append(active)
+        return merged
+
+    def found(self) -> list[tuple[frozenset[int], list[Event]]]:
+        """The events that lie within each sound, its run-up included."""
+        events = self.events()
+        return [
+            (sound, [e for e in events if min(sound) - PRE_ROLL <= _first_raster(e) <= max(sound)])
+            for sound in self.groups()
+        ]
+
+    def was_up(self, sound: frozenset[int]) -> bool:
+        """Whether no node was down from the run-up of a sound to its end."""
+        first, last = min(sound) - 2 * PRE_ROLL, max(sound) + 2 * HANG_OVER
+        return not any(since <= last and until >= first for spans in self.down.values() for since, until in spans)
+
+
+def _first_raster(event: Event) -> int:
+    return utc_ns(event["time_utc"]) // FRAME_NS
