@@ -40,7 +40,8 @@ from livessl.core.gcc import GCCPhat, microphone_pairs
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.peaks import Peak
 from livessl.core.search import PeakSearch
-from livessl.core.srp import SRPMapper, pair_weight, steering_delays_s
+from livessl.core.srp import SRPMapper, pair_weight
+from livessl.core.steering import steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray, Frame, HeardBy, RealArray
 from livessl.progress import counted
 

@@ -481,14 +481,14 @@ def test_what_is_for_files_is_not_for_an_audio_interface(
 @pytest.mark.parametrize(("options", "code"), [((), 0), (("--once",), 130)])
 def test_interrupted_demo(run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], code: int) -> None:
     """It runs until Ctrl-C, which is then no failure; once, it is cut short."""
-    monkeypatch.setattr("livessl.cli.demo.prepare", interrupted)
+    monkeypatch.setattr("livessl.demo.prepare", interrupted)
     assert run("demo", *options).code == code
 
 
 def test_interrupted_simulation_is_cut_short(
     run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.cli.write_scene", interrupted)
+    monkeypatch.setattr("livessl.simulate.export.write_scene", interrupted)
     assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
 
 
@@ -716,7 +716,7 @@ def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
             [Fault(site.server.http.host, f"{site.server.http.port} {site.server.http.tokens} {site.keys}")]
         )
 
-    monkeypatch.setattr("livessl.cli.Server", refuse)
+    monkeypatch.setattr("livessl.server.app.Server", refuse)
     assert main(["replay", str(session), *([] if own else ["--site", str(path)])]) == 2
     expected = "127.0.0.1: 8001 None None" if own else "0.0.0.0: 8001 tokens.yaml None"
     assert expected in capsys.readouterr().err

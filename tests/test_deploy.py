@@ -89,6 +89,12 @@ def test_node_reaches_the_sound_cards() -> None:
     assert "PrivateDevices" not in settings
 
 
+def test_server_keeps_what_it_compiled() -> None:
+    settings = unit("livessl-server.service")
+    assert settings["Environment"] == [f"NUMBA_CACHE_DIR=%C/{settings['CacheDirectory'][0]}"]
+    assert "MemoryDenyWriteExecute" not in settings  # what numba makes is machine code
+
+
 def test_commands_are_livessl_commands() -> None:
     for place, (command, *options) in commands().items():
         assert command == ("capture" if "node" in place else "serve"), place

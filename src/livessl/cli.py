@@ -1,4 +1,4 @@
-"""The command line: arguments, progress bars, exit codes. No logic."""
+"""The command line: arguments, progress bars, exit codes. No logic. Each command imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -14,29 +14,15 @@ import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from livessl import __version__, demo, progress, replay
+from livessl import __version__, progress
 from livessl import keys as keyring
-from livessl.bench import kernels as kernel_bench
-from livessl.bench import live as live_bench
-from livessl.capture.devices import DeviceError
-from livessl.capture.node import UndeliveredError, capture_device, capture_recordings, send_session
-from livessl.capture.record import Recorder, record_device, record_parts
-from livessl.capture.recorded import (
-    Part,
-    common_start_ns,
-    parts_from_node,
-    parts_from_sessions,
-    parts_from_wavs,
-    repeated,
-    span_ns,
-)
-from livessl.capture.spool import SpoolError
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
 from livessl.config import (
+    METHODS,
     ConfigError,
     Fault,
     HttpConfig,
@@ -48,19 +34,14 @@ from livessl.config import (
     load_site,
     open_doors,
 )
-from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_NS, Event
-from livessl.evaluate import command as evaluation
-from livessl.messages import JsonObject, Messages
-from livessl.plan import design, figure, words
-from livessl.processes import NotStartedError
-from livessl.server.app import Server
-from livessl.server.receiver import BindError
-from livessl.server.sinks import SinkError
-from livessl.server.store import StoreError
-from livessl.session import SESSION_FILE, read_session
-from livessl.simulate.export import TRUTH_FILE, write_scene
-from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
+from livessl.errors import RunError, UseError
+
+if TYPE_CHECKING:
+    from livessl.capture.recorded import Part
+    from livessl.demo import Outcome
+    from livessl.messages import JsonObject
+    from livessl.server.app import Server
 
 T = TypeVar("T")
 
@@ -76,25 +57,14 @@ WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
 
 
-_FAILURES: Final = (
-    BindError,
-    NotStartedError,
-    SinkError,
-    SpoolError,
-    StoreError,
-    UndeliveredError,
-    demo.DemoError,
-    figure.FigureError,
-)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code.
 
     0 success, also of what runs until Ctrl-C or SIGTERM; 1 failure at run time; 2 wrong use or configuration; 130 for a
     command that Ctrl-C or SIGTERM cut short before its own end.
     """
-    parsed = _parser().parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    parsed = _parser(given).parse_args(given)
     logging.basicConfig(
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
@@ -102,14 +72,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # the products are small: a second thread spins more than it works, eight times the processor's time in all
         with _sigterm_interrupts(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
-    except (ConfigError, DeviceError) as error:
+    except UseError as error:
         for line in str(error).splitlines():
             _complain(line)
         return WRONG_USE
     except BrokenPipeError:  # whoever read our output has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (*_FAILURES, OSError) as error:
+    except (RunError, OSError) as error:
         _complain(str(error))
         return FAILED
     except KeyboardInterrupt:
@@ -139,7 +109,8 @@ def _polite_stop() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
+    """All commands; what is dear to describe is described only where it is among the words given."""
     parser = argparse.ArgumentParser(
         prog="livessl", description="Tells, live, where in a room a sound happened.", epilog="example: livessl demo"
     )
@@ -235,10 +206,21 @@ def _parser() -> argparse.ArgumentParser:
         "repeat the paper's experiments in simulated rooms",
         "livessl evaluate one-array --events sounds/ --positions 10 --out evaluation/",
     )
-    evaluation.add_arguments(sub)
+    if "evaluate" in given:
+        from livessl.evaluate import command as evaluation
+
+        evaluation.add_arguments(sub)
 
     _add_bench(command)
-    _add_plan(command)
+
+    sub = command(
+        "plan",
+        _plan,
+        "tell what error to expect where, and where arrays should go",
+        "livessl plan --site site.yaml --rt60 0.7 --out plan/",
+    )
+    if "plan" in given:
+        _add_plan(sub)
 
     _add_keys(command)
 
@@ -269,22 +251,18 @@ def _add_bench(command: Callable[..., Any]) -> None:
     sub.add_argument("--json", action="store_true", help="print one JSON object")
 
 
-def _add_plan(command: Callable[..., Any]) -> None:
-    sub = command(
-        "plan",
-        _plan,
-        "tell what error to expect where, and where arrays should go",
-        "livessl plan --site site.yaml --rt60 0.7 --out plan/",
-    )
+def _add_plan(sub: Any) -> None:
+    from livessl.plan.design import CALIBRATION_M
+
     _add_site(sub)
     sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
     sub.add_argument("--height", type=_not_negative, metavar="M", help="of the sounds (default 1.5, if searched)")
     sub.add_argument(
         "--calibration",
         type=_above_zero,
-        default=design.CALIBRATION_M,
+        default=CALIBRATION_M,
         metavar="M",
-        help=f"how well the microphones' places are known (default {design.CALIBRATION_M:g})",
+        help=f"how well the microphones' places are known (default {CALIBRATION_M:g})",
     )
     sub.add_argument("--json", action="store_true", help="print one JSON object")
     sub.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
@@ -326,7 +304,7 @@ def _add_site(parser: Any) -> None:
 
 
 def _add_method(parser: Any) -> None:
-    parser.add_argument("--method", choices=sorted(ESTIMATORS), help="estimator (default: the site's)")
+    parser.add_argument("--method", choices=sorted(METHODS), help="estimator (default: the site's)")
 
 
 def _add_joint(parser: Any) -> None:
@@ -355,6 +333,9 @@ def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
+    from livessl.bench import kernels as kernel_bench
+    from livessl.bench import live as live_bench
+
     if not arguments.live:
         with progress.counted("measuring", "round") as show:
             report = kernel_bench.measure(SystemClock(), progress=show)
@@ -386,6 +367,8 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 
 def _show_demo(arguments: argparse.Namespace) -> int:
+    from livessl import demo
+
     clock = SystemClock()
     with (
         tempfile.TemporaryDirectory(prefix="livessl-demo-") as name,
@@ -420,7 +403,7 @@ def _show_demo(arguments: argparse.Namespace) -> int:
 _DEMO_HEAD: Final = f"{'time':>7}  {'sound':<14} {'true position':<22} {'found':<22} {'error':>7}  status"
 
 
-def _demo_row(outcome: demo.Outcome) -> str:
+def _demo_row(outcome: Outcome) -> str:
     event = outcome.event
     assert event is not None
     error = "-" if outcome.error_m is None else f"{outcome.error_m:.2f} m"
@@ -430,12 +413,14 @@ def _demo_row(outcome: demo.Outcome) -> str:
     )
 
 
-def _demo_json(outcome: demo.Outcome) -> str:
+def _demo_json(outcome: Outcome) -> str:
     truth = {"name": outcome.name, "start_s": outcome.start_s, "position_m": list(outcome.true_position_m)}
     return json.dumps({**(outcome.event or {}), "truth": truth, "error_m": outcome.error_m})
 
 
 def _serve(arguments: argparse.Namespace) -> int:
+    from livessl.server.app import Server
+
     site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
@@ -452,6 +437,9 @@ def _run_server(server: Server) -> None:
 
 
 def _capture(arguments: argparse.Namespace) -> int:
+    from livessl.capture.node import capture_device, capture_recordings
+    from livessl.capture.recorded import span_ns
+
     site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     config = _node(site, arguments.node, arguments.site)
     _check_played(arguments, config)
@@ -505,6 +493,8 @@ def _run_id(node: str, clock: Clock) -> str:
 
 def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[Part]:
     """What a node plays instead of a device."""
+    from livessl.capture.recorded import common_start_ns, parts_from_node, parts_from_wavs, repeated
+
     start_ns = getattr(arguments, "start_at", None) or common_start_ns(now_ns, len(site.nodes))
     if not arguments.wav:
         with progress.counted("simulating the room", "source") as bar:
@@ -515,6 +505,10 @@ def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> lis
 
 
 def _locate(arguments: argparse.Namespace) -> int:
+    from livessl import replay
+    from livessl.capture.recorded import parts_from_wavs, span_ns
+    from livessl.messages import Messages
+
     site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     parts = parts_from_wavs(site, *_wavs(arguments))
@@ -549,6 +543,9 @@ def _print_event(event: JsonObject, *, as_json: bool) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from livessl.capture.recorded import parts_from_sessions
+    from livessl.session import read_session
+
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = _once_each(arguments.joint, "--joint")
     site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
@@ -557,6 +554,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         with _polite_stop() as stop:
             _send(site, arguments.server, parts, arguments.speed, stop)
         return OK
+    from livessl.server.app import Server
+
     # keys and history are the real server's; a session's own site says nothing of who may look here
     http = site.server.http if arguments.site else HttpConfig(port=site.server.http.port)
     here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "http": http, "events_db": None, "sinks": ()})
@@ -589,6 +588,9 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 
 def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: threading.Event) -> None:
+    from livessl.capture.node import send_session
+    from livessl.capture.recorded import span_ns
+
     clock = SystemClock()
     begin_ns, end_ns = span_ns(parts)
     pace = UnpacedClock(begin_ns) if speed == float("inf") else PacedClock(begin_ns, speed)
@@ -597,6 +599,8 @@ def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: 
 
 
 def _record(arguments: argparse.Namespace) -> int:
+    from livessl.capture.record import Recorder, record_device, record_parts
+
     site = load_site(arguments.site)
     if site.privacy == "positions-only":
         what = "positions-only: no sound may be stored, so nothing is recorded; change it if everyone there agrees"
@@ -632,6 +636,8 @@ def _record(arguments: argparse.Namespace) -> int:
 
 def _refuse_recordings(directory: Path) -> None:
     """Nothing that was recorded is ever overwritten, nor mixed with anything."""
+    from livessl.session import SESSION_FILE
+
     held = directory.iterdir() if directory.is_dir() else ()
     names = sorted(path.name for path in held if path.name == SESSION_FILE or path.suffix.lower() in (".wav", ".flac"))
     if names:
@@ -641,6 +647,10 @@ def _refuse_recordings(directory: Path) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
+    from livessl.session import SESSION_FILE
+    from livessl.simulate.export import TRUTH_FILE, write_scene
+    from livessl.simulate.scene import make_scene, read_sounds, synthesised_sounds
+
     site = load_site(arguments.site)
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
@@ -667,6 +677,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    from livessl.evaluate import command as evaluation
+
     try:
         with progress.counted(f"evaluating {arguments.experiment}", "position") as bar:
             written = evaluation.run(arguments, arguments.jobs or os.cpu_count() or 1, bar)
@@ -679,6 +691,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace) -> int:
+    from livessl.plan import design, figure, words
+
     site = load_site(arguments.site)
     if arguments.out is not None:
         figure.require_matplotlib()

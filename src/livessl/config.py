@@ -9,21 +9,27 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from livessl.core.activity import ActivityParameters
-from livessl.core.estimators import ESTIMATORS, joined
-from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.gcc import microphone_pairs, uses_envelope
 from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
-from livessl.core.srp import alias_free_hz
+from livessl.core.joint import joined
+from livessl.core.steering import alias_free_hz
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
+from livessl.errors import UseError
+
+if TYPE_CHECKING:
+    from livessl.core.fusion import Fusion
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
+METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
+"""Names of `livessl.core.estimators.ESTIMATORS`: who checks a site file need not load what localizes."""
+
 COINCIDENT_M: Final = 1e-3
 """Two microphones nearer than this are a slip of the pen: no capsule is that small."""
 
@@ -52,7 +58,7 @@ class Fault:
         return f"{self.where}: {self.what}"
 
 
-class ConfigError(Exception):
+class ConfigError(UseError):
     """Everything that is wrong with what the user gave, at once."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
@@ -428,7 +434,10 @@ class Site(_Model):
         )
 
     def make_fusion(self, method: str | None = None, *, updates: bool = True, live: bool = False) -> Fusion:
-        """A new fusion of this site's arrays, by the site's method or another of `ESTIMATORS`."""
+        """A new fusion of this site's arrays, by the site's method or another of `METHODS`."""
+        from livessl.core.estimators import ESTIMATORS
+        from livessl.core.fusion import Fusion, FusionParameters
+
         f, a = self.fusion, self.activity
         estimator = ESTIMATORS[method or f.method](self.processed, self.search_grid(), self.c_m_s)
         parameters = FusionParameters(
@@ -784,8 +793,8 @@ def _cross_faults(site: Site) -> Iterator[_Finding]:
         )
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
-    if site.fusion.method not in ESTIMATORS:
-        yield ("fusion", "method"), f"expected one of {', '.join(ESTIMATORS)}, got {site.fusion.method!r}"
+    if site.fusion.method not in METHODS:
+        yield ("fusion", "method"), f"expected one of {', '.join(METHODS)}, got {site.fusion.method!r}"
     yield from _name_faults(site)
     count = len(site.arrays) + len(site.processed) - len(site.specs)
     if site.fusion.min_arrays > count:

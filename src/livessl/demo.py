@@ -18,6 +18,7 @@ from websockets.sync.client import connect
 from livessl import processes
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site, load_site, parse_site
+from livessl.errors import RunError
 from livessl.messages import JsonObject
 from livessl.simulate.export import TRUTH_FILE, write_scene
 from livessl.simulate.scene import Scene, make_scene, synthesised_sounds
@@ -34,7 +35,7 @@ RATE_HZ: Final = 44100.0
 SEED: Final = 1
 
 
-class DemoError(Exception):
+class DemoError(RunError):
     """The demo could not run."""
 
 

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from livessl.clock import Clock
+from livessl.errors import RunError
 
 READY_NS: Final = 60_000_000_000
 POLL_NS: Final = 50_000_000
 END_S: Final = 5.0
 
 
-class NotStartedError(Exception):
+class NotStartedError(RunError):
     """A command did not come up; it has said why itself."""
 
 

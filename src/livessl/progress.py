@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from tqdm import tqdm
-
 DELAY_S: Final = 2.0
 
 
 @contextmanager
 def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """A bar over things: call what it yields with (done, total)."""
+    from tqdm import tqdm
+
     bar: Any = tqdm(desc=what, unit=unit, delay=DELAY_S, leave=False, disable=None, total=1)
 
     def show(done: int, total: int) -> None:

@@ -7,11 +7,13 @@ import pytest
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 
 from livessl.core import frontends
-from livessl.core.estimators import ESTIMATORS, Localization, Sound, SrpPhat, joined, third_octaves_below_hz
+from livessl.core.estimators import ESTIMATORS, Localization, Sound, SrpPhat, third_octaves_below_hz
 from livessl.core.frontends import averaged, cepstral, minimum_phase_cepstrum, whole_segment
 from livessl.core.gcc import CrossSpectra, GCCPhat, microphone_pairs
 from livessl.core.geometry import Grid
-from livessl.core.srp import SRPMapper, alias_free_hz, steering_delays_s
+from livessl.core.joint import joined
+from livessl.core.srp import SRPMapper
+from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])

@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
-from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat, joined
+from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
 from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
 from livessl.core.geometry import Grid
+from livessl.core.joint import joined
 from livessl.core.onset import OnsetGCC
 from livessl.core.types import (
     FRAME_NS,

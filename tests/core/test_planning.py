@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from livessl.core import planning
 from livessl.core.gcc import microphone_pairs
 from livessl.core.geometry import Grid, line, posed, tetrahedron
-from livessl.core.srp import alias_free_hz, delay_gradients_s_m, steering_delays_s
+from livessl.core.steering import alias_free_hz, delay_gradients_s_m, steering_delays_s
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.simulate.room import absorption
 

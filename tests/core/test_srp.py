@@ -8,7 +8,8 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, band_mean_cos, burst, heard, ide
 
 from livessl.core.gcc import GCCPhat, microphone_pairs
 from livessl.core.geometry import Grid, line
-from livessl.core.srp import SRPFunctional, SRPMapper, pair_weight, steering_delays_s
+from livessl.core.srp import SRPFunctional, SRPMapper, pair_weight
+from livessl.core.steering import steering_delays_s
 from livessl.core.types import GCC, ArraySpec, FloatArray, HeardBy
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))

@@ -13,7 +13,7 @@ from livessl.core.activity import band_bins
 from livessl.core.frontends import whole_segment
 from livessl.core.gcc import CrossSpectra, microphone_pairs
 from livessl.core.geometry import Grid
-from livessl.core.srp import alias_free_hz, steering_delays_s
+from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.evaluate.campaign import read_clips
 from livessl.evaluate.maps import PairMatrices, PairTables, reach_samples

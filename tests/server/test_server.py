@@ -183,6 +183,21 @@ def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> Non
         live.close(bye=True)
 
 
+@pytest.mark.parametrize(("say_s", "said"), [(0.0, True), (5.0, False)], ids=["long", "short"])
+def test_start_that_waits_for_the_compiler_says_so(
+    say_s: float, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def compile_slowly() -> None:
+        if said:
+            wait_until(lambda: "compiling the search" in caplog.text, "the message")
+
+    monkeypatch.setattr(engine, "SAY_S", say_s)
+    monkeypatch.setattr(engine, "warm_up", compile_slowly)
+    with caplog.at_level("INFO"), running_server(site_of()):
+        pass
+    assert ("compiling the search" in caplog.text) == said
+
+
 def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
     """An open file or database would be a ResourceWarning here."""
     changes: Changes = {

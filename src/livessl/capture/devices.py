@@ -14,6 +14,7 @@ import soundfile
 
 from livessl.clock import Clock
 from livessl.core.types import MAX_SAMPLE, Block, Float32Array
+from livessl.errors import UseError
 
 BLOCK_S: Final = 0.02
 """Length of the blocks that recordings are read in: as an audio interface would deliver them."""
@@ -21,7 +22,7 @@ BLOCK_S: Final = 0.02
 _SCAN_SAMPLES: Final = 1 << 18
 
 
-class DeviceError(Exception):
+class DeviceError(UseError):
     """A device or recording that cannot be used: what, expected, got, cure."""
 
 

@@ -14,6 +14,7 @@ from livessl.capture.recorded import Part, lines_of
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
+from livessl.errors import RunError
 from livessl.keys import node_keys
 
 DRAIN_NS: Final = 3_000_000_000
@@ -27,7 +28,7 @@ MAX_PENDING: Final = 400
 _log = logging.getLogger(__name__)
 
 
-class UndeliveredError(Exception):
+class UndeliveredError(RunError):
     """Sound that the server never acknowledged."""
 
 

@@ -10,10 +10,9 @@ from typing import Final
 from livessl.capture.devices import ArrayRecording, DeviceError, Looped, Placed, Spliced, Stacked, WavRecording
 from livessl.capture.line import Line, recording_channels
 from livessl.config import SceneDeviceConfig, Site, WavDeviceConfig
-from livessl.core.estimators import require_one_clock
+from livessl.core.joint import require_one_clock
 from livessl.core.types import FRAME_NS
 from livessl.session import Session
-from livessl.simulate.scene import make_scene, render, synthesised_sounds
 
 TOGETHER_NS: Final = 5_000_000_000
 """Long against the difference between two processes' starts, short against a user's patience."""
@@ -178,6 +177,8 @@ def parts_from_scene(
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Part]:
     """A simulated scene as the arrays of one node would record it; every node with the same numbers hears the same."""
+    from livessl.simulate.scene import make_scene, render, synthesised_sounds  # heavy, and no other device needs it
+
     scene = make_scene(
         site.room.size_m,
         rt60_s=config.rt60_s,

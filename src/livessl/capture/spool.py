@@ -19,6 +19,7 @@ from typing import Final
 
 from livessl import wire
 from livessl.core.types import FRAME_NS, Frame
+from livessl.errors import RunError
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
 """Sound kept in memory, where there is no folder or its disk is full: half a minute of six arrays."""
@@ -32,7 +33,7 @@ _RECORD: Final = struct.Struct("<II")
 _log = logging.getLogger(__name__)
 
 
-class SpoolError(Exception):
+class SpoolError(RunError):
     """The folder, or a file in it, cannot be used."""
 
 

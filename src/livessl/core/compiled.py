@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import Final
 
-import numba
 import numpy as np
 
+from livessl.core.jit import jit
 from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT
 
 NAME: Final = "numba"
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_compiled = jit(error_model="numpy")
 
 
 @_compiled

@@ -15,8 +15,9 @@ from livessl.core.gcc import GCCPhat, LagSampling, microphone_pairs, require_ban
 from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.search import PeakSearch
-from livessl.core.srp import SRPFunctional, SRPMapper, alias_free_hz
-from livessl.core.types import GCC, MAX_MICROPHONES, ArraySpec, Float32Array, FloatArray, HeardBy
+from livessl.core.srp import SRPFunctional, SRPMapper
+from livessl.core.steering import alias_free_hz
+from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,58 +289,6 @@ class Onset(SrpPhat):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
-
-
-def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) -> ArraySpec:
-    """One array of all the microphones of several, to be processed jointly: every pair counts, across arrays too.
-
-    Its channels are theirs, array by array.
-
-    Parameters
-    ----------
-    arrays : sequence of ArraySpec
-    clocks : mapping of array name to clock
-        What samples each array: the same name, the same clock.
-    name : str
-        The new array's.
-
-    Raises
-    ------
-    ValueError
-        Where clocks differ or are unknown: delays across arrays are good only if one clock samples both. Where bands
-        differ, or there are more microphones than an array may have.
-    """
-    require_one_clock(name, {spec.name: clocks.get(spec.name) for spec in arrays})
-    bands_hz = {spec.band_hz for spec in arrays}
-    if len(bands_hz) != 1:
-        raise ValueError(
-            f"array {name!r}: joint processing expects arrays of one band, got {sorted(bands_hz)} Hz; "
-            "give them one band_hz, or let their maps be summed instead"
-        )
-    count = sum(len(spec.microphones_m) for spec in arrays)
-    if count > MAX_MICROPHONES:
-        raise ValueError(
-            f"array {name!r}: joint processing expects {MAX_MICROPHONES} microphones at most, got {count}; "
-            "join fewer arrays, or let their maps be summed instead"
-        )
-    microphones_m = np.ascontiguousarray(np.vstack([spec.microphones_m for spec in arrays]))  # sums depend on the order
-    return ArraySpec(name, microphones_m, bands_hz.pop())
-
-
-def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:
-    """Refuse to join arrays, into one of that name, which one clock does not sample; None is an unknown clock.
-
-    Raises
-    ------
-    ValueError
-        Then.
-    """
-    if None in clocks.values() or len(set(clocks.values())) != 1:
-        each = ", ".join(f"{array!r} by {clock or 'an unknown clock'}" for array, clock in clocks.items())
-        raise ValueError(
-            f"array {name!r}: joint processing expects arrays sampled by one clock, got {each}; "
-            "record them through one device, or let their maps be summed instead"
-        )
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:

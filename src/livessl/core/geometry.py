@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from livessl.core.types import FloatArray
 
@@ -94,8 +93,12 @@ def posed(
     yaw_deg, pitch_deg, roll_deg : float
         Degrees. Yaw is counter-clockwise seen from above; a positive pitch lowers the +x end.
     """
-    rotation = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True)
-    return np.asarray(rotation.apply(shape_m) + np.asarray(position_m, dtype=np.float64))
+    cos_y, cos_p, cos_r = np.cos(np.radians([yaw_deg, pitch_deg, roll_deg]))
+    sin_y, sin_p, sin_r = np.sin(np.radians([yaw_deg, pitch_deg, roll_deg]))
+    yaw = np.array([[cos_y, -sin_y, 0.0], [sin_y, cos_y, 0.0], [0.0, 0.0, 1.0]])
+    pitch = np.array([[cos_p, 0.0, sin_p], [0.0, 1.0, 0.0], [-sin_p, 0.0, cos_p]])
+    roll = np.array([[1.0, 0.0, 0.0], [0.0, cos_r, -sin_r], [0.0, sin_r, cos_r]])
+    return np.asarray(shape_m @ (yaw @ pitch @ roll).T + np.asarray(position_m, dtype=np.float64))
 
 
 def direction_deg(origin_m: FloatArray, target_m: FloatArray) -> tuple[float, float, float]:

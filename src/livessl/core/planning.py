@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from scipy.special import sici
 
 from livessl.core.gcc import microphone_pairs
-from livessl.core.srp import delay_gradients_s_m, pair_weight
+from livessl.core.srp import pair_weight
+from livessl.core.steering import delay_gradients_s_m
 from livessl.core.types import ArraySpec, FloatArray, IntArray
 
 CLEARANCE_M: Final = 0.5

@@ -11,12 +11,14 @@ microphones, C the cells. Lags are places on the fine axis: `int((|r - r_k| - |r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from livessl.core.types import Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 NAME: Final = "NumPy"
 
@@ -83,6 +85,8 @@ def look_up(values: Float32Array, places: UInt16Array, out: Float32Array) -> Non
 
 def look_up_table(places: UInt16Array, columns: int) -> csr_array:
     """What `add_power` wants of the places (G, P) that nodes look up in a pair's values, `columns` long."""
+    from scipy.sparse import csr_array  # dear to load, and only needed where numba is missing
+
     nodes, pairs = places.shape
     flat = places + np.arange(pairs, dtype=np.int32) * np.int32(columns)
     starts = np.arange(0, places.size + 1, pairs, dtype=np.int32)

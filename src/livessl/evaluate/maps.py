@@ -12,7 +12,8 @@ import numpy as np
 from livessl.core.estimators import third_octaves_below_hz
 from livessl.core.gcc import OVERSAMPLING
 from livessl.core.geometry import Grid
-from livessl.core.srp import SRPMapper, alias_free_hz, steering_delays_s
+from livessl.core.srp import SRPMapper
+from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray
 
 MARGIN_S: Final = 0.02

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.core.estimators import joined
 from livessl.core.geometry import Grid
+from livessl.core.joint import joined
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.evaluate.layout import Layout
 
@@ -77,7 +77,7 @@ class Settings:
     segment : str
         Which of an event's segments is localized: "longest", or "peak" for the one that holds the loudest frame.
     band_limit : bool
-        Against spatial aliasing, per pair and node; see `livessl.core.srp.alias_free_hz`.
+        Against spatial aliasing, per pair and node; see `livessl.core.steering.alias_free_hz`.
     layout : Layout or None
         Room, search volume and arrays; None are the paper's.
     """

@@ -12,7 +12,7 @@ from livessl.config import Site
 from livessl.core import planning
 from livessl.core.gcc import microphone_pairs
 from livessl.core.geometry import Grid
-from livessl.core.srp import alias_free_hz
+from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.simulate.room import absorption
 

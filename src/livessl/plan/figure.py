@@ -10,6 +10,7 @@ import numpy as np
 
 from livessl.core.planning import angle_error_deg
 from livessl.core.types import FloatArray
+from livessl.errors import RunError
 from livessl.plan.design import ANGLES_DEG, Errors, Plan
 from livessl.plan.words import advice_texts
 
@@ -24,7 +25,7 @@ SPACINGS_M: Final = np.geomspace(0.03, 4.0, 200)
 _INK: Final = "#222222"
 
 
-class FigureError(Exception):
+class FigureError(RunError):
     """There is nothing to draw with."""
 
 

@@ -32,6 +32,9 @@ BATCH: Final = 200
 STATUS_NS: Final = 500_000_000
 """Between two reports on the arrays."""
 
+SAY_S: Final = 2.0
+"""A start that waits longer for the compiler says so."""
+
 WATCH_NS: Final = 100_000_000
 """Between two looks whether an array's state has changed; then it is reported at once."""
 
@@ -103,7 +106,7 @@ class Engine:
         """Events that wait for the store to take them."""
         self.maps = Maps(clock)
         self.latency = Latency()
-        warm_up()
+        _warm_up()
         self._begin_live()
         self._receiver = Receiver(site, clock)
 
@@ -395,6 +398,16 @@ class Engine:
         others = {number: other for number, other in self._tracks.items() if number != track.id}
         self._tracks = others if track.state is TrackState.END else {**others, track.id: message}
         self._publish(message)
+
+
+def _warm_up() -> None:
+    """Have compiled what localizes, before anybody waits for it; read from numba's cache it takes a moment only."""
+    told = threading.Timer(SAY_S, _log.info, ["compiling the search, some seconds at the first start on this machine"])
+    told.start()
+    try:
+        warm_up()
+    finally:
+        told.cancel()
 
 
 def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:

@@ -15,6 +15,7 @@ from livessl import wire
 from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.types import Message
+from livessl.errors import RunError
 from livessl.keys import server_keys
 from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
@@ -33,7 +34,7 @@ BUSY_MESSAGES: Final = 100
 _log = logging.getLogger(__name__)
 
 
-class BindError(Exception):
+class BindError(RunError):
     """The server's address cannot be taken."""
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from livessl.config import SinkConfig
+from livessl.errors import RunError
 from livessl.messages import JsonObject
 
 _log = logging.getLogger(__name__)
 
 
-class SinkError(Exception):
+class SinkError(RunError):
     """A sink that cannot be opened."""
 
 

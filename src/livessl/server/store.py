@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from livessl.core.types import FRAME_NS
+from livessl.errors import RunError
 from livessl.messages import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
@@ -59,7 +60,7 @@ class Query:
     before: Cursor | None = None
 
 
-class StoreError(Exception):
+class StoreError(RunError):
     """The file cannot be used, or takes no more."""
 
 

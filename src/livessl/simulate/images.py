@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-import numba
 import numpy as np
 
+from livessl.core.jit import jit
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 _SHELLS: Final = 48
@@ -53,7 +53,7 @@ def lay_down_all(
     return wanted
 
 
-@numba.njit(cache=True, nogil=True)
+@jit()
 def _walk(
     x2: FloatArray,
     x_order: IntArray,
