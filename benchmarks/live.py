@@ -33,7 +33,7 @@ from livessl.server.engine import Engine
 class Nowhere:
     """Says the middle of the room; looks at the sound, so that it is in the cache as if it had been used."""
 
-    name = "srp-phat"
+    name = "onset"
 
     def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
         self._grid = grid
@@ -58,7 +58,7 @@ class Nowhere:
 
 def serve(site_file: Path, profile: Path | None) -> None:
     """Be the server, with the estimator above, and perhaps profiled."""
-    estimators.ESTIMATORS["srp-phat"] = Nowhere
+    estimators.ESTIMATORS["onset"] = Nowhere
     if profile is not None:
         run = Engine._run
         profiler = cProfile.Profile()
