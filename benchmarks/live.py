@@ -42,6 +42,10 @@ class Nowhere:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """There is nothing to prepare."""
 
+    def listener(self, array: str, sample_rate_hz: float) -> None:
+        """Nothing listens."""
+        return
+
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """One place for everything."""
         loudest = max(float(segment.max()) for sound in sounds.values() for segment in sound.segments)

@@ -241,7 +241,7 @@ def test_locate_prints_what_is_promised(run: Run, recorded: Recorded) -> None:
         assert event["kind"] == "event"
         assert event["time_utc"] is None
         assert event["status"] == "located"
-        assert event["method"] == "srp-phat"
+        assert event["method"] == "onset"
         assert np.shape(event["covariance_m2"]) == (3, 3)
         # half the diagonal of a cell of 0.25 m; sound travels at most 7 m in 0.02 s, and frames are 0.05 s long
         assert np.linalg.norm(np.subtract(event["position_m"], source["position_m"])) < 0.22

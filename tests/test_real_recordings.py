@@ -29,12 +29,17 @@ def test_pulses_in_a_field_of_five_microphones_are_located(tmp_path: Path, capsy
     site.write_text(yaml.safe_dump(r.FIELD), encoding="utf-8")
     channels = f"field={','.join(map(str, r.FIELD_CHANNELS))}"
     by_file = []
+    refused = 0
     for file in files:
         assert main(["locate", "--site", str(site), "--wav", f"field={file}", "--channels", channels, "--json"]) == 0
         events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
         assert events, f"nothing was heard in {file.name}"
-        by_file.append([float(np.linalg.norm(event["position_m"][:2] - r.field_truth_m(file))) for event in events])
+        located = [event for event in events if event["status"] != "refused"]
+        refused += len(events) - len(located)
+        by_file.append([float(np.linalg.norm(event["position_m"][:2] - r.field_truth_m(file))) for event in located])
     assert len(files) == 10
+    # one file begins in the middle of a pulse; of the others one pulse in twenty may be too unsure
+    assert refused <= 2
     assert np.median([np.median(errors) for errors in by_file]) <= 0.10
     assert np.median([error for errors in by_file for error in errors]) <= 0.10
     assert max(error for errors in by_file for error in errors) <= 0.25

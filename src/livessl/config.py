@@ -332,7 +332,7 @@ class ActivityConfig(_Model):
 class FusionConfig(_Model):
     """How arrays are joined."""
 
-    method: str = "srp-phat"
+    method: str = "onset"
     deadline_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     window_s: Annotated[float, Field(ge=0.05, le=2)] = 0.2
     update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1

@@ -79,7 +79,7 @@ def test_matrices_give_the_sum_that_they_stand_for(edge_m: float, budget: float)
 
 def test_a_position_is_one_row_per_event_condition_and_method(tmp_path: Path) -> None:
     job = small_job(tmp_path)
-    position = Position(job.settings, job.clips)
+    position = job.unit()
     rows = position.rows(0)
     keys = {(row["system"], row["method"], row["sound"], row["rt60_s"]) for row in rows}
     assert len(rows) == len(keys) == 2 * 3 * 2 * 2
@@ -95,7 +95,7 @@ def test_a_position_is_one_row_per_event_condition_and_method(tmp_path: Path) ->
 
 def test_dry_and_small_it_finds_the_direction(tmp_path: Path) -> None:
     job = small_job(tmp_path)
-    position = Position(job.settings, job.clips)
+    position = job.unit()
     rows = [row for number in range(8) for row in position.rows(number)]
     dry = [row for row in rows if row["rt60_s"] == 0.0 and row["system"] == "small" and row["method"] == "srp-phat"]
     # a cell of 1 m is 1/3 rad wide at 3 m: half of it is 10 degrees; one in four may be nearer

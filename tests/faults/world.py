@@ -56,6 +56,9 @@ class Fingerprint:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         pass
 
+    def listener(self, array: str, sample_rate_hz: float) -> None:
+        return None
+
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         position = np.zeros(3)
         for k, name in enumerate(sorted(sounds)):

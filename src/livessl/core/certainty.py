@@ -54,6 +54,11 @@ class Signs:
         intercept, of_margin, of_standing = _LOGISTIC
         return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
 
+    @property
+    def tell_direction(self) -> bool:
+        """Whether there is anything at the place, be it only a direction: noise alone stands as high as its rms."""
+        return self.standing >= 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Judgement:

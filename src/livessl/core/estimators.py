@@ -245,6 +245,7 @@ class Onset(SrpPhat):
 
     def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
         super().__init__(arrays, Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M)), c_m_s, band_limit=False)
+        self._map_grid = map_grid(arrays, grid)
         self._samplings: dict[str, tuple[float, LagSampling]] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:

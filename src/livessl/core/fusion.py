@@ -483,7 +483,7 @@ class Fusion:
         found = self._estimator.locate(sounds)
         middle_ns = (window.start + window.stop) * FRAME_NS // 2
         estimate = _estimate(found, middle_ns, sounds)
-        status, _ = self._judge(estimate, found.refused)
+        status, _ = self._judge(estimate, found)
         loudest = max(float(power.max()) for power in powers.values())
         contributions = self._contributions(powers, estimate)
         complete_ns = window.stop * FRAME_NS
@@ -531,7 +531,7 @@ class Fusion:
         if len(sounds) >= parameters.min_arrays:
             found = self._estimator.locate(sounds)
             estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
-            status, reason = self._judge(estimate, found.refused)
+            status, reason = self._judge(estimate, found)
             if status is Status.REFUSED:
                 estimate = None
         return [
@@ -552,14 +552,16 @@ class Fusion:
             )
         ]
 
-    def _judge(self, estimate: Estimate, refused: str | None) -> tuple[Status, str | None]:
+    def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         """Whether the estimate is a place, only a direction, or neither, and why."""
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         specs = [self._streams[name].spec for name in estimate.arrays]
         nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return (Status.LOCATED, None) if refused is None else (Status.REFUSED, refused)
+            return (Status.LOCATED, None) if found.refused is None else (Status.REFUSED, found.refused)
+        if found.signs is not None and not found.signs.tell_direction:
+            return Status.REFUSED, "nothing that was heard came from any one direction"
         who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
         return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 

@@ -36,6 +36,9 @@ HOP_S: Final = 0.005
 PAST_S: Final = 0.1
 """Time constant of the past's decay; between 0.06 and 0.2 s little changes."""
 
+_WINDOW_LAGS: Final = 8
+"""A window is at least so many times as long as the array's largest delay, which would else move sound out of it."""
+
 _STRONGEST: Final = 10.0
 """Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
 
@@ -89,8 +92,8 @@ class OnsetFrontEnd:
         self._band_hz = spec.band_hz
         self._pairs = microphone_pairs(len(spec.microphones_m))
         self._envelope = uses_envelope(spec.band_hz)
-        length = round(WINDOW_S * sample_rate_hz)
-        self._hop = round(HOP_S * sample_rate_hz)
+        length = max(round(WINDOW_S * sample_rate_hz), _WINDOW_LAGS * sampling.room)
+        self._hop = round(HOP_S / WINDOW_S * length)
         self._n_fft = fast_length(length + max(length, sampling.room))
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
         self._band = slice(*band_bins(self._n_fft, sample_rate_hz, spec.band_hz))

@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
     from livessl.evaluate.campaign import Job, read_clips, run_campaign
-    from livessl.evaluate.localizer import POSITIONS, RT60S_S, SNRS_DB, LocalizerSettings
+    from livessl.evaluate.localizer import POSITIONS, RT60S_S, SNRS_DB, SPACING_M, LocalizerSettings
     from livessl.evaluate.localizer_report import write_localizer_report
 
     settings = LocalizerSettings(
@@ -144,7 +144,7 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[
         snrs_db=SNRS_DB if arguments.snr is None else (arguments.snr,),
         seed=arguments.seed,
         sample_rate_hz=float(arguments.sample_rate),
-        spacing_m=arguments.grid or LocalizerSettings.spacing_m,
+        spacing_m=arguments.grid or SPACING_M,
         half=arguments.half,
     )
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ from scipy.signal import oaconvolve
 
 from livessl.core.frontends import whole_segment
 from livessl.core.gcc import CrossSpectra, microphone_pairs
-from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.core.types import ArraySpec, BoolArray, Float32Array, FloatArray
 from livessl.evaluate.maps import PairMatrices, reach_samples
 from livessl.evaluate.paper import (
     BAND_HZ,
@@ -81,6 +82,45 @@ def draw_all(directory: Path, campaigns: Mapping[str, Results]) -> dict[str, str
         figure.savefig(directory / f"{name}.png", dpi=130, metadata={"Software": None})
         figure.savefig(directory / f"{name}.svg", metadata={"Date": None})
     return {name: titles.get(name) or TITLES[name] for name in drawings}
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizerCurve:
+    """One condition of the localizer's campaign.
+
+    Parameters
+    ----------
+    label : str
+    error_m : mapping of method to (n,) float64
+        Ascending, infinite where refused; the standard first.
+    off : (n,) bool
+        Of the events of the last method, the surest first: whether it was off.
+    """
+
+    label: str
+    error_m: Mapping[str, FloatArray]
+    off: BoolArray
+
+
+def draw_localizer(directory: Path, curves: Sequence[LocalizerCurve]) -> None:
+    """Draw what share of events is within a distance, and what share of the surest is off."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mpl.rcParams["svg.hashsalt"] = "livessl"
+    figure, axes = _figure(1, 2, (11.0, 4.6))
+    share, risk = axes[0]
+    for colour, curve in zip(COLOURS, curves, strict=False):
+        for style, (method, error_m) in zip((":", "-"), curve.error_m.items(), strict=True):
+            label, shares = f"{curve.label}, {method}", np.arange(1, len(error_m) + 1) / len(error_m)
+            share.semilogx(error_m, shares, style, color=colour, label=label)
+        kept = np.arange(1, len(curve.off) + 1)
+        risk.plot(kept / len(kept), np.cumsum(curve.off) / kept, color=colour, label=curve.label)
+    share.set(xlabel="error (m)", ylabel="share of events", xlim=(0.003, 10.0), ylim=(0.0, 1.0))
+    risk.set(xlabel="share of events kept", ylabel="of these over 0.5 m off", xlim=(0.5, 1.0), ylim=(0.0, None))
+    for axis in (share, risk):
+        axis.grid(visible=True, alpha=0.3)
+        axis.legend(fontsize=7)
+    figure.savefig(directory / "localizer.png", dpi=130, metadata={"Software": None})
+    figure.savefig(directory / "localizer.svg", metadata={"Date": None})
 
 
 def sigma_theta_deg(theta_deg: FloatArray, spacing_m: FloatArray | float, sample_rate_hz: float) -> FloatArray:

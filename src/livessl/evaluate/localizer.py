@@ -7,7 +7,7 @@ tests. Positions differ by the seed. It draws nothing and writes no report.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import reduce
 from operator import add
 from typing import Any, Final
@@ -27,6 +27,7 @@ METHODS: Final = ("srp-phat", "onset")
 SEPARATION_M: Final = 5
 RT60S_S: Final = (0.0, 0.4, 1.0, 2.0)
 SNRS_DB: Final = (float("inf"), 10.0)
+SPACING_M: Final = 0.1
 POSITIONS: Final = 200
 
 LEAD_S: Final = 0.5
@@ -77,9 +78,13 @@ class LocalizerSettings:
     snrs_db: tuple[float, ...] = SNRS_DB
     seed: int = 0
     sample_rate_hz: float = 16000.0
-    spacing_m: float = 0.1
+    spacing_m: float = SPACING_M
     half: str = HALVES[1]
     experiment: str = LOCALIZER
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values by name."""
+        return asdict(self)
 
 
 class LocalizerPosition:

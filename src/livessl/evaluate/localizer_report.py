@@ -1,4 +1,4 @@
-"""What the localizer's campaign found: tables against the paper's standard, honesty, a figure. It simulates nothing."""
+"""What the localizer's campaign found: tables against the paper's standard, honesty. It simulates and draws nothing."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
 import pyarrow.parquet as pq
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from livessl.core.certainty import LEAST_CONFIDENCE, NEAR_M, Signs
 from livessl.core.types import BoolArray, FloatArray
-from livessl.evaluate.figures import COLOURS
-from livessl.evaluate.localizer import HALVES, METHODS, development_fit
+from livessl.evaluate.command import HALVES
+from livessl.evaluate.figures import LocalizerCurve, draw_localizer
+from livessl.evaluate.localizer import METHODS, development_fit
 from livessl.evaluate.report import Block, Heading, Picture, Table, as_markdown
 from livessl.evaluate.statistics import INTERVAL, RESAMPLES, write_csv
 
@@ -35,12 +33,7 @@ def write_localizer_report(out: Path) -> list[Path]:
     settings = json.loads((out / "campaign.json").read_text(encoding="utf-8"))["settings"]
     columns = read_columns(out / "results.parquet")
     rows = summary(columns)
-    figures = out / "figures"
-    figures.mkdir(exist_ok=True)
-    mpl.rcParams["svg.hashsalt"] = "livessl"  # the same figure, the same bytes
-    figure = _figure(columns)
-    figure.savefig(figures / "localizer.png", dpi=130, metadata={"Software": None})
-    figure.savefig(figures / "localizer.svg", metadata={"Date": None})
+    draw_localizer(out / "figures", _curves(columns))
     write_csv(out / "summary.csv", rows)
     (out / "report.md").write_text(as_markdown(_blocks(columns, rows, settings)), encoding="utf-8")
     return [out / name for name in ("summary.csv", "report.md")]
@@ -138,13 +131,15 @@ def _blocks(columns: Columns, rows: Sequence[dict[str, Any]], settings: Mapping[
         "below the event's mean power, over its whole recording with its reverberation. Both methods see the same "
         f"samples and refine below a grid of {settings['spacing_m']:g} m. Refused: confidence below "
         f"{LEAST_CONFIDENCE:g}.",
+        f"Command: `livessl evaluate localizer --events DIR --positions {settings['positions']} "
+        f"--seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 task 2.",
         Table(_TITLES, [_cells(row) for row in rows if row["sound"] == "all"]),
         "Lost: more than 0.5 m off, or refused. More lost than the standard: difference on the same events, with its "
         "99 % interval (bootstrap over positions); below 0 is better.",
         Picture(
             "localizer",
             "Left: share of events within a distance, refused ones counted as never. Right: of the "
-            "events kept when the least confident are refused, the share over 0.5 m off.",
+            "events kept when the least confident are refused, the share over 0.5 m off",
         ),
         Heading(2, "By class of sound"),
         Table(("sound", *_TITLES), [(row["sound"], *_cells(row)) for row in rows if row["sound"] != "all"]),
@@ -181,7 +176,7 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _calibration(columns: Columns, ours: BoolArray, good: BoolArray) -> list[tuple[str, ...]]:
     edges = (0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for low, high in pairwise(edges):
         within = ours & (columns["confidence"] >= low) & ((columns["confidence"] < high) | (high == 1.0))
         if within.any():
@@ -190,27 +185,20 @@ def _calibration(columns: Columns, ours: BoolArray, good: BoolArray) -> list[tup
     return rows
 
 
-def _figure(columns: Columns) -> Figure:
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    share, risk = figure.subplots(1, 2)
-    hard = [(rt60_s, snr_db) for rt60_s, snr_db in _conditions(columns) if rt60_s >= 1.0]
-    for colour, (rt60_s, snr_db) in zip(COLOURS, hard, strict=False):
-        name = f"RT {rt60_s:g} s, " + (f"{snr_db:g} dB" if np.isfinite(snr_db) else "clean")
+def _curves(columns: Columns) -> list[LocalizerCurve]:
+    found = _conditions(columns)
+    hard = [each for each in found if each[0] >= 1.0] or found
+    curves = []
+    for rt60_s, snr_db in hard:
         here = (columns["rt60_s"] == rt60_s) & (columns["snr_db"] == snr_db)
-        for method, style in ((STANDARD, ":"), (OURS, "-")):
-            chosen = here & (columns["method"] == method)
-            error = np.sort(np.where(columns["located"][chosen], columns["error_m"][chosen], np.inf))
-            share.semilogx(error, np.arange(1, len(error) + 1) / len(error), style, color=colour,
-                           label=f"{name}, {method}")  # fmt: skip
         ours = here & (columns["method"] == OURS)
         surest = np.argsort(-columns["confidence"][ours], kind="stable")
-        off = columns["error_m"][ours][surest] > NEAR_M
-        kept = np.arange(1, len(off) + 1)
-        risk.plot(kept / len(off), np.cumsum(off) / kept, color=colour, label=name)
-    share.set(xlabel="error (m)", ylabel="share of events", xlim=(0.003, 10.0), ylim=(0.0, 1.0))
-    risk.set(xlabel="share of events kept", ylabel="of these over 0.5 m off", xlim=(0.5, 1.0), ylim=(0.0, None))
-    for axis in (share, risk):
-        axis.grid(visible=True, alpha=0.3)
-        axis.legend(fontsize=7)
-    return figure
+        error_m = np.where(columns["located"], columns["error_m"], np.inf)
+        curves.append(
+            LocalizerCurve(
+                f"RT {rt60_s:g} s, " + (f"{snr_db:g} dB" if np.isfinite(snr_db) else "clean"),
+                {method: np.sort(error_m[here & (columns["method"] == method)]) for method in METHODS},
+                columns["error_m"][ours][surest] > NEAR_M,
+            )
+        )
+    return curves
