@@ -189,13 +189,13 @@ def test_start_that_waits_for_the_compiler_says_so(
 ) -> None:
     def compile_slowly() -> None:
         if said:
-            wait_until(lambda: "compiling the search" in caplog.text, "the message")
+            wait_until(lambda: "preparing the search" in caplog.text, "the message")
 
     monkeypatch.setattr(engine, "SAY_S", say_s)
     monkeypatch.setattr(engine, "warm_up", compile_slowly)
     with caplog.at_level("INFO"), running_server(site_of()):
         pass
-    assert ("compiling the search" in caplog.text) == said
+    assert ("preparing the search" in caplog.text) == said
 
 
 def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:

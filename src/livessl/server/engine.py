@@ -33,7 +33,7 @@ STATUS_NS: Final = 500_000_000
 """Between two reports on the arrays."""
 
 SAY_S: Final = 2.0
-"""A start that waits longer for the compiler says so."""
+"""A start that waits longer than this for the compiler says so."""
 
 WATCH_NS: Final = 100_000_000
 """Between two looks whether an array's state has changed; then it is reported at once."""
@@ -402,7 +402,8 @@ class Engine:
 
 def _warm_up() -> None:
     """Have compiled what localizes, before anybody waits for it; read from numba's cache it takes a moment only."""
-    told = threading.Timer(SAY_S, _log.info, ["compiling the search, some seconds at the first start on this machine"])
+    what = "preparing the search: the first start on a machine compiles it, which takes some seconds"
+    told = threading.Timer(SAY_S, _log.info, [what])
     told.start()
     try:
         warm_up()
