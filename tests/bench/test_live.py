@@ -120,7 +120,7 @@ def test_a_server_that_does_not_come_up_is_told() -> None:
 
 
 def test_kernels_are_measured_without_live(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    report = kernels.KernelReport("compiled", 0.25, (kernels.Timing("map, 2 arrays", 1.5, 2.5, 1.9),))
+    report = kernels.KernelReport("compiled", 0.25, (kernels.Timing("map, 2 arrays", 1.5, 2.5, 1.4, ratio=1.9),))
     monkeypatch.setattr(kernels, "measure", lambda clock, progress: report)
     assert main(["bench"]) == 0
     told = capsys.readouterr().out

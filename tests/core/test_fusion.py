@@ -752,6 +752,26 @@ def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
     assert None not in on_time.heard
 
 
+def test_a_twin_hears_only_what_the_other_has_not() -> None:
+    """In step, all that one hears is the other's, too; from a frame that only one has on, each hears for itself."""
+    arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
+    alone, both = Listening(), Listening()
+    play(fusion_of(alone), arrivals, 60)
+    first = fusion_of(both)
+    second = first.twin()
+    for fusion in (first, second):
+        play(fusion, arrivals, 60)
+    assert both.heard == alone.heard
+    assert both.sums == 2 * alone.sums
+
+    partly = Listening()
+    first = fusion_of(partly)
+    second = first.twin()
+    play(first, [arrival for arrival in arrivals if arrival[1].raster != START + 16], 60)
+    play(second, arrivals, 60)
+    assert partly.sums[-1] == alone.sums[-1]
+
+
 @pytest.mark.parametrize("refused", [None, "too unsure"])
 def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None) -> None:
     estimator = Scripted()

@@ -66,6 +66,16 @@ RANGE_APERTURES: Final = 2.0
 delays, which the covariance cannot know, moves the place along the line of sight by metres."""
 
 
+SHARED_FRAMES: Final = 4096
+"""Frames of which a fusion and its twin share what listeners made of them: some seconds of many arrays."""
+
+UNHEARD_FRAMES: Final = 600
+"""Half a minute, longer than an event: no more can be heard after all."""
+
+_Shared = dict[tuple[str, int], OnsetGCC]
+"""By array and chain of frames."""
+
+
 class ArrayState(StrEnum):
     """How an array is doing, as the server sees it."""
 
@@ -143,6 +153,10 @@ class _Stream:
     trouble: str = ""
     left: bool = False
     listener: OnsetFrontEnd | None = None
+    chain: int = 0  # names the frames listened to, in their order
+    unheard: deque[int] = field(
+        default_factory=lambda: deque(maxlen=UNHEARD_FRAMES)
+    )  # those another fusion's heard for it
     onsets: dict[int, OnsetGCC] = field(default_factory=dict)
     counters: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
@@ -176,22 +190,46 @@ class _Stream:
             there.append(raster)
         return pieces, there
 
-    def listen(self, rasters: Iterable[int], estimator: Estimator) -> None:
+    def listen(self, rasters: Iterable[int], estimator: Estimator, shared: _Shared) -> None:
         """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
         for raster in rasters:
             frame = self.frames.get(raster)
             if frame is None:
                 if self.listener is not None:
                     self.listener.reset()
+                self.chain = 0
+                self.unheard.clear()
                 continue
-            if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
-                self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
-            if self.listener is not None:
-                self.onsets[raster] = self.listener.push(frame.samples, quiet=not frame.active)
+            self.chain = hash((self.chain, raster, frame.active, frame.sample_rate_hz))
+            onsets = shared.get((self.spec.name, self.chain))
+            if onsets is None:
+                onsets = self._push(frame, estimator)
+                if onsets is None:
+                    continue
+                shared[self.spec.name, self.chain] = onsets
+                if len(shared) > SHARED_FRAMES:
+                    del shared[next(iter(shared))]
+            else:
+                self.unheard.append(raster)
+            self.onsets[raster] = onsets
+
+    def _push(self, frame: Frame, estimator: Estimator) -> OnsetGCC | None:
+        """Let the listener hear a frame, after those that another one has heard for it."""
+        if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
+            self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
+            if self.listener is None:
+                return None
+        missed = [self.frames[raster] for raster in self.unheard if raster in self.frames]
+        self.unheard.clear()
+        for one in missed:
+            if one.sample_rate_hz == frame.sample_rate_hz:
+                self.listener.push(one.samples, quiet=not one.active)
+        return self.listener.push(frame.samples, quiet=not frame.active)
 
     def forget(self) -> None:
         """Forget what was listened to."""
-        self.listener = None
+        self.listener, self.chain = None, 0
+        self.unheard.clear()
         self.onsets.clear()
 
     def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
@@ -250,13 +288,16 @@ class Fusion:
         self._now_ns = 0
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
+        self._shared: _Shared = {}
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
     def twin(self) -> Fusion:
         """Another of the same site around the same estimator, at its beginning, that makes events only."""
         specs = [stream.spec for stream in self._streams.values()]
-        return Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+        other = Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+        other._shared = self._shared
+        return other
 
     def begin(self, raster: int) -> None:
         """Take it that everything before this raster interval has been told."""
@@ -433,7 +474,7 @@ class Fusion:
             return []
         event.closed = raster
         for stream in self._streams.values():
-            stream.listen([raster], self._estimator)
+            stream.listen([raster], self._estimator, self._shared)
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
@@ -461,7 +502,7 @@ class Fusion:
         if raster != self._heard_until:
             for stream in self._streams.values():
                 stream.forget()
-                stream.listen(span, self._estimator)
+                stream.listen(span, self._estimator, self._shared)
         return _OpenEvent(raster, raster, raster)
 
     def _span_start(self, start: int) -> int:
@@ -518,7 +559,7 @@ class Fusion:
                 continue
             if any(raster not in stream.onsets for raster in there):  # some came late
                 stream.forget()
-                stream.listen(span, self._estimator)
+                stream.listen(span, self._estimator, self._shared)
             sounds.pieces[name], powers[name] = pieces, power[mask]
             sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
             first, last = min(first, rasters[0]), max(last, rasters[-1])
