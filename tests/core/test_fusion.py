@@ -772,6 +772,12 @@ def test_a_twin_hears_only_what_the_other_has_not() -> None:
     assert partly.sums[-1] == alone.sums[-1]
 
 
+def test_sound_without_end_leaves_nothing_behind() -> None:
+    fusion = fusion_of(Listening(), max_event_s=1.0)
+    play(fusion, [(k + 1.0, numbered(k, k >= 12)) for k in range(4, 200)], 200)
+    assert len(fusion._streams["north"].onsets) <= len(fusion._streams["north"].frames) < 60
+
+
 @pytest.mark.parametrize("refused", [None, "too unsure"])
 def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None) -> None:
     estimator = Scripted()

@@ -221,10 +221,12 @@ class Spool:
         self._segment = int(path.stem)
         content = path.read_bytes()
         offset = len(_MAGIC) if content.startswith(_MAGIC) else len(content)
+        self._needed[self._segment] += 1  # by us, while we read it
         while (data := _record(content, offset)) is not None and (frame := _frame(data)) is not None:
             self._clear_from(frame)
             self._add(Kept(frame.array, frame.raster, len(data), None, self._segment, offset))
             offset += _RECORD.size + len(data)
+        self._needed[self._segment] -= 1
         self.torn += offset != len(content)
         self._tidy(self._segment)
 

@@ -80,8 +80,7 @@ class Judgement:
 def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
     """Nodes (3, 2), first and last along each axis, that are the same place: within `peaks.RIVAL_DISTANCE_M`."""
     reach = min(peaks.RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
-    axes = [np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach) for axis in range(3)]
-    return np.array([[axis[0], axis[-1]] for axis in axes], dtype=np.int64)
+    return peaks.box_within(grid, position_m, reach)
 
 
 def judge(

@@ -1,4 +1,4 @@
-"""The searching and mapping kernels, compiled by numba: what `livessl.core.vectorised` does, many times faster.
+"""The searching and mapping kernels, compiled by numba: what `livessl.core.vectorised` does, faster.
 
 Each function has its twin there, which says what it does: the same arguments, the same answers to the last bit.
 """
@@ -230,7 +230,7 @@ def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
                 continue
             if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
                 continue
-            if spent > most:
+            if spent > most and best > -np.inf:
                 return best_node, best, False
             spent += 2 * children * len(rows)
             _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
@@ -247,7 +247,7 @@ def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
                 if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
                     continue
                 if not _covered(first, edge, shape, boxes):
-                    if spent > most:
+                    if spent > most and best > -np.inf:
                         return best_node, best, False
                     spent += edge**3 * len(rows)
                     best, best_node = _best_of_cell(

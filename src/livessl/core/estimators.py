@@ -268,7 +268,8 @@ class Onset(SrpPhat):
         rival_power = rivals[0].power if rivals else 0.0
         judged = certainty.judge(functional, evidence, position, power, rival_power, self._grid)
         confidence, proven = judged.signs.confidence, found[0].proven
-        return Localization(position, judged.covariance_m2, confidence, evidence, proven, judged.signs, judged.refused)
+        refused = judged.refused if proven else "nothing stands out: the search for the place was given up"
+        return Localization(position, judged.covariance_m2, confidence, evidence, proven, judged.signs, refused)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         onsets = sound.onsets

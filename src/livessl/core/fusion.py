@@ -220,6 +220,8 @@ class _Stream:
             if self.listener is None:
                 return None
         missed = [self.frames[raster] for raster in self.unheard if raster in self.frames]
+        if len(missed) < len(self.unheard) or len(missed) == UNHEARD_FRAMES:
+            self.listener.reset()
         self.unheard.clear()
         for one in missed:
             if one.sample_rate_hz == frame.sample_rate_hz:
@@ -376,6 +378,7 @@ class Fusion:
         outputs += self._tracker.step(self._now_ns + round(2e9 * SILENCE_S))
         self._streams = {name: _Stream(old.spec, counters=old.counters) for name, old in self._streams.items()}
         self._reached.clear()
+        self._shared.clear()
         self._next, self._heard_until = None, -(2**63)
         return outputs
 
@@ -417,6 +420,7 @@ class Fusion:
                 self._event.late_frames += 1
         if frame.sample_rate_hz != stream.rate_hz:
             stream.frames.clear()  # its node came back with another device: the two do not make one sound
+            stream.forget()
             stream.rate_hz = frame.sample_rate_hz
         stream.frames[frame.raster] = frame
         stream.counters["frames"] += 1
@@ -438,7 +442,7 @@ class Fusion:
             self._next += 1
             self._prune()
         due, self._due = self._due, None
-        if due is not None and self._event is not None:
+        if due is not None and self._event is not None and due >= self._event.start:
             outputs += self._update(self._event, due)
         return outputs
 
@@ -619,6 +623,8 @@ class Fusion:
         for stream in self._streams.values():
             while stream.frames and (first := next(iter(stream.frames))) < oldest:
                 del stream.frames[first]
+            while stream.onsets and (first := next(iter(stream.onsets))) < oldest:
+                del stream.onsets[first]
 
 
 class _Sounds(Mapping[str, Sound]):

@@ -74,6 +74,15 @@ def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
     return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
 
 
+def box_within(grid: Grid, position_m: FloatArray, reach_m: float) -> IntArray:
+    """First and last node along each axis (3, 2) of what lies at most so far from a place; 1 and 0 where none does."""
+    box = np.empty((3, 2), dtype=np.int64)
+    for axis in range(3):
+        near = np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach_m)
+        box[axis] = (near[0], near[-1]) if len(near) else (1, 0)
+    return box
+
+
 def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
     """From nodes to the highest top near any of them.
 
@@ -145,11 +154,7 @@ def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray)
     Elsewhere is more than `RIVAL_DISTANCE_M` away along some axis (a quarter of the volume's size where that is less).
     """
     reach = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
-    box = np.empty((3, 2), dtype=np.int64)
-    for axis in range(3):
-        near = np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach)
-        box[axis] = (near[0], near[-1]) if len(near) else (1, 0)
-    rivals = find(1, without=[box])
+    rivals = find(1, without=[box_within(grid, position_m, reach)])
     second = rivals[0].power if rivals else 0.0
     return 0.0 if first.power <= 0 else float(np.clip(1.0 - max(second, 0.0) / first.power, 0.0, 1.0))
 

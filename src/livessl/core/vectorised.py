@@ -252,14 +252,14 @@ def highest(
     cubes = promising(every, corners, per_top * edge, (top_low, top_high))
     spent += 2 * len(every) * len(rows)
     while (chosen := cubes.take(best, best_node)) is not None:
-        if spent > most:
+        if spent > most and best > -np.inf:
             return best_node, float(best), False
         which, first = chosen
         children = (which[:, None] * per_top**3 + np.arange(per_top**3)).ravel()
         spent += 2 * len(children) * len(rows)
         cells = promising(children, (first[:, None] + inner).reshape(-1, 3), edge, (low, high))
         while (chosen := cells.take(best, best_node)) is not None:
-            if spent > most:
+            if spent > most and best > -np.inf:
                 return best_node, float(best), False
             spent += len(chosen[1]) * edge**3 * len(rows)
             at = (chosen[1][:, None] + inmost).reshape(-1, 3)

@@ -339,9 +339,16 @@ class Engine:
             _log.error("%s", error)
         self._publish_event(event)
 
+    def _provisional(self, until: int) -> list[JsonObject]:
+        try:
+            return self._store.provisional(until)
+        except StoreError as error:  # what was told without an array is then told again, not replaced
+            _log.error("%s", error)
+            return []
+
     def _tell_settled(self, settled: Settled, messages: Messages) -> None:
         """Events that stay: those that are news are told, once they are stored."""
-        before = [] if self._replay_now_ns is not None else self._store.provisional(settled.until)
+        before = [] if self._replay_now_ns is not None else self._provisional(settled.until)
         events = []
         for output in settled.events:
             stages = None if output.late or before else self._stages(output, "event")

@@ -108,7 +108,8 @@ class Subscription:
         if older is not None:
             del self._waiting[older]
         elif len(self._waiting) >= BACKLOG:
-            victim = min(self._newest.values(), default=next(iter(self._waiting)))
+            states = (seq for seq, told in self._waiting.items() if told.subject is not None)
+            victim = next(states, next(iter(self._waiting)))
             self._forget(self._waiting.pop(victim), victim)
             self._missed += 1
         else:

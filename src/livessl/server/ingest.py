@@ -123,15 +123,9 @@ class Ingest:
                 wire.WireError(f"node {peer.hello.node!r} sent array {message.array!r}, which it did not announce"),
                 now_ns,
             )
-        rate_hz = peer.hello.arrays[message.array]
-        if isinstance(message, Frame) and message.sample_rate_hz != rate_hz and not peer.is_backlog(message):
-            return self._reject(
-                wire.WireError(
-                    f"node {peer.hello.node!r} sent {message.sample_rate_hz:g} Hz of array {message.array!r}, "
-                    f"announced were {rate_hz:g} Hz"
-                ),
-                now_ns,
-            )
+        wrong = self._wrong_rate(peer, message) if isinstance(message, Frame) else None
+        if wrong is not None:
+            return self._reject(wire.WireError(wrong), now_ns)
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
             return Arrival(message=message)
@@ -145,6 +139,16 @@ class Ingest:
         if isinstance(message, Frame):
             peer.take(message)
         return Arrival(message=message)
+
+    def _wrong_rate(self, peer: Peer, frame: Frame) -> str | None:
+        """What is wrong with a frame's sampling rate: sound of an earlier run may have another than was announced."""
+        rate_hz, sent = frame.sample_rate_hz, f"node {peer.hello.node!r} sent {frame.sample_rate_hz:g} Hz"
+        high_hz, announced_hz = self._site.array(frame.array).band_hz[1], peer.hello.arrays[frame.array]
+        if high_hz >= rate_hz / 2:
+            return f"{sent} of array {frame.array!r}, which uses up to {high_hz:g} Hz"
+        if rate_hz != announced_hz and not peer.is_backlog(frame):
+            return f"{sent} of array {frame.array!r}, announced were {announced_hz:g} Hz"
+        return None
 
     def _missing_before(self, peer: Peer, message: Message) -> int | None:
         """How many frames should have come before a message of live sound; None where it was here before."""
@@ -183,7 +187,11 @@ class Ingest:
             peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
             peer.received, peer.live = same_run.received, same_run.live
         peer.greet(hello)
-        others = {k: other for k, other in self._peers.items() if other.hello.node != hello.node and k != routing_id}
+        others = {
+            key: other
+            for key, other in self._peers.items()
+            if other.hello.node != hello.node and other.hello.replay == hello.replay and key != routing_id
+        }
         self._peers = {**others, routing_id: peer}  # replaced, never changed: other threads read it
         if same_run is None:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))

@@ -134,9 +134,18 @@ class Store:
         return None if not rows else int(rows[0][0])
 
     def provisional(self, raster: int) -> list[JsonObject]:
-        """Events before a raster interval that may still be replaced."""
+        """Events before a raster interval that may still be replaced.
+
+        Raises
+        ------
+        StoreError
+            Where the file cannot be read.
+        """
         sql = "SELECT json FROM events JOIN provisional USING (id) WHERE time_ns < ? ORDER BY time_ns"
-        return [json.loads(text) for (text,) in self._writing.rows(sql, (raster * FRAME_NS,))]
+        try:
+            return [json.loads(text) for (text,) in self._writing.rows(sql, (raster * FRAME_NS,))]
+        except sqlite3.Error as error:
+            raise StoreError(f"server.events_db: cannot read: {error}; release the file") from error
 
     def _insert(self, db: sqlite3.Connection, event: JsonObject, time_ns: int) -> None:
         db.execute(
@@ -169,8 +178,9 @@ class Store:
             with self._writing.lock:
                 with self._writing.db as db:
                     gone = db.execute("DELETE FROM events WHERE time_ns < ?", (before_ns,)).rowcount
-                if gone:
-                    self._writing.db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                busy, *_ = self._writing.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+                if busy:
+                    raise StoreError("server.events_db: its journal was not emptied of old events; release the file")
         except sqlite3.Error as error:
             raise StoreError(f"server.events_db: old events were not deleted: {error}; release the file") from error
         return gone

@@ -328,6 +328,7 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
             return
+        arrays = await asyncio.to_thread(engine.arrays)
         subscription = hub.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
@@ -337,7 +338,7 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
             "site": site.site,
             "mode": engine.mode,
             "last_seq": hub.last_seq,
-            "arrays": await asyncio.to_thread(engine.arrays),
+            "arrays": arrays,
         }
         try:
             await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
