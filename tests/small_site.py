@@ -149,9 +149,9 @@ def wait_until(condition: Callable[[], object], what: str, seconds: float = 10.0
 
 
 @contextmanager
-def running_server(site: Site) -> Iterator[Server]:
+def running_server(site: Site, method: str | None = None) -> Iterator[Server]:
     """A whole server in a thread, answering."""
-    server = Server(site, SystemClock())
+    server = Server(site, SystemClock(), method=method)
     thread = Thread(target=server.run)
     thread.start()
     try:

@@ -277,8 +277,10 @@ class World:
         return sounds
 
     def start_server(self) -> None:
+        fusion = self.site.fusion.model_copy(update={"method": "fingerprint"})
+        site = self.site.model_copy(update={"fusion": fusion})
         with patch("livessl.server.engine.Receiver", Post):
-            self.server = Engine(self.site, self.clock, self.store, self.published.append, "fingerprint")
+            self.server = Engine(site, self.clock, self.store, self.published.append)
 
     def kill_server(self) -> None:
         self.server = None

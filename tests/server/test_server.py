@@ -315,6 +315,15 @@ def test_addresses_that_are_taken() -> None:
         pass  # the failed start has given its port back
 
 
+def test_method_of_the_command_line_is_the_sites() -> None:
+    with running_server(site_of(), method="averaged") as server:
+        assert httpx.get(f"{server.url}/api/v1/site").json()["method"] == "averaged"
+        play(server)
+        wait_until(lambda: server.engine.events == 2, "both events")
+        told = httpx.get(f"{server.url}/api/v1/events").json()["events"]
+    assert {event["method"] for event in told} == {"averaged"}
+
+
 def test_host_that_is_not_ours(tmp_path: Path) -> None:
     add_token(tmp_path / "tokens.yaml", "tests", "viewer")
     said = refused({"server.http.host": "192.0.2.1", "server.http.tokens": "tokens.yaml"}, tmp_path)

@@ -84,6 +84,8 @@ class Server:
         faults = open_doors(site)
         if faults:
             raise ConfigError(faults)
+        if method is not None:
+            site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
         http = site.server.http
         tokens = None if http.tokens is None else read_tokens(site.file(http.tokens))
         certificate = _certificate(site)
@@ -99,7 +101,7 @@ class Server:
             undo.callback(self._sinks.close)
             self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
             undo.callback(self._store.close)
-            self.engine = Engine(site, clock, self._store, self._publish, method)
+            self.engine = Engine(site, clock, self._store, self._publish)
             undo.pop_all()
         app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, tokens)
         self._uvicorn = uvicorn.Server(

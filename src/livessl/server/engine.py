@@ -72,8 +72,6 @@ class Engine:
     store : Store
     publish : callable
         Gets every message for subscribers; called on the engine's thread.
-    method : str or None
-        Estimator, instead of the site's.
 
     Raises
     ------
@@ -81,14 +79,11 @@ class Engine:
         Where the address for the nodes is taken.
     """
 
-    def __init__(
-        self, site: Site, clock: Clock, store: Store, publish: Callable[[JsonObject], None], method: str | None = None
-    ) -> None:
+    def __init__(self, site: Site, clock: Clock, store: Store, publish: Callable[[JsonObject], None]) -> None:
         self._site = site
         self._clock = clock
         self._store = store
         self._publish = publish
-        self._method = method
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
         self._tracks: dict[int, JsonObject] = {}  # replaced, never changed: other threads read it
@@ -205,7 +200,7 @@ class Engine:
 
     def _begin(self, arrays: Iterable[str], settled: int | None, *, live: bool = False) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._settling = Settling(self._site.make_fusion(self._method, live=live), arrays, settled)
+        self._settling = Settling(self._site.make_fusion(live=live), arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
 
