@@ -50,4 +50,5 @@ def test_a_server_loads_nothing_of_other_commands(tmp_path: Path) -> None:
 
 
 def test_methods_of_a_site_file_are_the_estimators() -> None:
-    assert tuple(ESTIMATORS) == METHODS
+    ours = [name for name, made in ESTIMATORS.items() if made.__module__.startswith("livessl.")]  # tests add their own
+    assert tuple(ours) == METHODS
