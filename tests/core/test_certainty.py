@@ -10,7 +10,8 @@ from free_field import C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
 from hypothesis import given
 from hypothesis import strategies as st
 
-from livessl.core.certainty import LEAST_CONFIDENCE, Judgement, Signs, judge, neighbourhood
+from livessl.core import peaks
+from livessl.core.certainty import LEAST_CONFIDENCE, Judgement, Signs, judge
 from livessl.core.geometry import Grid
 from livessl.core.srp import SRPFunctional
 from livessl.core.types import ArraySpec, HeardBy
@@ -68,7 +69,7 @@ def test_nothing_heard_is_refused_without_a_warning() -> None:
 
 
 def test_neighbourhood_is_a_metre_around_and_inside_the_grid() -> None:
-    box = neighbourhood(SOURCE_M, GRID)
+    box = peaks.neighbourhood(SOURCE_M, GRID)
     for axis, (first, last) in enumerate(box):
         nodes = GRID.axis_m(axis)
         assert abs(nodes[first] - SOURCE_M[axis]) <= 1.0

@@ -14,7 +14,7 @@ import numpy as np
 from livessl.core import peaks
 from livessl.core.geometry import Grid
 from livessl.core.srp import PairTerms, SRPFunctional
-from livessl.core.types import FloatArray, HeardBy, IntArray
+from livessl.core.types import FloatArray, HeardBy
 
 NEAR_M: Final = 0.5
 """The confidence is the probability that the place is right to within so much."""
@@ -77,12 +77,6 @@ class Judgement:
     refused: str | None
 
 
-def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
-    """Nodes (3, 2), first and last along each axis, that are the same place: within `peaks.RIVAL_DISTANCE_M`."""
-    reach = min(peaks.RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
-    return peaks.box_within(grid, position_m, reach)
-
-
 def judge(
     functional: SRPFunctional,
     evidence: Sequence[HeardBy],
@@ -101,12 +95,12 @@ def judge(
     position_m : (3,) float64
         The highest place.
     power, rival_power : float
-        The functional there, and the highest outside its `neighbourhood`.
+        The functional there, and the highest outside its `peaks.neighbourhood`.
     grid : Grid
     """
     terms = functional.pair_terms(position_m)
-    margin = float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
-    signs = Signs(margin, sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True)))
+    standing = sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True))
+    signs = Signs(peaks.margin(power, rival_power), standing)
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
     refused = None
     if signs.confidence < LEAST_CONFIDENCE:

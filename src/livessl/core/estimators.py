@@ -264,8 +264,7 @@ class Onset(SrpPhat):
         functional = SRPFunctional(evidence, self._c_m_s)
         starts_m = np.stack([self._grid.node_m(peak.node) for peak in found])
         position, power = peaks.refine(functional, starts_m, self._grid)
-        rivals = find(1, without=[certainty.neighbourhood(position, self._grid)])
-        rival_power = rivals[0].power if rivals else 0.0
+        rival_power = peaks.rival_power(find, self._grid, position)
         judged = certainty.judge(functional, evidence, position, power, rival_power, self._grid)
         confidence, proven = judged.signs.confidence, found[0].proven
         refused = judged.refused if proven else "nothing stands out: the search for the place was given up"
@@ -304,6 +303,7 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
+
 MAP_SPACING_M: Final = 0.1
 """Maps are not drawn finer than this: a screen shows no more of a room."""
 

@@ -74,8 +74,12 @@ def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
     return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
 
 
-def box_within(grid: Grid, position_m: FloatArray, reach_m: float) -> IntArray:
-    """First and last node along each axis (3, 2) of what lies at most so far from a place; 1 and 0 where none does."""
+def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
+    """Nodes (3, 2), first and last along each axis, that are the same place as a position; 1 and 0 where there is none.
+
+    That is at most `RIVAL_DISTANCE_M` away along every axis, or a quarter of the volume's size where that is less.
+    """
+    reach_m = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
     box = np.empty((3, 2), dtype=np.int64)
     for axis in range(3):
         near = np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach_m)
@@ -148,15 +152,20 @@ def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
     return np.asarray(eigenvectors @ ((eigenvectors.T @ gradient) / strength))
 
 
-def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
-    """How far the peak stands out: 1 - (highest power elsewhere) / (highest power), 0 to 1.
+def rival_power(find: FindPeaks, grid: Grid, position_m: FloatArray) -> float:
+    """Highest power outside a position's `neighbourhood`; 0 where there is no outside."""
+    rivals = find(1, without=[neighbourhood(position_m, grid)])
+    return rivals[0].power if rivals else 0.0
 
-    Elsewhere is more than `RIVAL_DISTANCE_M` away along some axis (a quarter of the volume's size where that is less).
-    """
-    reach = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
-    rivals = find(1, without=[box_within(grid, position_m, reach)])
-    second = rivals[0].power if rivals else 0.0
-    return 0.0 if first.power <= 0 else float(np.clip(1.0 - max(second, 0.0) / first.power, 0.0, 1.0))
+
+def margin(power: float, rival_power: float) -> float:
+    """How far a place stands out from the best other one: 1 - (power there) / (power here), 0 to 1."""
+    return float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
+
+
+def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
+    """How far the peak stands out: its `margin` over the highest power outside its `neighbourhood`."""
+    return margin(first.power, rival_power(find, grid, position_m))
 
 
 def laplace_covariance_m2(

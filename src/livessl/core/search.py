@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core import vectorised
+from livessl.core.gcc import microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.peaks import FindPeaks, Peak, box_around
@@ -64,7 +65,7 @@ class PeakSearch:
         self._cells = [-(-n // self._edge) for n in grid.shape]
         self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
         self._specs = {spec.name: spec for spec in arrays}
-        self._pairs = {s.name: np.stack(np.triu_indices(len(s.microphones_m), k=1), axis=1) for s in arrays}
+        self._pairs = {spec.name: microphone_pairs(len(spec.microphones_m)) for spec in arrays}
         counts = [len(pairs) for pairs in self._pairs.values()]
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total = sum(counts)
