@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.jit import jit
-from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT, SILENT_POWER
+from livessl.core.vectorised import BLOCKS, MINIMUM, NO_LAG, PRODUCT, RUNS, SILENT_POWER
 
 NAME: Final = "numba"
 
@@ -167,18 +167,24 @@ def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, 
 
 
 @_compiled
-def running_maxima(values, maxima):  # type: ignore[no-untyped-def]
-    """Maxima over 1, 2, 4, ... lags from each lag on."""
-    maxima[0] = values
-    for level in range(1, len(maxima)):
-        half = 1 << (level - 1)
-        length = values.shape[1] - half
-        for row in range(len(values)):
-            before, now = maxima[level - 1, row], maxima[level, row]
-            for lag in range(length):
-                now[lag] = max(before[lag], before[lag + half])
-            for lag in range(length, values.shape[1]):
-                now[lag] = before[lag]
+def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
+    """Maxima over runs of blocks of lags."""
+    length = values.shape[1]
+    for r in range(len(values)):
+        row, of_blocks, size = values[r], maxima[r], block[r]
+        of_blocks[:BLOCKS] = -np.inf
+        for b in range(min(BLOCKS, -(-length // size))):
+            most = row[b * size]
+            for lag in range(b * size + 1, min((b + 1) * size, length)):
+                most = max(most, row[lag])
+            of_blocks[b] = most
+        for level in range(1, maxima.shape[1] // BLOCKS):
+            further = RUNS[level] - RUNS[level - 1]
+            before, now = of_blocks[(level - 1) * BLOCKS : level * BLOCKS], of_blocks[level * BLOCKS :]
+            for b in range(BLOCKS - further):
+                now[b] = max(before[b], before[b + further])
+            for b in range(BLOCKS - further, BLOCKS):
+                now[b] = before[b]
 
 
 @_compiled
@@ -198,25 +204,17 @@ def _start(rule):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _bounds(first, count, low, high, rows, first_row, weight, rule, maxima, level_of, bound):  # type: ignore[no-untyped-def]
+def bounds(maxima, places, rows, first_row, weight, rule, bound):  # type: ignore[no-untyped-def]
     """What no node of each of some cells exceeds."""
-    flat = maxima.reshape(maxima.size)
-    length = np.uint32(maxima.shape[2])
-    level_step = np.uint32(maxima.shape[1]) * length
-    bound[:count] = _start(rule)
-    total = np.empty(count, np.float32)
+    bound[:] = _start(rule)
+    total = np.empty(len(bound), np.float32)
     for a in range(len(weight)):
         total[:] = np.float32(0.0)
         for r in range(first_row[a], first_row[a + 1]):
-            lows, highs = low[rows[r], first : first + count], high[rows[r], first : first + count]
-            start = np.uint32(r) * length
-            for c in range(count):  # unsigned all along: signed indices would be asked whether they count from the end
-                lowest, highest = np.uint32(lows[c]), np.uint32(highs[c])
-                level = np.uint32(level_of[highest - lowest])
-                at = start + level * level_step
-                second = highest + np.uint32(1) - (np.uint32(1) << level)
-                total[c] += max(flat[at + lowest], flat[at + second])
-        for c in range(count):
+            row, of_cells = maxima[r], places[rows[r]]
+            for c in range(len(bound)):
+                total[c] += row[of_cells[c]]
+        for c in range(len(bound)):
             bound[c] = _joined(rule, bound[c], weight[a] * total[c])
 
 
@@ -276,39 +274,43 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
+    values, maxima, rows, first_row, weight, rule, places, top_bound, cell_bound, bounded,
     x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip
     """The highest node outside some boxes, by branch and bound."""
     shape = (len(x_m), len(y_m), len(z_m))
     top_edge = edge * per_top
     tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
-    count, children = top_low.shape[1], per_top**3
-    top_bound, child_bound = np.empty(count, np.float32), np.empty(children, np.float32)
+    children = per_top**3
+    child_bound = np.empty(children, np.float32)
     distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
     total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
-    _bounds(0, count, top_low, top_high, rows, first_row, weight, rule, maxima, level_of, top_bound)
-    spent = 2 * count * len(rows)
+    spent = 0
     best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
-    order = np.array([np.argmax(top_bound)])
+    first_top = np.argmax(top_bound)
+    order = np.array([first_top])
     for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
         if turn == 1:
-            top_bound[order[0]] = -np.inf
             left = np.flatnonzero(top_bound >= best)
             order = left[np.argsort(-top_bound[left])]
         for top in order:
-            if top_bound[top] < best or top_bound[top] == -np.inf:
+            if top_bound[top] < best:
                 break
+            if turn == 1 and top == first_top:
+                continue
             t_x, t_y, t_z = top // (tops_y * tops_z), top // tops_z % tops_y, top % tops_z
             t_x, t_y, t_z = t_x * top_edge, t_y * top_edge, t_z * top_edge
             if top_bound[top] == best and (t_x * shape[1] + t_y) * shape[2] + t_z > best_node:
                 continue
             if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
                 continue
-            if spent > most and best > -np.inf:
-                return best_node, best, False
-            spent += 2 * children * len(rows)
-            _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
+            if not bounded[top]:
+                if spent > most and best > -np.inf:
+                    return best_node, best, False
+                spent += children * len(rows)
+                bounds(maxima, places[top], rows, first_row, weight, rule, cell_bound[top])
+                bounded[top] = True
+            child_bound[:] = cell_bound[top]
             while True:
                 child = np.argmax(child_bound)
                 bound = child_bound[child]

@@ -24,7 +24,7 @@ from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 class Sound:
     """What one array heard: segments, each (K, n) samples without gaps, at its sampling rate."""
 
-    segments: tuple[Float32Array, ...]
+    segments: Sequence[Float32Array]
     sample_rate_hz: float
     onsets: OnsetGCC | None = None
     """What the estimator's listener made of its frames and those around them, where there is one."""
@@ -247,6 +247,7 @@ class Onset(SrpPhat):
         super().__init__(arrays, Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M)), c_m_s, band_limit=False)
         self._map_grid = map_grid(arrays, grid)
         self._samplings: dict[str, tuple[float, LagSampling]] = {}
+        self._alike: dict[tuple[tuple[float, float], float, int], LagSampling] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
@@ -285,7 +286,11 @@ class Onset(SrpPhat):
             return known[1]
         spec = self._arrays[array]
         require_band(spec, sample_rate_hz)
-        sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
+        largest_lag_s = spec.aperture_m / self._c_m_s
+        kind = (spec.band_hz, sample_rate_hz, LagSampling.reach(sample_rate_hz, largest_lag_s))
+        if kind not in self._alike:
+            self._alike[kind] = LagSampling(spec.band_hz, sample_rate_hz, largest_lag_s)
+        sampling = self._alike[kind]
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling

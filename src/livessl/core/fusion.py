@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import reduce
 from operator import add
-from typing import Final
+from typing import Final, overload
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from livessl.core.types import (
     Contribution,
     Estimate,
     Event,
+    Float32Array,
     FloatArray,
     Frame,
     Mark,
@@ -627,8 +628,27 @@ class Fusion:
                 del stream.onsets[first]
 
 
+class _Segments(Sequence[Float32Array]):
+    """Runs of frames, each joined when it is looked at: of many arrays never all at once, and not if nobody looks."""
+
+    def __init__(self, pieces: Sequence[Sequence[Frame]]) -> None:
+        self._pieces = pieces
+
+    @overload
+    def __getitem__(self, index: int) -> Float32Array: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Float32Array]: ...
+    def __getitem__(self, index: int | slice) -> Float32Array | Sequence[Float32Array]:
+        if isinstance(index, slice):
+            return _Segments(self._pieces[index])
+        return np.concatenate([frame.samples for frame in self._pieces[index]], axis=1)
+
+    def __len__(self) -> int:
+        return len(self._pieces)
+
+
 class _Sounds(Mapping[str, Sound]):
-    """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
+    """What the arrays heard."""
 
     def __init__(self) -> None:
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
@@ -636,8 +656,7 @@ class _Sounds(Mapping[str, Sound]):
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
-        segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
+        return Sound(_Segments(pieces), pieces[0][0].sample_rate_hz, self.onsets[array])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)

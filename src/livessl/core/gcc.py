@@ -35,6 +35,9 @@ _RIDGE: Final = 1e-10
 _PRODUCT_BINS: Final = 2048
 """Up to so many bins, a third of a second, lags come by a matrix that is kept; above it by a short inverse FFT."""
 
+_ROUNDING: Final = 1e-6
+"""Of a lag: arrays of one shape, turned this way and that, are equally wide but for their last digits."""
+
 _MATRICES: Final = 16
 """Matrices kept: a site's windows have few lengths."""
 
@@ -194,7 +197,7 @@ class LagSampling:
 
     def __init__(self, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> None:
         self._rate_hz = sample_rate_hz
-        fine = int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING)) + 2 * OVERSAMPLING
+        fine = self.reach(sample_rate_hz, largest_lag_s)
         self.fine_lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
         least = _NYQUIST_MARGIN * 2.0 * band_hz[1] / sample_rate_hz * FFT_FACTOR
         self._per_factor = scipy.fft.next_fast_len(int(np.ceil(least)), real=True)  # lags in FFT_FACTOR samples
@@ -205,6 +208,11 @@ class LagSampling:
         self._lags_s = np.arange(-self._reach, self._reach + 1) * np.float64(step / sample_rate_hz)
         self._weights = _least_squares(self._lags_s, self.fine_lags_s, band_hz)
         self._matrices: dict[tuple[int, bool], Float32Array] = {}
+
+    @staticmethod
+    def reach(sample_rate_hz: float, largest_lag_s: float) -> int:
+        """Fine lags on each side of zero: with the band and the rate, all that a sampling depends on."""
+        return int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING - _ROUNDING)) + 2 * OVERSAMPLING
 
     def sample(
         self, cross: CrossSpectra, cut_off_hz: float = np.inf, *, envelope: bool = False

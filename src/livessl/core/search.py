@@ -21,7 +21,7 @@ from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.peaks import FindPeaks, Peak, box_around
 from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray, UInt8Array, UInt16Array
+from livessl.core.types import GCC, ArraySpec, BoolArray, Float32Array, FloatArray, HeardBy, IntArray, UInt16Array
 
 CELL_M: Final = 0.2
 """Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
@@ -70,9 +70,9 @@ class PeakSearch:
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total = sum(counts)
         tops = int(np.prod(self._tops))
-        self._low, self._high = (np.zeros((total, tops * CELLS_PER_TOP**3), np.uint16) for _ in range(2))
-        self._top_low, self._top_high = (np.zeros((total, tops), np.uint16) for _ in range(2))
-        self._places: dict[str, LagPlaces] = {}
+        self._cell_places = np.zeros((tops, total, CELLS_PER_TOP**3), np.uint16)
+        self._top_places = np.zeros((total, tops), np.uint16)
+        self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Rows] = {}
 
     def prepare(self, array: str, lags_s: FloatArray) -> None:
@@ -90,14 +90,16 @@ class PeakSearch:
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         rows = slice(first, first + len(pairs))
-        places = self._places[array] = LagPlaces.on(lags_s, self._c_m_s)
+        places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
         low, high = (np.empty((len(pairs), int(np.prod(self._cells))), np.uint16) for _ in range(2))
         microphones_m = spec.microphones_m.astype(np.float32)
         kernels.cell_intervals(
             *self._axes, microphones_m, pairs.astype(np.int32), places.scale, places.offset, self._edge, low, high
         )
-        self._low[rows], self._top_low[rows] = self._by_cube(low, np.minimum)
-        self._high[rows], self._top_high[rows] = self._by_cube(high, np.maximum)
+        block = _block(len(lags_s))
+        (low, top_low), (high, top_high) = self._by_cube(low, np.minimum), self._by_cube(high, np.maximum)
+        self._cell_places[:, rows] = _run_places(low, high, block).swapaxes(0, 1)
+        self._top_places[rows] = _run_places(top_low, top_high, block)
         self._sets.clear()
 
     def among(
@@ -117,15 +119,19 @@ class PeakSearch:
         for array, heard in enumerate(evidence):
             values = heard.gcc.values
             rows.values[rows.first_row[array] : rows.first_row[array + 1], : values.shape[1]] = values
-        kernels.running_maxima(rows.values, rows.maxima)
+        kernels.running_maxima(rows.values, rows.block, rows.maxima)
+        kernels.bounds(
+            rows.maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), rows.top_bound
+        )
+        rows.bounded[:] = False
 
         def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
                 node, power, proven = kernels.highest(
-                    rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
-                    self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
+                    rows.values, rows.maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
+                    rows.top_bound, rows.cell_bound, rows.bounded, *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
                     np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
                 )  # fmt: skip
@@ -138,7 +144,7 @@ class PeakSearch:
         return find
 
     def _by_cube(self, cells: UInt16Array, extreme: np.ufunc) -> tuple[UInt16Array, UInt16Array]:
-        """Intervals' ends (P, C) of cells in the grid's order: cube after cube, filled up with zeros; and of cubes."""
+        """Intervals' ends of cells in the grid's order: (P, T, cells) by cubes, filled up with zeros; and of cubes."""
         pairs = len(cells)
         by_axis = cells.reshape(pairs, *self._cells)
         of_cubes = by_axis
@@ -147,7 +153,8 @@ class PeakSearch:
         padded = np.zeros((pairs, *(CELLS_PER_TOP * tops for tops in self._tops)), np.uint16)
         padded[:, : self._cells[0], : self._cells[1], : self._cells[2]] = by_axis
         split = padded.reshape(pairs, *(n for tops in self._tops for n in (tops, CELLS_PER_TOP)))
-        return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(pairs, -1), of_cubes.reshape(pairs, -1)
+        of_cubes = of_cubes.reshape(pairs, -1)
+        return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(*of_cubes.shape, -1), of_cubes
 
     def _rows(self, arrays: tuple[str, ...]) -> _Rows:
         if arrays not in self._sets:
@@ -157,15 +164,19 @@ class PeakSearch:
         return self._sets[arrays]
 
     def _new_rows(self, arrays: tuple[str, ...]) -> _Rows:
-        specs, places = [self._specs[name] for name in arrays], [self._places[name] for name in arrays]
+        specs, places = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
         first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
         rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
         length = max(one.count for one in places)
-        levels = int((self._top_high[rows] - self._top_low[rows]).max()).bit_length() + 1
+        most = 1 + int(self._top_places[rows].max())
+        tops = self._top_places.shape[1]
         return _Rows(
             values=np.zeros((len(rows), length), np.float32),
-            maxima=np.zeros((levels, len(rows), length), np.float32),
-            level_of=np.array([(n + 1).bit_length() - 1 for n in range(length)], np.uint8),
+            block=np.repeat([_block(one.count) for one in places], np.diff(first_row)),
+            maxima=np.zeros((len(rows), -(-most // vectorised.BLOCKS) * vectorised.BLOCKS), np.float32),
+            top_bound=np.zeros(tops, np.float32),
+            cell_bound=np.zeros((tops, CELLS_PER_TOP**3), np.float32),
+            bounded=np.zeros(tops, np.bool_),
             rows=rows,
             first_row=first_row,
             weight=np.array([pair_weight(len(spec.microphones_m)) for spec in specs], np.float32),
@@ -177,6 +188,18 @@ class PeakSearch:
         )
 
 
+def _block(lags: int) -> int:
+    """How many lags of an axis make one of its blocks."""
+    return -(-lags // vectorised.BLOCKS)
+
+
+def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
+    """Where among the running maxima the shortest run is that begins with the block of `low` and holds that of `high`."""
+    first = low // block
+    level = np.searchsorted(vectorised.RUNS, high // block - first + 1)
+    return (level * vectorised.BLOCKS + first).astype(np.uint16)
+
+
 _SETS: Final = 16
 """Sets of arrays that are kept ready."""
 
@@ -186,8 +209,11 @@ class _Rows:
     """What a search over one set of arrays needs, and the room it works in: see `vectorised.highest`."""
 
     values: Float32Array
+    block: IntArray
     maxima: Float32Array
-    level_of: UInt8Array
+    top_bound: Float32Array
+    cell_bound: Float32Array
+    bounded: BoolArray
     rows: IntArray
     first_row: IntArray
     weight: Float32Array
