@@ -274,7 +274,7 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    values, maxima, rows, first_row, weight, rule, places, top_bound, cell_bound, bounded,
+    values, maxima, rows, first_row, weight, rule, places, leaf_places, top_bound, cell_bound, bounded,
     x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip
     """The highest node outside some boxes, by branch and bound."""
@@ -283,6 +283,8 @@ def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
     tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
     children = per_top**3
     child_bound = np.empty(children, np.float32)
+    leaf_edge = edge // 2 if leaf_places.shape[2] else edge
+    leaf_bound = np.empty(max(1, leaf_places.shape[2]), np.float32)
     distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
     total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
     spent = 0
@@ -323,12 +325,30 @@ def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
                     continue  # a cube at the volume's edge has cells outside it
                 if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
                     continue
-                if not _covered(first, edge, shape, boxes):
+                if _covered(first, edge, shape, boxes):
+                    continue
+                if leaf_places.shape[2] == 0:
+                    leaf_bound[0] = bound
+                else:
+                    spent += len(leaf_bound) * len(rows)
+                    bounds(maxima, leaf_places[top * children + child], rows, first_row, weight, rule, leaf_bound)
+                while True:
+                    leaf = np.argmax(leaf_bound)
+                    if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
+                        break
+                    leaf_bound[leaf] = -np.inf
+                    at = (
+                        first[0] + leaf // 4 * leaf_edge,
+                        first[1] + leaf // 2 % 2 * leaf_edge,
+                        first[2] + leaf % 2 * leaf_edge,
+                    )
+                    if at[0] >= shape[0] or at[1] >= shape[1] or at[2] >= shape[2]:
+                        continue
                     if spent > most and best > -np.inf:
                         return best_node, best, False
-                    spent += edge**3 * len(rows)
+                    spent += leaf_edge**3 * len(rows)
                     best, best_node = _best_of_cell(
-                        first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
+                        at, leaf_edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
                         weight, rule, values, boxes, best, best_node, distance, total, fused,
                     )  # fmt: skip
     return best_node, best, True

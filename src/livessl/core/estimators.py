@@ -247,7 +247,6 @@ class Onset(SrpPhat):
         super().__init__(arrays, Grid(grid.bounds_m, min(grid.spacing_m, SEARCH_SPACING_M)), c_m_s, band_limit=False)
         self._map_grid = map_grid(arrays, grid)
         self._samplings: dict[str, tuple[float, LagSampling]] = {}
-        self._alike: dict[tuple[tuple[float, float], float, int], LagSampling] = {}
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Work out an array's tables for a sampling rate."""
@@ -286,11 +285,7 @@ class Onset(SrpPhat):
             return known[1]
         spec = self._arrays[array]
         require_band(spec, sample_rate_hz)
-        largest_lag_s = spec.aperture_m / self._c_m_s
-        kind = (spec.band_hz, sample_rate_hz, LagSampling.reach(sample_rate_hz, largest_lag_s))
-        if kind not in self._alike:
-            self._alike[kind] = LagSampling(spec.band_hz, sample_rate_hz, largest_lag_s)
-        sampling = self._alike[kind]
+        sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling

@@ -7,6 +7,7 @@ SRP equation has the opposite one, which would mirror the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,9 @@ _PRODUCT_BINS: Final = 2048
 
 _ROUNDING: Final = 1e-6
 """Of a lag: arrays of one shape, turned this way and that, are equally wide but for their last digits."""
+
+_SAMPLINGS: Final = 16
+"""Samplings kept for all arrays: a site's have few shapes."""
 
 _MATRICES: Final = 16
 """Matrices kept: a site's windows have few lengths."""
@@ -89,7 +93,7 @@ class GCCPhat:
         self._rate_hz = sample_rate_hz
         self._front_end = front_end
         self._envelope = uses_envelope(spec.band_hz)
-        self._sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / c_m_s)
+        self._sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / c_m_s)
         self.lags_s = self._sampling.fine_lags_s
 
     def __call__(self, segments: Sequence[Float32Array]) -> GCC:
@@ -197,7 +201,7 @@ class LagSampling:
 
     def __init__(self, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> None:
         self._rate_hz = sample_rate_hz
-        fine = self.reach(sample_rate_hz, largest_lag_s)
+        fine = _fine_lags(sample_rate_hz, largest_lag_s)
         self.fine_lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
         least = _NYQUIST_MARGIN * 2.0 * band_hz[1] / sample_rate_hz * FFT_FACTOR
         self._per_factor = scipy.fft.next_fast_len(int(np.ceil(least)), real=True)  # lags in FFT_FACTOR samples
@@ -209,10 +213,10 @@ class LagSampling:
         self._weights = _least_squares(self._lags_s, self.fine_lags_s, band_hz)
         self._matrices: dict[tuple[int, bool], Float32Array] = {}
 
-    @staticmethod
-    def reach(sample_rate_hz: float, largest_lag_s: float) -> int:
-        """Fine lags on each side of zero: with the band and the rate, all that a sampling depends on."""
-        return int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING - _ROUNDING)) + 2 * OVERSAMPLING
+    @classmethod
+    def shared(cls, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> LagSampling:
+        """One for all that are alike, as arrays of one shape are: its matrices are then in the cache, and but once."""
+        return _alike(band_hz, sample_rate_hz, _fine_lags(sample_rate_hz, largest_lag_s))
 
     def sample(
         self, cross: CrossSpectra, cut_off_hz: float = np.inf, *, envelope: bool = False
@@ -249,6 +253,17 @@ class LagSampling:
                 del self._matrices[next(iter(self._matrices))]
             self._matrices[key] = matrix.astype(np.float32)
         return self._matrices[key]
+
+
+def _fine_lags(sample_rate_hz: float, largest_lag_s: float) -> int:
+    """Fine lags on each side of zero: with band and rate, all that a sampling depends on."""
+    return int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING - _ROUNDING)) + 2 * OVERSAMPLING
+
+
+@lru_cache(_SAMPLINGS)
+def _alike(band_hz: tuple[float, float], sample_rate_hz: float, fine_lags: int) -> LagSampling:
+    largest_lag_s = (fine_lags - 2 * OVERSAMPLING) / (OVERSAMPLING * sample_rate_hz)
+    return LagSampling(band_hz, sample_rate_hz, largest_lag_s)
 
 
 def _least_squares(lags_s: FloatArray, fine_lags_s: FloatArray, band_hz: tuple[float, float]) -> Float32Array:

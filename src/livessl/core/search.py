@@ -32,6 +32,9 @@ MOST_LOOK_UPS: Final = 5_000_000
 """After so many a search is given up, some 10 ms compiled. Two arrays never need so many, nor do many that hear a sound
 well; many that hear nothing but noise do."""
 
+MOST_HALVES_BYTES: Final = 64_000_000
+"""Cells are halved along each axis, before nodes are looked at, where the tables of that take no more."""
+
 CELLS_PER_TOP: Final = 4
 """Cells along an edge of the cubes of cells that are bounded first."""
 
@@ -61,7 +64,8 @@ class PeakSearch:
         self._c_m_s = c_m_s
         self._axes = [grid.axis_m(axis).astype(np.float32) for axis in range(3)]
         volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
-        self._edge = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / grid.spacing_m))
+        half = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / 2 / grid.spacing_m))
+        self._edge = 2 * half
         self._cells = [-(-n // self._edge) for n in grid.shape]
         self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
         self._specs = {spec.name: spec for spec in arrays}
@@ -70,7 +74,10 @@ class PeakSearch:
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total = sum(counts)
         tops = int(np.prod(self._tops))
-        self._cell_places = np.zeros((tops, total, CELLS_PER_TOP**3), np.uint16)
+        children = CELLS_PER_TOP**3
+        self._halves = half > 1 and 2 * 8 * children * tops * total <= MOST_HALVES_BYTES
+        self._cell_places = np.zeros((tops, total, children), np.uint16)
+        self._leaf_places = np.zeros((tops * children, total, 8 if self._halves else 0), np.uint16)
         self._top_places = np.zeros((total, tops), np.uint16)
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Rows] = {}
@@ -91,15 +98,25 @@ class PeakSearch:
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         rows = slice(first, first + len(pairs))
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
-        low, high = (np.empty((len(pairs), int(np.prod(self._cells))), np.uint16) for _ in range(2))
-        microphones_m = spec.microphones_m.astype(np.float32)
+        edge = self._edge // 2 if self._halves else self._edge
+        small = [-(-len(axis_m) // edge) for axis_m in self._axes]
+        low, high = (np.empty((len(pairs), *small), np.uint16) for _ in range(2))
         kernels.cell_intervals(
-            *self._axes, microphones_m, pairs.astype(np.int32), places.scale, places.offset, self._edge, low, high
-        )
+            *self._axes, spec.microphones_m.astype(np.float32), pairs.astype(np.int32), places.scale, places.offset,
+            edge, low.reshape(len(pairs), -1), high.reshape(len(pairs), -1),
+        )  # fmt: skip
         block = _block(len(lags_s))
-        (low, top_low), (high, top_high) = self._by_cube(low, np.minimum), self._by_cube(high, np.maximum)
-        self._cell_places[:, rows] = _run_places(low, high, block).swapaxes(0, 1)
-        self._top_places[rows] = _run_places(top_low, top_high, block)
+        if self._halves:
+            children = CELLS_PER_TOP * 2
+            leaf_places = _by_cube(_run_places(low, high, block), self._tops, children)
+            split = leaf_places.reshape(len(pairs), -1, *(n for _ in range(3) for n in (CELLS_PER_TOP, 2)))
+            by_cell = split.transpose(1, 2, 4, 6, 0, 3, 5, 7)
+            self._leaf_places[:, rows] = by_cell.reshape(len(self._leaf_places), len(pairs), 8)
+            low, high = _extreme(low, 2, np.minimum), _extreme(high, 2, np.maximum)
+        places_of_cells = _by_cube(_run_places(low, high, block), self._tops, CELLS_PER_TOP)
+        self._cell_places[:, rows] = places_of_cells.swapaxes(0, 1)
+        low, high = _extreme(low, CELLS_PER_TOP, np.minimum), _extreme(high, CELLS_PER_TOP, np.maximum)
+        self._top_places[rows] = _run_places(low, high, block).reshape(len(pairs), -1)
         self._sets.clear()
 
     def among(
@@ -131,7 +148,7 @@ class PeakSearch:
             for _ in range(count):
                 node, power, proven = kernels.highest(
                     rows.values, rows.maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
-                    rows.top_bound, rows.cell_bound, rows.bounded, *self._axes, self._edge, CELLS_PER_TOP,
+                    self._leaf_places, rows.top_bound, rows.cell_bound, rows.bounded, *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
                     np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
                 )  # fmt: skip
@@ -142,19 +159,6 @@ class PeakSearch:
             return found
 
         return find
-
-    def _by_cube(self, cells: UInt16Array, extreme: np.ufunc) -> tuple[UInt16Array, UInt16Array]:
-        """Intervals' ends of cells in the grid's order: (P, T, cells) by cubes, filled up with zeros; and of cubes."""
-        pairs = len(cells)
-        by_axis = cells.reshape(pairs, *self._cells)
-        of_cubes = by_axis
-        for axis, count in enumerate(self._cells):
-            of_cubes = extreme.reduceat(of_cubes, np.arange(0, count, CELLS_PER_TOP), axis=axis + 1)
-        padded = np.zeros((pairs, *(CELLS_PER_TOP * tops for tops in self._tops)), np.uint16)
-        padded[:, : self._cells[0], : self._cells[1], : self._cells[2]] = by_axis
-        split = padded.reshape(pairs, *(n for tops in self._tops for n in (tops, CELLS_PER_TOP)))
-        of_cubes = of_cubes.reshape(pairs, -1)
-        return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(*of_cubes.shape, -1), of_cubes
 
     def _rows(self, arrays: tuple[str, ...]) -> _Rows:
         if arrays not in self._sets:
@@ -198,6 +202,21 @@ def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
     first = low // block
     level = np.searchsorted(vectorised.RUNS, high // block - first + 1)
     return (level * vectorised.BLOCKS + first).astype(np.uint16)
+
+
+def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
+    """Of intervals' ends (P, X, Y, Z), the extremes over cubes with `count` an edge."""
+    for axis in (1, 2, 3):
+        ends = extreme.reduceat(ends, np.arange(0, ends.shape[axis], count), axis=axis)
+    return ends
+
+
+def _by_cube(table: UInt16Array, cubes: Sequence[int], count: int) -> UInt16Array:
+    """A table (P, X, Y, Z) as (P, T, count^3): cube after cube, filled up with zeros where one reaches out."""
+    padded = np.zeros((len(table), *(count * n for n in cubes)), table.dtype)
+    padded[:, : table.shape[1], : table.shape[2], : table.shape[3]] = table
+    split = padded.reshape(len(table), *(n for along in cubes for n in (along, count)))
+    return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(len(table), -1, count**3)
 
 
 _SETS: Final = 16

@@ -308,7 +308,7 @@ def bounds(
 
 def highest(
     values: Float32Array, maxima: Float32Array, rows: IntArray, first_row: IntArray, weight: Float32Array, rule: int,
-    places: UInt16Array, top_bound: Float32Array, cell_bound: Float32Array, bounded: BoolArray,
+    places: UInt16Array, leaf_places: UInt16Array, top_bound: Float32Array, cell_bound: Float32Array, bounded: BoolArray,
     x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int, microphones_m: Float32Array,
     first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray, most: int,
 ) -> tuple[int, float, bool]:  # fmt: skip
@@ -332,6 +332,8 @@ def highest(
         `SUM`, `PRODUCT` of the positive parts or `MINIMUM` over the arrays.
     places : (T, site's pairs, per_top^3) uint16
         Of the cells of each cube: see `bounds`.
+    leaf_places : (T per_top^3, site's pairs, 8 or 0) uint16
+        Of the halves, along each axis, of each cell; 0 where the nodes of a whole cell are looked at together.
     top_bound : (T,) float32
         Bounds of the cubes.
     cell_bound : (T, per_top^3) float32
@@ -373,7 +375,11 @@ def highest(
         return _Cells(which[order], first[order], bound[order], np.ravel_multi_index(tuple(first[order].T), shape))
 
     inner = np.stack(np.unravel_index(np.arange(per_top**3), (per_top,) * 3), axis=1) * edge
-    inmost = np.stack(np.unravel_index(np.arange(edge**3), (edge,) * 3), axis=1)
+    halves = leaf_places.shape[2] > 0
+    leaf_edge = edge // 2 if halves else edge
+    leaf_bound = np.empty((_CELLS_AT_ONCE, 8), dtype=np.float32)
+    leaves = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * leaf_edge
+    inmost = np.stack(np.unravel_index(np.arange(leaf_edge**3), (leaf_edge,) * 3), axis=1)
     every = np.arange(len(top_bound))
     corners = np.stack(np.unravel_index(every, tops), axis=1) * (per_top * edge)
     cubes = promising(every, corners, per_top * edge, top_bound)
@@ -390,8 +396,15 @@ def highest(
         while (chosen := cells.take(best, best_node)) is not None:
             if spent > most and best > -np.inf:
                 return best_node, float(best), False
-            spent += len(chosen[1]) * edge**3 * len(rows)
-            at = (chosen[1][:, None] + inmost).reshape(-1, 3)
+            which, first = chosen
+            for cell in range(0, len(which) if halves else 0):
+                bounds(maxima, leaf_places[which[cell]], rows, first_row, weight, rule, leaf_bound[cell])
+            if halves:
+                spent += leaf_bound[: len(which)].size * len(rows)
+                hopeful = leaf_bound[: len(which)] >= best
+                first = (first[:, None] + leaves)[hopeful]
+            spent += len(first) * leaf_edge**3 * len(rows)
+            at = (first[:, None] + inmost).reshape(-1, 3)
             at = at[(at < shape).all(axis=1)]
             for box in boxes:
                 at = at[~((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)]
