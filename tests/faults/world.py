@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 import numpy as np
@@ -250,7 +250,7 @@ class World:
         Where the nodes keep their frames; None keeps them in memory.
     """
 
-    array_of: Mapping[str, str] = ARRAY_OF
+    array_of: ClassVar[Mapping[str, str]] = ARRAY_OF
 
     def __init__(
         self, seed: int, sounds: int = 8, delay_ticks: tuple[int, int] = (0, 1), spools: Path | None = None
