@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 import scipy.fft
 
+from livessl.core.kernels import kernels
 from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
 
 MOST_OFF_S: Final = 0.6
@@ -272,8 +273,10 @@ def _rises(frames: Sequence[Frame]) -> FloatArray:
     """By how much the power of each piece of `HOP_S` exceeds all before it, less the decay; log, (n,)."""
     frames = frames[: round(LISTENED_S / FRAME_S)]
     pieces = round(FRAME_S / HOP_S)
-    steps = [np.diff(frame.samples, axis=1, prepend=frame.samples[:, :1]) for frame in frames]  # no rumble
-    power = np.concatenate([_means(np.square(step).mean(axis=0), pieces) for step in steps])
+    power = np.empty((len(frames), pieces), dtype=np.float32)
+    for frame, of_pieces in zip(frames, power, strict=True):
+        kernels.step_powers(frame.samples, of_pieces)
+    power = power.ravel()
     floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
     decay = np.log(10.0) / 10.0 * _DECAY_DB_S * HOP_S * np.arange(len(level))
@@ -299,7 +302,3 @@ def _lag_s(first: FloatArray, other: FloatArray) -> float | None:
         return None
     before, at, after = fits[top - 1 : top + 2]
     return float(lags[top] + 0.5 * (before - after) / (before - 2.0 * at + after)) * HOP_S
-
-
-def _means(values: FloatArray, pieces: int) -> FloatArray:
-    return np.array([part.mean() for part in np.array_split(values, pieces)])
