@@ -10,8 +10,6 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import reduce
-from operator import add
 from typing import Final, overload
 
 import numpy as np
@@ -20,7 +18,8 @@ from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.onset import OnsetFrontEnd, OnsetGCC
+from livessl.core.listening import Ear, Listening
+from livessl.core.onset import OnsetGCC
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
@@ -66,16 +65,6 @@ RANGE_UNKNOWN: Final = 0.25
 RANGE_APERTURES: Final = 2.0
 """Further away than so many times its own width, an array alone tells no distance: what reverberation does to its
 delays, which the covariance cannot know, moves the place along the line of sight by metres."""
-
-
-SHARED_FRAMES: Final = 4096
-"""Frames of which a fusion and its twin share what listeners made of them: some seconds of many arrays."""
-
-UNHEARD_FRAMES: Final = 600
-"""Half a minute, longer than an event: no more can be heard after all."""
-
-_Shared = dict[tuple[str, int], OnsetGCC]
-"""By array and chain of frames."""
 
 
 class ArrayState(StrEnum):
@@ -158,12 +147,8 @@ class _Stream:
     left: bool = False
     ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
     rest_ns: int = 0  # that it is ahead besides
-    listener: OnsetFrontEnd | None = None
-    chain: int = 0  # names the frames listened to, in their order
-    unheard: deque[int] = field(
-        default_factory=lambda: deque(maxlen=UNHEARD_FRAMES)
-    )  # those another fusion's heard for it
-    onsets: dict[int, OnsetGCC] = field(default_factory=dict)
+    ear: Ear = field(default_factory=Ear)
+    next_ear: Ear = field(default_factory=Ear)  # for the sound that may come after this one
     counters: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
     )
@@ -196,44 +181,6 @@ class _Stream:
             there.append(raster)
         return pieces, there
 
-    def listen(self, rasters: Iterable[int], estimator: Estimator, shared: _Shared) -> None:
-        """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
-        for raster in rasters:
-            frame = self.frames.get(raster)
-            if frame is None:
-                if self.listener is not None:
-                    self.listener.reset()
-                self.chain = 0
-                self.unheard.clear()
-                continue
-            self.chain = hash((self.chain, raster, frame.time_ns, frame.active, frame.sample_rate_hz))
-            onsets = shared.get((self.spec.name, self.chain))
-            if onsets is None:
-                onsets = self._push(frame, estimator)
-                if onsets is None:
-                    continue
-                shared[self.spec.name, self.chain] = onsets
-                if len(shared) > SHARED_FRAMES:
-                    del shared[next(iter(shared))]
-            else:
-                self.unheard.append(raster)
-            self.onsets[raster] = onsets
-
-    def _push(self, frame: Frame, estimator: Estimator) -> OnsetGCC | None:
-        """Let the listener hear a frame, after those that another one has heard for it."""
-        if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
-            self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
-            if self.listener is None:
-                return None
-        missed = [self.frames[raster] for raster in self.unheard if raster in self.frames]
-        if len(missed) < len(self.unheard) or len(missed) == UNHEARD_FRAMES:
-            self.listener.reset()
-        self.unheard.clear()
-        for one in missed:
-            if one.sample_rate_hz == frame.sample_rate_hz:
-                self.listener.push(one.samples, quiet=not one.active)
-        return self.listener.push(frame.samples, quiet=not frame.active)
-
     def move(self, frames: int) -> None:
         """Take it that its clock is ahead by so many frames more."""
         self.ahead += frames
@@ -244,14 +191,7 @@ class _Stream:
 
     def forget(self) -> None:
         """Forget what was listened to."""
-        self.listener, self.chain = None, 0
-        self.unheard.clear()
-        self.onsets.clear()
-
-    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
-        """All that was listened to at `rasters` together; None for nothing."""
-        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        return reduce(add, heard) if heard else None
+        self.ear, self.next_ear = Ear(), Ear()
 
 
 @dataclass(slots=True)
@@ -310,7 +250,8 @@ class Fusion:
         self._now_ns = 0
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
-        self._shared: _Shared = {}
+        self._listening = Listening(estimator)
+        self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
@@ -320,7 +261,7 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._shared = self._shared
+        other._listening = self._listening
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -416,7 +357,8 @@ class Fusion:
             for name, old in self._streams.items()
         }
         self._reached.clear()
-        self._shared.clear()
+        self._listening.clear()
+        self._ahead = None
         self._next, self._heard_until = None, -(2**63)
         return outputs
 
@@ -467,6 +409,8 @@ class Fusion:
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
+        if self._event is not None and frame.raster == self._next:
+            self._hear([stream], [frame.raster])  # while the others' are on their way
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -518,12 +462,14 @@ class Fusion:
             self._event = self._open(raster)
         event = self._event
         if event is None:
+            self._listen_ahead(raster, self._heard_until)
             return []
         event.closed = raster
-        for stream in self._streams.values():
-            stream.listen([raster], self._estimator, self._shared)
+        self._hear(self._streams.values(), [raster])
         if active:
-            event.last_active = raster
+            event.last_active, self._ahead = raster, None
+        else:
+            self._listen_ahead(raster, event.last_active + 1)
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
             event.ended = event.became_quiet = True
             return self._finish()
@@ -547,10 +493,37 @@ class Fusion:
         """
         span = range(self._span_start(raster), raster)
         if raster != self._heard_until:
+            ready = self._ahead == (span.start, span.stop - 1)
             for stream in self._streams.values():
-                stream.forget()
-                stream.listen(span, self._estimator, self._shared)
+                if ready and stream.next_ear.has(r for r in span if r in stream.frames):
+                    stream.ear = stream.next_ear
+                else:
+                    self._hear_anew(stream, span)
+        self._ahead = None
         return _OpenEvent(raster, raster, raster)
+
+    def _hear(self, streams: Iterable[_Stream], rasters: Sequence[int]) -> None:
+        for stream in streams:
+            self._listening.hear(stream.spec.name, stream.ear, rasters, stream.frames)
+
+    def _hear_anew(self, stream: _Stream, rasters: Sequence[int]) -> None:
+        stream.ear = Ear()
+        self._hear([stream], rasters)
+
+    def _listen_ahead(self, raster: int, begin: int) -> None:
+        """In quiet, listen to what a sound that comes soon will begin with: from `begin` on, where the last one ended.
+
+        That is as far as its pre-roll reaches back. With many arrays there is no time for it when the sound is there.
+        """
+        if not self._newest_only or raster - begin >= round(self._parameters.pre_roll_s / FRAME_S):
+            return
+        if raster != begin and self._ahead != (begin, raster - 1):
+            return
+        for stream in self._streams.values():
+            if raster == begin:
+                stream.next_ear = Ear()
+            self._listening.hear(stream.spec.name, stream.next_ear, [raster], stream.frames)
+        self._ahead = begin, raster
 
     def _span_start(self, start: int) -> int:
         """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
@@ -564,7 +537,7 @@ class Fusion:
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces:
                 sounds.pieces[name] = pieces
-                sounds.onsets[name] = stream.onsets_at(window)
+                sounds.onsets[name] = stream.ear.at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
@@ -600,6 +573,7 @@ class Fusion:
             by = self.clock_offsets.frames_ahead(name) - stream.ahead
             if by:
                 stream.move(by)
+                self._ahead = None
                 onward = max(onward, -by)
             stream.rest_ns = round(1e9 * self.clock_offsets.rest_s(name))
         if onward and self._next is not None:
@@ -629,11 +603,10 @@ class Fusion:
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
-            if any(raster not in stream.onsets for raster in there):  # some came late
-                stream.forget()
-                stream.listen(span, self._estimator, self._shared)
+            if not stream.ear.has(there):  # some came late
+                self._hear_anew(stream, span)
             sounds.pieces[name], powers[name] = pieces, power[mask]
-            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
+            sounds.onsets[name] = stream.ear.at(range(span.start, rasters[-1] + 1))
             starts_ns.append(rasters[0] * FRAME_NS - stream.rest_ns)
             ends_ns.append((rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
         if not sounds:
@@ -702,8 +675,9 @@ class Fusion:
         for stream in self._streams.values():
             while stream.frames and (first := next(iter(stream.frames))) < oldest:
                 del stream.frames[first]
-            while stream.onsets and (first := next(iter(stream.onsets))) < oldest:
-                del stream.onsets[first]
+            onsets = stream.ear.onsets
+            while onsets and (first := next(iter(onsets))) < oldest:
+                del onsets[first]
 
 
 class _Segments(Sequence[Float32Array]):

@@ -137,9 +137,7 @@ class PeakSearch:
             values = heard.gcc.values
             rows.values[rows.first_row[array] : rows.first_row[array + 1], : values.shape[1]] = values
         kernels.running_maxima(rows.values, rows.block, rows.maxima)
-        kernels.bounds(
-            rows.maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), rows.top_bound
-        )
+        kernels.bounds(rows.maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), rows.top_bound)
         rows.bounded[:] = False
 
         def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
@@ -148,7 +146,8 @@ class PeakSearch:
             for _ in range(count):
                 node, power, proven = kernels.highest(
                     rows.values, rows.maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
-                    self._leaf_places, rows.top_bound, rows.cell_bound, rows.bounded, *self._axes, self._edge, CELLS_PER_TOP,
+                    self._leaf_places, rows.top_bound, rows.cell_bound, rows.bounded,
+                    *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
                     np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
                 )  # fmt: skip
@@ -198,7 +197,7 @@ def _block(lags: int) -> int:
 
 
 def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
-    """Where among the running maxima the shortest run is that begins with the block of `low` and holds that of `high`."""
+    """Where among the running maxima the shortest run is that begins in the block of `low` and holds `high`."""
     first = low // block
     level = np.searchsorted(vectorised.RUNS, high // block - first + 1)
     return (level * vectorised.BLOCKS + first).astype(np.uint16)

@@ -317,9 +317,10 @@ def bounds(
 
 def highest(
     values: Float32Array, maxima: Float32Array, rows: IntArray, first_row: IntArray, weight: Float32Array, rule: int,
-    places: UInt16Array, leaf_places: UInt16Array, top_bound: Float32Array, cell_bound: Float32Array, bounded: BoolArray,
-    x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int, microphones_m: Float32Array,
-    first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray, most: int,
+    places: UInt16Array, leaf_places: UInt16Array, top_bound: Float32Array, cell_bound: Float32Array,
+    bounded: BoolArray, x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int,
+    microphones_m: Float32Array, first_microphone: IntArray, pairs: IntArray, scale: Float32Array,
+    offset: Float32Array, boxes: IntArray, most: int,
 ) -> tuple[int, float, bool]:  # fmt: skip
     """The highest node outside some boxes, by branch and bound: the very one that the whole map would give.
 
@@ -406,7 +407,7 @@ def highest(
             if spent > most and best > -np.inf:
                 return best_node, float(best), False
             which, first = chosen
-            for cell in range(0, len(which) if halves else 0):
+            for cell in range(len(which) if halves else 0):
                 bounds(maxima, leaf_places[which[cell]], rows, first_row, weight, rule, leaf_bound[cell])
             if halves:
                 spent += leaf_bound[: len(which)].size * len(rows)
