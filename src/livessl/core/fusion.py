@@ -337,11 +337,14 @@ class Fusion:
         if array in self._streams:
             self._streams[array].left = True
 
-    def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
+    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size.
+
+        Without `levels` nothing is said of the channels' power, which costs a transform for each array.
+        """
         clocks = self.clock_offsets
         return [
-            _status(stream, now_ns, None if clocks is None else clocks.of(name))
+            _status(stream, now_ns, None if clocks is None else clocks.of(name), levels=levels)
             for name, stream in self._streams.items()
         ]
 
@@ -746,7 +749,7 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
         stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
-def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArrayStatus:
+def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None, *, levels: bool) -> ArrayStatus:
     mark = stream.mark
     age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
     state, reason = _state(stream, age_ns, now_ns)
@@ -760,7 +763,7 @@ def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArraySt
         age_s=None if age_ns is None else age_ns / 1e9,
         power=stream.power,
         noise_power=mark.noise_power if mark else None,
-        channel_power=_channel_power(stream),
+        channel_power=_channel_power(stream) if levels else (),
         sample_rate_hz=stream.rate_hz,
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,

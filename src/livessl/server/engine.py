@@ -172,9 +172,9 @@ class Engine:
         """Seconds since the start."""
         return (self._clock.monotonic_ns() - self._began_ns) / 1e9
 
-    def arrays(self) -> list[JsonObject]:
+    def arrays(self, *, levels: bool = True) -> list[JsonObject]:
         """How every array is doing; from any thread, and without waiting for a localization that is going on."""
-        return [self._array(status) for status in self._settling.status(self.now_ns())]
+        return [self._array(status) for status in self._settling.status(self.now_ns(), levels=levels)]
 
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
@@ -257,9 +257,11 @@ class Engine:
             self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
 
     def _watch_arrays(self, now_ns: int) -> None:
+        if now_ns - self._status_ns < STATUS_NS:
+            states = {array["name"]: array["state"] for array in self.arrays(levels=False)}
+            if all(state == self._states.get(name) for name, state in states.items()):
+                return
         arrays = self.arrays()
-        if now_ns - self._status_ns < STATUS_NS and all(a["state"] == self._states.get(a["name"]) for a in arrays):
-            return
         self._status_ns = now_ns
         for array in arrays:
             before = self._states.get(array["name"])
