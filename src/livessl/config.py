@@ -26,6 +26,7 @@ from livessl.errors import UseError
 if TYPE_CHECKING:
     from livessl.core.clock_offsets import ClockOffsets
     from livessl.core.fusion import Fusion
+    from livessl.core.listening import Each
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
@@ -447,10 +448,11 @@ class Site(_Model):
         updates: bool = True,
         live: bool = False,
         clock_offsets: ClockOffsets | None = None,
+        each: Each | None = None,
     ) -> Fusion:
         """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
 
-        `clock_offsets` is what is known already of the arrays' clocks.
+        `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
         """
         from livessl.core.estimators import ESTIMATORS
         from livessl.core.fusion import Fusion, FusionParameters
@@ -475,6 +477,7 @@ class Site(_Model):
             updates=updates,
             newest_only=live,
             clock_offsets=self.make_clock_offsets() if clock_offsets is None else clock_offsets,
+            each=each,
         )
 
     def node_of(self, array: str) -> str | None:

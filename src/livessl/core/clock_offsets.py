@@ -70,6 +70,9 @@ _LEAST_SCATTER_S: Final = 1e-3
 _TUKEY: Final = 4.7
 """Scatters beyond which a sound does not count."""
 
+_CONVERGED: Final = 1e-9
+"""Seconds, and seconds a second: less is nothing to go on for."""
+
 _STEP_S: Final = 0.05
 """So many last sounds as are needed to believe an offset, this far off and at one: the clock was set."""
 
@@ -242,7 +245,9 @@ def _line(times_s: FloatArray, offsets_s: FloatArray) -> _Line:
         scatter = max(_LEAST_SCATTER_S, 1.4826 * float(np.median(np.abs(off))))
         weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * scatter))))
         normal = (terms.T * weights) @ terms + np.diag([0.0, (scatter / _DRIFT) ** 2])
-        found = np.linalg.solve(normal, (terms.T * weights) @ offsets_s)
+        before, found = found, np.linalg.solve(normal, (terms.T * weights) @ offsets_s)
+        if np.abs(found - before).max() < _CONVERGED:
+            break
     return _Line(float(found[0]), float(found[1]), float(scatter * np.sqrt(np.linalg.inv(normal)[0, 0])))
 
 

@@ -47,6 +47,18 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
 
 
 @_compiled
+def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
+    """Windows of sound, weighed, and zeros after them."""
+    length = len(window)
+    for t in range(len(windows)):
+        for m in range(len(samples)):
+            cut, out = samples[m, t * hop : t * hop + length], windows[t, m]
+            for n in range(length):
+                out[n] = cut[n] * window[n]
+            out[length:] = np.float32(0.0)
+
+
+@_compiled
 def cross_spectra(spectra, low, pairs, weights, whitened):  # type: ignore[no-untyped-def]
     """Cross spectra of phases alone, weighed and summed over frames."""
     microphones, bins = spectra.shape[1], whitened.shape[1]

@@ -18,7 +18,7 @@ from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.listening import Ear, Listening
+from livessl.core.listening import Each, Ear, Listening
 from livessl.core.onset import OnsetGCC
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
@@ -221,6 +221,8 @@ class Fusion:
         further behind. `updates_left_out` counts the others.
     clock_offsets : ClockOffsets or None
         What is known of the arrays' clocks, learned from the events told; None takes them all to agree.
+    each : callable or None
+        What arrays are listened to by, several at once perhaps: see `Listening`.
     """
 
     def __init__(
@@ -233,6 +235,7 @@ class Fusion:
         updates: bool = True,
         newest_only: bool = False,
         clock_offsets: ClockOffsets | None = None,
+        each: Each | None = None,
     ) -> None:
         self._site = site
         self._estimator = estimator
@@ -250,7 +253,7 @@ class Fusion:
         self._now_ns = 0
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
-        self._listening = Listening(estimator)
+        self._listening = Listening(estimator, each)
         self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
         self.updates_left_out = 0
         self.unknown_arrays = 0
@@ -310,6 +313,9 @@ class Fusion:
         self._now_ns = now_ns
         for message in messages:
             self._accept(message)
+        if self._event is not None and self._next is not None:  # while others' frames are on their way
+            here = [stream for stream in self._streams.values() if self._next in stream.frames]
+            self._hear(here, [self._next])
         outputs += self._close_ready()
         if self._event is not None and self._everyone_silent():
             outputs += self._finish()
@@ -412,8 +418,6 @@ class Fusion:
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
-        if self._event is not None and frame.raster == self._next:
-            self._hear([stream], [frame.raster])  # while the others' are on their way
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -498,16 +502,16 @@ class Fusion:
         if raster != self._heard_until:
             ready = self._ahead == (span.start, span.stop - 1)
             for stream in self._streams.values():
-                if ready and stream.next_ear.has(r for r in span if r in stream.frames):
-                    stream.ear = stream.next_ear
-                else:
-                    self._hear_anew(stream, span)
+                ready = ready and stream.next_ear.has(r for r in span if r in stream.frames)
+            for stream in self._streams.values():
+                stream.ear = stream.next_ear if ready else Ear()
+            if not ready:
+                self._hear(self._streams.values(), span)
         self._ahead = None
         return _OpenEvent(raster, raster, raster)
 
     def _hear(self, streams: Iterable[_Stream], rasters: Sequence[int]) -> None:
-        for stream in streams:
-            self._listening.hear(stream.spec.name, stream.ear, rasters, stream.frames)
+        self._listening.hear(((stream.spec.name, stream.ear, stream.frames) for stream in streams), rasters)
 
     def _hear_anew(self, stream: _Stream, rasters: Sequence[int]) -> None:
         stream.ear = Ear()
@@ -522,10 +526,11 @@ class Fusion:
             return
         if raster != begin and self._ahead != (begin, raster - 1):
             return
-        for stream in self._streams.values():
-            if raster == begin:
+        if raster == begin:
+            for stream in self._streams.values():
                 stream.next_ear = Ear()
-            self._listening.hear(stream.spec.name, stream.next_ear, [raster], stream.frames)
+        streams = self._streams.values()
+        self._listening.hear(((stream.spec.name, stream.next_ear, stream.frames) for stream in streams), [raster])
         self._ahead = begin, raster
 
     def _span_start(self, start: int) -> int:

@@ -7,11 +7,11 @@ follows a chain that another one has followed already finds there what it is to 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add
-from typing import Final
+from typing import Any, Final
 
 from livessl.core.estimators import Estimator
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
@@ -22,6 +22,10 @@ SHARED_FRAMES: Final = 4096
 
 LISTENERS: Final = 4
 """Of each array, kept at the ends of the chains that were followed last: somebody may go on there."""
+
+
+Each = Callable[[Callable[[Any], None], Iterable[Any]], None]
+"""Calls the first with each of the second, in any order, and returns when all is done."""
 
 
 @dataclass(slots=True)
@@ -42,21 +46,32 @@ class Ear:
         return reduce(add, heard) if heard else None
 
 
+Followed = tuple[str, Ear, Mapping[int, Frame]]
+"""An array, how far it has been followed, and its frames by raster interval."""
+
+
 class Listening:
     """The listeners of an estimator.
 
     Parameters
     ----------
     estimator : Estimator
+    each : callable or None
+        Does some work on each of some arrays, several at once perhaps; None does one after the other.
     """
 
-    def __init__(self, estimator: Estimator) -> None:
+    def __init__(self, estimator: Estimator, each: Each | None = None) -> None:
         self._estimator = estimator
+        self._each = _in_turn if each is None else each
         self._onsets: dict[tuple[str, int], OnsetGCC] = {}
         self._listeners: defaultdict[str, dict[int, OnsetFrontEnd]] = defaultdict(dict)
 
-    def hear(self, array: str, ear: Ear, rasters: Iterable[int], frames: Mapping[int, Frame]) -> None:
-        """Let an ear follow an array through some raster intervals; where a frame is missing another chain begins."""
+    def hear(self, followed: Iterable[Followed], rasters: Sequence[int]) -> None:
+        """Let ears follow their arrays through some raster intervals; where a frame is missing another chain begins."""
+        self._each(lambda one: self._follow(*one, rasters), followed)
+        _limit(self._onsets, SHARED_FRAMES)
+
+    def _follow(self, array: str, ear: Ear, frames: Mapping[int, Frame], rasters: Sequence[int]) -> None:
         for raster in rasters:
             if raster in ear.onsets:
                 continue
@@ -77,7 +92,6 @@ class Listening:
                 onsets = self._onsets[array, ear.chain] = _push(listener, frame)
                 self._listeners[array][ear.chain] = listener
                 _limit(self._listeners[array], LISTENERS)
-                _limit(self._onsets, SHARED_FRAMES)
             ear.onsets[raster] = onsets
 
     def clear(self) -> None:
@@ -98,6 +112,11 @@ class Listening:
                 else:
                     _push(listener, frame)
         return listener
+
+
+def _in_turn(work: Callable[[Any], None], items: Iterable[Any]) -> None:
+    for item in items:
+        work(item)
 
 
 def _push(listener: OnsetFrontEnd, frame: Frame) -> OnsetGCC:

@@ -135,9 +135,8 @@ class OnsetFrontEnd:
         self._tail = heard[:, hops * self._hop :].copy()
         if hops == 0:
             return self.nothing
-        cut = np.lib.stride_tricks.sliding_window_view(heard, length, axis=1)[:, :: self._hop][:, :hops]
-        windows = np.zeros((hops, len(samples), self._n_fft), dtype=np.float32)
-        np.multiply(cut.swapaxes(0, 1), self._window, out=windows[:, :, :length])
+        windows = np.empty((hops, len(samples), self._n_fft), dtype=np.float32)
+        kernels.cut_windows(heard, self._hop, self._window, windows)
         spectra = scipy.fft.rfft(windows, axis=2)
         weights = np.empty((hops, len(self._noise)), dtype=np.float32)
         kernels.onset_weights(

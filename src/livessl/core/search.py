@@ -16,9 +16,10 @@ from typing import Final
 import numpy as np
 
 from livessl.core import vectorised
-from livessl.core.gcc import microphone_pairs
+from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
+from livessl.core.onset import OnsetFrontEnd
 from livessl.core.peaks import FindPeaks, Peak, box_around
 from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
 from livessl.core.types import GCC, ArraySpec, BoolArray, Float32Array, FloatArray, HeardBy, IntArray, UInt16Array
@@ -254,5 +255,8 @@ def warm_up() -> None:
     search = PeakSearch([spec], grid, 343.0)
     search.prepare(spec.name, lags_s)
     search.among([heard])(2)
+    ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
+    ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
+    kernels.step_powers(np.zeros((2, 800), dtype=np.float32), np.zeros(10, dtype=np.float32))
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
     SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))

@@ -45,6 +45,14 @@ _CELLS_AT_ONCE: Final = 64
 """Most cells whose nodes are looked at together; it begins with few, for mostly few are needed."""
 
 
+def cut_windows(samples: Float32Array, hop: int, window: Float32Array, windows: Float32Array) -> None:
+    """Windows (T, K, n) of sound (K, N), `hop` samples apart: weighed by `window`, and zeros after it."""
+    length = len(window)
+    cut = np.lib.stride_tricks.sliding_window_view(samples, length, axis=1)[:, ::hop][:, : len(windows)]
+    np.multiply(cut.swapaxes(0, 1), window, out=windows[:, :, :length])
+    windows[:, :, length:] = 0.0
+
+
 def cross_spectra(
     spectra: ComplexArray, low: int, pairs: IntArray, weights: Float32Array, whitened: ComplexArray
 ) -> None:

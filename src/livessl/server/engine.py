@@ -17,6 +17,7 @@ from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
 from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
+from livessl.server.helper import Helper
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
@@ -104,6 +105,7 @@ class Engine:
         self.unsaved = 0
         """Events that wait for the store to take them."""
         self.maps = Maps(clock)
+        self._helper = Helper()
         self.latency = Latency()
         _warm_up()
         self._begin_live()
@@ -155,6 +157,7 @@ class Engine:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=3.0)
+        self._helper.stop()
         self.maps.stop()
         self._receiver.stop()
 
@@ -209,7 +212,7 @@ class Engine:
         self._clocks = self._site.make_clock_offsets()
         if clocks is not None:
             self._clocks.restore(clocks)
-        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks)
+        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks, each=self._helper.each)
         self._settling = Settling(fusion, arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
