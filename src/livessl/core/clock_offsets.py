@@ -17,7 +17,7 @@ import numpy as np
 import scipy.fft
 
 from livessl.core.kernels import kernels
-from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
+from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame
 
 MOST_OFF_S: Final = 0.6
 """Offsets beyond it are not looked for: such arrays' sounds do not meet in one event."""
@@ -69,9 +69,6 @@ _LEAST_SCATTER_S: Final = 1e-3
 
 _TUKEY: Final = 4.7
 """Scatters beyond which a sound does not count."""
-
-_CONVERGED: Final = 1e-9
-"""Seconds, and seconds a second: less is nothing to go on for."""
 
 _STEP_S: Final = 0.05
 """So many last sounds as are needed to believe an offset, this far off and at one: the clock was set."""
@@ -136,10 +133,10 @@ class ClockOffsets:
         """Whether the arrays have different clocks."""
         return len({self._clock_of[array] for array in arrays}) > 1
 
-    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Sequence[Frame]]]) -> None:
-        """Learn from a sound of known place: of each array the frames of it, without gaps, its run-up first."""
+    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Steps]]) -> None:
+        """Learn from a sound of known place: of each array what is left of it, without gaps, its run-up first."""
         travel_s = {s.name: float(np.linalg.norm(s.centre_m - position_m)) / self._c_m_s for s, _ in heard}
-        late_s = lateness_s({spec.name: frames for spec, frames in heard}, travel_s)
+        late_s = lateness_s({spec.name: steps for spec, steps in heard}, travel_s)
         if self.tell_apart(late_s):
             self.learn(time_ns, late_s)
 
@@ -157,11 +154,13 @@ class ClockOffsets:
         for array, late in late_s.items():
             each.setdefault(self._clock_of[array], []).append(late)
         now = {clock: float(np.median(values)) for clock, values in each.items()}
-        expected = {clock: self._fit(clock, time_ns).offset_s for clock in now if self._heard[clock]}
+        known = [clock for clock in now if self._heard[clock]]
+        lines = _lines([self._heard[clock] for clock in known], time_ns)
+        expected = {clock: line.offset_s for clock, line in zip(known, lines, strict=True)}
         moment = float(np.median([now[clock] - expected.get(clock, 0.0) for clock in expected or now]))
         for clock, late in now.items():
             self._heard[clock].append((time_ns, late - moment))
-            self._forget_before_step(clock)
+        self._forget_before_steps(now)
         self._know(time_ns)
 
     def state(self) -> dict[str, Any]:
@@ -180,24 +179,20 @@ class ClockOffsets:
             if clock in state["known"]:
                 self._known[clock] = ClockOffset(*state["known"][clock])
 
-    def _fit(self, clock: str, time_ns: int) -> _Line:
-        times, offsets = np.array(self._heard[clock], dtype=np.float64).T
-        return _line((times - time_ns) / 1e9, offsets)
-
-    def _forget_before_step(self, clock: str) -> None:
-        heard = self._heard[clock]
-        if len(heard) < 2 * LEAST_SOUNDS:
-            return
-        before = np.array(list(heard)[:-LEAST_SOUNDS], dtype=np.float64)
-        last = np.array(list(heard)[-LEAST_SOUNDS:], dtype=np.float64)
-        line = _line((before[:, 0] - last[-1, 0]) / 1e9, before[:, 1])
-        off_s = last[:, 1] - line.offset_s - line.drift * (last[:, 0] - last[-1, 0]) / 1e9
-        if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2:
-            for _ in range(len(before)):
-                heard.popleft()
+    def _forget_before_steps(self, clocks: Iterable[str]) -> None:
+        """Of clocks that were just heard: forget what was before one was set."""
+        heards = [heard for clock in clocks if len(heard := self._heard[clock]) >= 2 * LEAST_SOUNDS]
+        lines = _lines([list(heard)[:-LEAST_SOUNDS] for heard in heards], heards[0][-1][0]) if heards else []
+        for heard, line in zip(heards, lines, strict=True):
+            last = np.array(list(heard)[-LEAST_SOUNDS:], dtype=np.float64)
+            off_s = last[:, 1] - line.offset_s - line.drift * (last[:, 0] - last[-1, 0]) / 1e9
+            if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2:
+                for _ in range(len(heard) - LEAST_SOUNDS):
+                    heard.popleft()
 
     def _know(self, time_ns: int) -> None:
-        lines = {clock: self._fit(clock, time_ns) for clock, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS}
+        enough = [clock for clock, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS]
+        lines = dict(zip(enough, _lines([self._heard[clock] for clock in enough], time_ns), strict=True))
         known = [clock for clock in self._heard if clock in lines and lines[clock].std_s < KNOWN_S]
         if len(known) < 2:
             return
@@ -235,33 +230,76 @@ class _Line:
     std_s: float
 
 
-def _line(times_s: FloatArray, offsets_s: FloatArray) -> _Line:
-    """Line through (times, offsets), each (n,), by iterated weights (Tukey's); flat where too few tell its slope."""
-    terms = np.stack([np.ones_like(times_s), times_s], axis=1)
-    found = np.array([np.median(offsets_s), 0.0])
-    scatter = _LEAST_SCATTER_S
+def _lines(heard: Sequence[Sequence[tuple[int, float]]], zero_ns: int) -> list[_Line]:
+    """Lines through (time in ns, offset in s) by iterated weights (Tukey's); flat where too few tell the slope."""
+    if not heard:
+        return []
+    count = np.array([len(points) for points in heard])
+    there = np.arange(count.max()) < count[:, None]
+    times_s, offsets_s = np.zeros(there.shape), np.zeros(there.shape)
+    for row, points in enumerate(heard):
+        times_ns, offsets_s[row, : count[row]] = zip(*points, strict=True)
+        times_s[row, : count[row]] = (np.array(times_ns) - zero_ns) / 1e9
+    terms = np.stack([np.ones_like(times_s), times_s], axis=2)
+    found = np.stack([_medians(offsets_s, there), np.zeros(len(heard))], axis=1)
     for _ in range(10):
-        off = offsets_s - terms @ found
-        scatter = max(_LEAST_SCATTER_S, 1.4826 * float(np.median(np.abs(off))))
-        weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * scatter))))
-        normal = (terms.T * weights) @ terms + np.diag([0.0, (scatter / _DRIFT) ** 2])
-        before, found = found, np.linalg.solve(normal, (terms.T * weights) @ offsets_s)
-        if np.abs(found - before).max() < _CONVERGED:
-            break
-    return _Line(float(found[0]), float(found[1]), float(scatter * np.sqrt(np.linalg.inv(normal)[0, 0])))
+        off = offsets_s - (terms @ found[:, :, None])[:, :, 0]
+        scatter = np.maximum(_LEAST_SCATTER_S, 1.4826 * _medians(np.abs(off), there))
+        weights = there * np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * scatter[:, None]))))
+        weighed = (terms * weights[:, :, None]).swapaxes(1, 2)
+        normal = weighed @ terms
+        normal[:, 1, 1] += (scatter / _DRIFT) ** 2
+        found = np.linalg.solve(normal, weighed @ offsets_s[:, :, None])[:, :, 0]
+    std_s = scatter * np.sqrt(np.linalg.inv(normal)[:, 0, 0])
+    return [_Line(*numbers) for numbers in np.column_stack([found, std_s]).tolist()]
 
 
-def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, float]) -> dict[str, float]:
+def _medians(values: FloatArray, there: BoolArray) -> FloatArray:
+    """Of each row, the median of the values that are there."""
+    ordered, count = np.sort(np.where(there, values, np.inf), axis=1), there.sum(axis=1)
+    middle = np.stack([(count - 1) // 2, count // 2], axis=1)
+    return np.asarray(np.take_along_axis(ordered, middle, axis=1).mean(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What is left of an array's sound to compare clocks by.
+
+    Parameters
+    ----------
+    began_ns : int
+        Time of the first sample, by the array's clock.
+    powers : (n,) float32
+        Mean square of the steps from sample to sample, which hold no rumble, of pieces of `HOP_S`.
+    """
+
+    began_ns: int
+    powers: Float32Array
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame]) -> Steps:
+        """Of frames without gaps."""
+        return cls(frames[0].time_ns, np.concatenate([step_powers(frame) for frame in frames]))
+
+
+def step_powers(frame: Frame) -> Float32Array:
+    """One frame's part of `Steps.powers`."""
+    powers = np.empty(round(FRAME_S / HOP_S), dtype=np.float32)
+    kernels.step_powers(frame.samples, powers)
+    return powers
+
+
+def lateness_s(sound: Mapping[str, Steps], travel_s: Mapping[str, float]) -> dict[str, float]:
     """How late each array heard a sound against the first one, but for the travel time; none where it is not sure.
 
     Parameters
     ----------
-    frames : mapping of array to its frames
+    sound : mapping of array to what is left of its sound
         Without gaps, from the run-up on.
     travel_s : mapping of array to float
         From the sound's place to the array.
     """
-    rises = {array: _rises(some) for array, some in frames.items() if len(some) > 1}
+    rises = {array: _rises(steps.powers) for array, steps in sound.items() if len(steps.powers) > FRAME_S / HOP_S}
     if len(rises) < 2:
         return {}
     first, *others = rises
@@ -269,19 +307,14 @@ def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, flo
     for other in others:
         lag_s = _lag_s(rises[first], rises[other])
         if lag_s is not None:
-            began_s = (frames[other][0].time_ns - frames[first][0].time_ns) / 1e9
+            began_s = (sound[other].began_ns - sound[first].began_ns) / 1e9
             late[other] = lag_s + began_s - (travel_s[other] - travel_s[first])
     return late if len(late) > 1 else {}
 
 
-def _rises(frames: Sequence[Frame]) -> FloatArray:
+def _rises(power: Float32Array) -> FloatArray:
     """By how much the power of each piece of `HOP_S` exceeds all before it, less the decay; log, (n,)."""
-    frames = frames[: round(LISTENED_S / FRAME_S)]
-    pieces = round(FRAME_S / HOP_S)
-    power = np.empty((len(frames), pieces), dtype=np.float32)
-    for frame, of_pieces in zip(frames, power, strict=True):
-        kernels.step_powers(frame.samples, of_pieces)
-    power = power.ravel()
+    power, pieces = power[: round(LISTENED_S / HOP_S)], round(FRAME_S / HOP_S)
     floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
     decay = np.log(10.0) / 10.0 * _DECAY_DB_S * HOP_S * np.arange(len(level))

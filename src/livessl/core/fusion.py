@@ -15,7 +15,7 @@ from typing import Final, overload
 import numpy as np
 
 from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
-from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
+from livessl.core.clock_offsets import ClockOffset, ClockOffsets, Steps, clock_is_off, step_powers
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
 from livessl.core.listening import Each, Ear, Listening
@@ -133,6 +133,7 @@ class _Stream:
 
     spec: ArraySpec
     frames: dict[int, Frame] = field(default_factory=dict)
+    steps: dict[int, Float32Array] = field(default_factory=dict)  # of the frames, where clocks are learned
     watermark: int | None = None
     heard_ns: int | None = None
     waited_for: bool = True
@@ -181,10 +182,16 @@ class _Stream:
             there.append(raster)
         return pieces, there
 
+    def steps_at(self, rasters: Sequence[int]) -> Steps:
+        """What its clock is compared by, of the longest run of frames."""
+        frames = max(self.segments(rasters)[0], key=len)
+        return Steps(frames[0].time_ns, np.concatenate([self.steps[frame.raster] for frame in frames]))
+
     def move(self, frames: int) -> None:
         """Take it that its clock is ahead by so many frames more."""
         self.ahead += frames
         self.frames = {r - frames: replace(frame, raster=r - frames) for r, frame in self.frames.items()}
+        self.steps = {r - frames: powers for r, powers in self.steps.items()}
         if self.watermark is not None:
             self.watermark -= frames
         self.forget()
@@ -314,7 +321,8 @@ class Fusion:
         for message in messages:
             self._accept(message)
         if self._event is not None and self._next is not None:  # while others' frames are on their way
-            here = [stream for stream in self._streams.values() if self._next in stream.frames]
+            at = self._next
+            here = [s for s in self._streams.values() if at in s.frames and at not in s.ear.onsets]
             self._hear(here, [self._next])
         outputs += self._close_ready()
         if self._event is not None and self._everyone_silent():
@@ -411,9 +419,12 @@ class Fusion:
                 self._event.late_frames += 1
         if frame.sample_rate_hz != stream.rate_hz:
             stream.frames.clear()  # its node came back with another device: the two do not make one sound
+            stream.steps.clear()
             stream.forget()
             stream.rate_hz = frame.sample_rate_hz
         stream.frames[frame.raster] = frame
+        if self.clock_offsets is not None and self._learns:
+            stream.steps[frame.raster] = step_powers(frame)
         stream.counters["frames"] += 1
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
@@ -654,8 +665,7 @@ class Fusion:
         if clocks is None or not self._learns or not clocks.tell_apart(estimate.arrays):
             return
         streams = [self._streams[name] for name in estimate.arrays]
-        whole = [(stream.spec, max(stream.segments(span)[0], key=len)) for stream in streams]
-        clocks.hear(time_ns, estimate.position_m, whole)
+        clocks.hear(time_ns, estimate.position_m, [(stream.spec, stream.steps_at(span)) for stream in streams])
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         """Whether the estimate is a place, only a direction, or neither, and why."""
@@ -681,8 +691,9 @@ class Fusion:
         keep = max(self._parameters.pre_roll_s, self._parameters.window_s) + self._parameters.hang_over_s
         oldest = (self._next if self._event is None else self._event.start) - round(keep / FRAME_S) - 1
         for stream in self._streams.values():
-            while stream.frames and (first := next(iter(stream.frames))) < oldest:
-                del stream.frames[first]
+            for kept in (stream.frames, stream.steps):
+                while kept and (first := next(iter(kept))) < oldest:
+                    del kept[first]  # type: ignore[attr-defined]
             onsets = stream.ear.onsets
             while onsets and (first := next(iter(onsets))) < oldest:
                 del onsets[first]

@@ -7,7 +7,7 @@ SRP equation has the opposite one, which would mirror the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Final
 
 import numpy as np
@@ -46,9 +46,12 @@ _MATRICES: Final = 16
 """Matrices kept: a site's windows have few lengths."""
 
 
+@cache
 def microphone_pairs(count: int) -> IntArray:
     """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""
-    return np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
+    pairs = np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
+    pairs.flags.writeable = False
+    return pairs
 
 
 def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:

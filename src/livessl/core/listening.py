@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
-from operator import add
 from typing import Any, Final
 
 from livessl.core.estimators import Estimator
@@ -43,7 +41,12 @@ class Ear:
     def at(self, rasters: Iterable[int]) -> OnsetGCC | None:
         """All that was heard at `rasters` together; None for nothing."""
         heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        return reduce(add, heard) if heard else None
+        if not heard:
+            return None
+        lags = heard[0].lags.copy()
+        for one in heard[1:]:
+            lags += one.lags
+        return OnsetGCC(lags, sum(one.weight for one in heard))
 
 
 Followed = tuple[str, Ear, Mapping[int, Frame]]
