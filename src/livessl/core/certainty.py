@@ -5,6 +5,7 @@ The numbers fitted here come from simulated events: `livessl evaluate localizer 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -13,6 +14,7 @@ import numpy as np
 
 from livessl.core import peaks
 from livessl.core.geometry import Grid
+from livessl.core.kernels import kernels
 from livessl.core.srp import PairTerms, SRPFunctional
 from livessl.core.types import FloatArray, HeardBy
 
@@ -112,6 +114,6 @@ def judge(
 
 
 def _standing(heard: HeardBy, term: PairTerms) -> float:
-    noise = float(np.sqrt(np.square(heard.gcc.values).mean(dtype=np.float64)))
+    noise = math.sqrt(kernels.mean_square(heard.gcc.values, heard.gcc.lags_s, term.lags_s, -1.0))
     delays = len(heard.spec.microphones_m) - 1
     return delays / _DELAYS * max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0

@@ -172,6 +172,20 @@ def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
+    """Mean square of a GCC, further than something from one lag of each pair."""
+    total, count = 0.0, 0
+    for p in range(len(values)):
+        row, square = values[p], np.float32(0.0)
+        for lag in range(len(lags_s)):
+            if abs(lags_s[lag] - but_s[p]) > apart_s:
+                square += row[lag] * row[lag]
+                count += 1
+        total += square
+    return total / count if count else 0.0
+
+
+@_compiled
 def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
     """Summed power at points off the grid."""
     power = np.zeros(len(points_m))

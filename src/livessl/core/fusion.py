@@ -693,7 +693,7 @@ class Fusion:
         for stream in self._streams.values():
             for kept in (stream.frames, stream.steps):
                 while kept and (first := next(iter(kept))) < oldest:
-                    del kept[first]  # type: ignore[attr-defined]
+                    del kept[first]
             onsets = stream.ear.onsets
             while onsets and (first := next(iter(onsets))) < oldest:
                 del onsets[first]

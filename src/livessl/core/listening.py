@@ -71,10 +71,11 @@ class Listening:
 
     def hear(self, followed: Iterable[Followed], rasters: Sequence[int]) -> None:
         """Let ears follow their arrays through some raster intervals; where a frame is missing another chain begins."""
-        self._each(lambda one: self._follow(*one, rasters), followed)
+        self._each(lambda one: self._follow(one, rasters), followed)
         _limit(self._onsets, SHARED_FRAMES)
 
-    def _follow(self, array: str, ear: Ear, frames: Mapping[int, Frame], rasters: Sequence[int]) -> None:
+    def _follow(self, followed: Followed, rasters: Sequence[int]) -> None:
+        array, ear, frames = followed
         for raster in rasters:
             if raster in ear.onsets:
                 continue

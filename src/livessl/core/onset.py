@@ -137,7 +137,7 @@ class OnsetFrontEnd:
             return self.nothing
         windows = np.empty((hops, len(samples), self._n_fft), dtype=np.float32)
         kernels.cut_windows(heard, self._hop, self._window, windows)
-        spectra = scipy.fft.rfft(windows, axis=2)
+        spectra = np.asarray(scipy.fft.rfft(windows, axis=2), dtype=np.complex64)
         weights = np.empty((hops, len(self._noise)), dtype=np.float32)
         kernels.onset_weights(
             spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,

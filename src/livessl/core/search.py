@@ -29,8 +29,8 @@ CELL_M: Final = 0.2
 
 MOST_CELLS: Final = 50_000
 
-MOST_LOOK_UPS: Final = 5_000_000
-"""After so many a search is given up, some 10 ms compiled. Two arrays never need so many, nor do many that hear a sound
+MOST_LOOK_UPS: Final = 3_000_000
+"""After so many a search is given up, some 5 ms compiled. Two arrays never need so many, nor do many that hear a sound
 well; many that hear nothing but noise do."""
 
 MOST_HALVES_BYTES: Final = 64_000_000

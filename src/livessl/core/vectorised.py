@@ -216,6 +216,12 @@ def add_power(values: Float32Array, table: csr_array, weight: np.float32, power:
     power += weight * (table @ values.ravel())
 
 
+def mean_square(values: RealArray, lags_s: FloatArray, but_s: FloatArray, apart_s: float) -> float:
+    """Mean square of a GCC (P, L) at lags further than `apart_s` from one of each pair, (P,); 0 where there are none."""
+    elsewhere = np.abs(lags_s[None] - but_s[:, None]) > apart_s
+    return float((values**2)[elsewhere].mean(dtype=np.float64)) if elsewhere.any() else 0.0
+
+
 def smooth_power(
     points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float, first_s: FloatArray,
     step_s: FloatArray, start: IntArray, last: IntArray, weight: FloatArray, values: RealArray,

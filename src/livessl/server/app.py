@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import gc
 import logging
 import socket
 import ssl
@@ -144,6 +145,8 @@ class Server:
         """Serve until SIGINT, SIGTERM or `stop`; raises what made the engine fail, if it did."""
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
+        gc.collect()
+        gc.freeze()  # what is there now stays: the collector need not look through it for ever
         try:
             asyncio.run(self._serve())
         finally:
