@@ -7,7 +7,7 @@ import random
 import subprocess
 import time
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 
 class Cable:
@@ -60,6 +60,11 @@ class Cable:
         """Put it in again."""
         _ip("link", "set", self._here, "up")
 
+    def narrow(self, kbit_s: int) -> None:
+        """Let no more than so much pass, each way."""
+        for where, end in ((), self._here), (("-n", self._namespace), self._there):
+            _run("tc", *where, "qdisc", "replace", "dev", end, "root", "tbf", "rate", f"{kbit_s}kbit", *_QUEUE)
+
     def loosen(self, rng: random.Random, seconds: float) -> None:
         """A loose contact: whatever is sent in some 0.05 to 0.4 s of every second is lost."""
         until_s = time.monotonic() + seconds
@@ -80,6 +85,14 @@ def why_not() -> str | None:
 
 
 def _ip(*arguments: str) -> None:
-    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    _run("ip", *arguments)
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise OSError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+        raise OSError(f"{' '.join(command)}: {done.stderr.strip()}")
+
+
+_QUEUE: Final = ("burst", "16kb", "latency", "300ms")
+"""What a router keeps before it throws away."""
