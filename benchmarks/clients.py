@@ -188,15 +188,15 @@ async def _watch(
     )
 
 
-def open_client(host: str, port: int, window_bytes: int | None) -> socket.socket:
-    """A WebSocket for updates, opened by hand."""
+def open_client(host: str, port: int, window_bytes: int | None, kinds: str = "update") -> socket.socket:
+    """A WebSocket for messages of some kinds, opened by hand."""
     connection = socket.socket()
     if window_bytes is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window_bytes)
     connection.settimeout(10)
     connection.connect((host, port))
     lines = [
-        "GET /api/v1/live?kinds=update HTTP/1.1",
+        f"GET /api/v1/live?kinds={kinds} HTTP/1.1",
         f"Host: {host}:{port}",
         "Connection: Upgrade",
         "Upgrade: websocket",
@@ -238,13 +238,17 @@ class Listener(asyncio.Protocol):
                 break
             if data[at] & 15 == 9 and self._transport is not None:  # a ping wants its pong, masked with zeros
                 self._transport.write(bytes([0x8A, 0x80 | length, 0, 0, 0, 0]) + data[body : body + length])
-            stamp = data.rfind(STAMP, body, body + length)
-            if stamp >= 0 and self._log.open:
-                sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
-                self._log.delays_ms.append((now_ns - sent_ns) / 1e6)
-                self._log.message_bytes = length
+            self.note(data, body, length, now_ns)
             at = body + length
         self._rest = data[at:]
+
+    def note(self, data: bytes, body: int, length: int, now_ns: int) -> None:
+        """A frame's body has come."""
+        stamp = data.rfind(STAMP, body, body + length)
+        if stamp >= 0 and self._log.open:
+            sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
+            self._log.delays_ms.append((now_ns - sent_ns) / 1e6)
+            self._log.message_bytes = length
 
     def close(self) -> None:
         """Hang up."""

@@ -28,7 +28,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).par
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
-from soak import GROWTH, soak
+from soak import GROWTH, Sample, soak
 
 
 def replayed(seed: int) -> list[str]:
@@ -158,8 +158,8 @@ def soaked(hours: float, seed: int) -> int:
     """So many hours of four arrays; 1 where the memory has grown too much after the first, or a sound is lost."""
     logging.disable(logging.CRITICAL)
 
-    def tell(at_hours: float, resident_mb: float) -> None:
-        print(f"{at_hours:5.2f} h {resident_mb:6.1f} MB", flush=True)
+    def tell(sample: Sample) -> None:
+        print(f"{sample.hours:5.2f} h {sample.resident_mb:6.1f} MB, {sample.kept} frames kept", flush=True)
 
     with tempfile.TemporaryDirectory() as directory:
         outcome = soak(Path(directory), hours, seed=seed, tell=tell)
