@@ -37,6 +37,7 @@ PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
 ROUTES = {
     "/api/v1/site",
     "/api/v1/arrays",
+    "/api/v1/arrays/{name}/enabled",
     "/api/v1/events",
     "/api/v1/events/{event_id}",
     "/api/v1/tracks",
