@@ -133,7 +133,7 @@ def _try(data: bytes, decode: Decode, found: Found) -> None:
     found.outcomes[outcome] += 1
     if not edges <= found.edges:
         found.edges |= edges
-        if len(data) < MOST_KEPT:
+        if 0 < len(data) < MOST_KEPT:
             found.kept.append(data)
 
 
