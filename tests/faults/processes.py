@@ -10,6 +10,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Mapping
@@ -24,13 +25,14 @@ import soundfile
 import yaml
 from namespaces import Cable
 from proxy import Proxy
+from websockets.sync.client import connect
 
 from livessl import keys
 from livessl.clock import utc_ns, utc_text
 from livessl.config import load_site
 from livessl.simulate.export import write_scene
 from livessl.simulate.scene import make_scene
-from small_site import RATE_HZ, hiss, small
+from small_site import RATE_HZ, Changes, hiss, small
 
 Event = dict[str, Any]
 
@@ -40,11 +42,21 @@ TAIL_S = 120.0
 
 NODES = {"a": "north", "b": "south"}
 
+WEST = {"arrays.west": {"geometry": {"tetrahedron": {"edge_m": 0.3}}, "position_m": [0.7, 2.4, 1.6]}}
+"""A third array, for what an array's death costs two others."""
 
-def make_recordings(directory: Path, count: int, gap_s: float, seed: int = 5) -> None:
-    """`north.wav` and `south.wav`: bursts of noise at random places of the small room, without reverberation."""
+
+def make_recordings(
+    directory: Path,
+    count: int,
+    gap_s: float,
+    seed: int = 5,
+    changes: Changes | None = None,
+    lead_s: float = 2.0,
+) -> None:
+    """A WAV for each array: bursts of noise at random places of the small room, without reverberation."""
     path = directory / "scene.yaml"
-    path.write_text(yaml.safe_dump(small()), encoding="utf-8")
+    path.write_text(yaml.safe_dump(small(changes)), encoding="utf-8")
     site = load_site(path)
     scene = make_scene(
         site.room.size_m,
@@ -55,11 +67,11 @@ def make_recordings(directory: Path, count: int, gap_s: float, seed: int = 5) ->
         c_m_s=site.c_m_s,
         keep_away_m=[spec.centre_m for spec in site.specs],
         seed=seed,
-        lead_s=2.0,
+        lead_s=lead_s,
         gap_s=gap_s,
     )
     write_scene(directory, site, scene, seed=seed)
-    for k, array in enumerate(NODES.values()):
+    for k, array in enumerate(site.arrays):
         samples, rate = soundfile.read(directory / f"{array}.wav", always_2d=True)
         hum = 1e-4 * np.random.default_rng(k).standard_normal((round(TAIL_S * rate), samples.shape[1]))
         soundfile.write(directory / f"{array}.wav", np.concatenate([samples, hum]), rate, subtype="PCM_16")
@@ -84,6 +96,10 @@ class Playing:
         For site file, database, spools and what the processes say.
     lead_s : float
         From now to the recordings' first sample, seconds.
+    nodes : dict of str to str
+        The nodes, and each one's array.
+    changes : dict
+        Of the small site.
     cables : mapping of node to Cable
         Nodes in network namespaces: no proxy is between them and the server, and both have keys, as a server needs
         that others can reach.
@@ -93,6 +109,8 @@ class Playing:
     directory: Path
     lead_s: float = 40.0
     seed: int = 0
+    nodes: dict[str, str] = field(default_factory=lambda: dict(NODES))
+    changes: Changes = field(default_factory=dict)
     cables: Mapping[str, Cable] = field(default_factory=dict)
     proxies: dict[str, Proxy] = field(default_factory=dict)
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
@@ -104,14 +122,14 @@ class Playing:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._log = self._open.enter_context((self.directory / "said.txt").open("ab"))
         port, self.http = free_port(), free_port()
-        for k, name in enumerate(NODES):
+        for k, name in enumerate(self.nodes):
             if name not in self.cables:
                 self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
-        data = small({"server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http})
+        data = small({**self.changes, "server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http})
         if self.cables:
             folder = self.directory / "keys"
             keys.make_server_keys(folder)
-            for name in NODES:
+            for name in self.nodes:
                 keys.enrol(folder, name, keys.make_node_keys(folder, name))
             data["server"]["bind"], data["keys"] = f"tcp://*:{port}", "keys"
         data["server"]["events_db"] = str(self.directory / "events.db")
@@ -122,7 +140,7 @@ class Playing:
                 "arrays": {array: [1, 2, 3, 4]},
                 "spool": {"directory": str(self.directory / "spool")},
             }
-            for name, array in NODES.items()
+            for name, array in self.nodes.items()
         }
         self.site = self.directory / "site.yaml"
         self.site.write_text(yaml.safe_dump(data), encoding="utf-8")
@@ -142,7 +160,7 @@ class Playing:
 
     def start_node(self, name: str) -> None:
         """Start a node; it plays what is left of its recording, for what is past nobody hears any more."""
-        array = NODES[name]
+        array = self.nodes[name]
         late_s = max(0.0, time.time() + 0.5 - self.start_ns / 1e9)
         skip = math.ceil(late_s / FRAME_S)
         path = self.directory / f"{array}-{skip}.wav"
@@ -210,6 +228,39 @@ class Playing:
             rows = db.execute("SELECT json FROM events ORDER BY time_ns").fetchall()
         events = [json.loads(text) for (text,) in rows]
         return [{**event, "at_s": (utc_ns(event["time_utc"]) - self.start_ns) / 1e9} for event in events]
+
+
+class Hearer:
+    """Subscribes to events and notes how long after each sound's end the first word of it came.
+
+    Parameters
+    ----------
+    http : int
+        The server's port on this machine.
+    """
+
+    def __init__(self, http: int) -> None:
+        self._url = f"ws://127.0.0.1:{http}/api/v1/live?kinds=event"
+        self.delays_s: dict[str, float] = {}
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._socket = connect(self._url)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+        self._thread.join(timeout=5)
+
+    def _run(self) -> None:
+        for text in self._socket:
+            event = json.loads(text)
+            if event["kind"] == "event":
+                end_s = utc_ns(event["time_utc"]) / 1e9 + event["duration_s"]
+                self.delays_s.setdefault(event["id"], time.time() - end_s)
 
 
 def wait_for(condition: Callable[[], object], what: str, within_s: float) -> None:

@@ -310,6 +310,7 @@ class Fusion:
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
         self._shared: _Shared = {}
+        self._spared: Collection[str] = ()
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
@@ -394,6 +395,10 @@ class Fusion:
         """The array's node said good-bye: nobody waits for it."""
         if array in self._streams:
             self._streams[array].left = True
+
+    def spare(self, arrays: Collection[str]) -> None:
+        """Wait for none of these arrays, from now on, and for all others again."""
+        self._spared = arrays
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
@@ -503,7 +508,7 @@ class Fusion:
         return True
 
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
-        if stream.watermark is None or stream.heard_ns is None or stream.left:
+        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
             return False
         return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
