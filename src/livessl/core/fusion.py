@@ -262,6 +262,7 @@ class Fusion:
         self._due: int | None = None
         self._listening = Listening(estimator, each)
         self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
+        self._spared: Collection[str] = ()
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
@@ -350,6 +351,10 @@ class Fusion:
         """The array's node said good-bye: nobody waits for it."""
         if array in self._streams:
             self._streams[array].left = True
+
+    def spare(self, arrays: Collection[str]) -> None:
+        """Wait for none of these arrays, from now on, and for all others again."""
+        self._spared = arrays
 
     def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size.
@@ -466,7 +471,7 @@ class Fusion:
         return True
 
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
-        if stream.watermark is None or stream.heard_ns is None or stream.left:
+        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
             return False
         return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 

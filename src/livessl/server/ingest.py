@@ -184,7 +184,7 @@ class Ingest:
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
         peer = Peer(routing_id, hello, now_ns)
         if same_run is not None:
-            moved = same_run.routing_id != routing_id or hello.backlog.keys() - same_run.hello.backlog.keys()
+            moved = same_run.routing_id != routing_id or hello.backlog.items() - same_run.hello.backlog.items()
             peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
             peer.received, peer.live = same_run.received, same_run.live
         peer.greet(hello)
