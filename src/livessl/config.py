@@ -16,8 +16,17 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from livessl.core.activity import ActivityParameters
-from livessl.core.gcc import microphone_pairs, uses_envelope
-from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
+from livessl.core.bands import uses_envelope
+from livessl.core.geometry import (
+    Grid,
+    as_positions_m,
+    circle,
+    line,
+    microphone_pairs,
+    posed,
+    speed_of_sound_m_s,
+    tetrahedron,
+)
 from livessl.core.joint import joined
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray

@@ -181,7 +181,7 @@ def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
             if abs(lags_s[lag] - but_s[p]) > apart_s:
                 square += row[lag] * row[lag]
                 count += 1
-        total += square
+        total += float(square)
     return total / count if count else 0.0
 
 

@@ -7,22 +7,21 @@ SRP equation has the opposite one, which would mirror the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 import scipy.fft
 
 from livessl.core.activity import band_bins
+from livessl.core.bands import uses_envelope as uses_envelope
 from livessl.core.frontends import FFT_FACTOR, FrontEnd, Spectra, whole_segment
+from livessl.core.geometry import microphone_pairs as microphone_pairs
 from livessl.core.kernels import kernels
 from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
 """Fine lags a sample. Nearest-lag look-up then errs by 1/16 sample: 8 degrees of phase at 6 kHz and 16 kHz sampling."""
-
-ENVELOPE_ABOVE: Final = 0.25
-"""Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
 
 _NYQUIST_MARGIN: Final = 1.25
 """Near-Nyquist lags are so much denser than the band's upper edge asks for; the interpolation needs the room."""
@@ -44,14 +43,6 @@ _SAMPLINGS: Final = 16
 
 _MATRICES: Final = 16
 """Matrices kept: a site's windows have few lengths."""
-
-
-@cache
-def microphone_pairs(count: int) -> IntArray:
-    """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""
-    pairs = np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
-    pairs.flags.writeable = False
-    return pairs
 
 
 def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:
@@ -278,12 +269,6 @@ def _least_squares(lags_s: FloatArray, fine_lags_s: FloatArray, band_hz: tuple[f
 
     gram = mean_cosine(lags_s[:, None] - lags_s) + _RIDGE * np.eye(len(lags_s))
     return np.linalg.solve(gram, mean_cosine(lags_s[:, None] - fine_lags_s)).astype(np.float32)
-
-
-def uses_envelope(band_hz: tuple[float, float]) -> bool:
-    """Whether R is the magnitude instead of the real part: see `GCCPhat`."""
-    low, high = band_hz
-    return low > ENVELOPE_ABOVE * (high - low)
 
 
 def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:

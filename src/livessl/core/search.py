@@ -257,6 +257,7 @@ def warm_up() -> None:
     search.among([heard])(2)
     ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
     ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
+    kernels.mean_square(heard.gcc.values, lags_s, np.zeros(1), 0.0)
     kernels.step_powers(np.zeros((2, 800), dtype=np.float32), np.zeros(10, dtype=np.float32))
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
     SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))
