@@ -22,7 +22,17 @@ from livessl.core.kernels import kernels
 from livessl.core.onset import OnsetFrontEnd
 from livessl.core.peaks import FindPeaks, Peak, box_around
 from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
-from livessl.core.types import GCC, ArraySpec, BoolArray, Float32Array, FloatArray, HeardBy, IntArray, UInt16Array
+from livessl.core.types import (
+    GCC,
+    ArraySpec,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    HeardBy,
+    IntArray,
+    UInt16Array,
+    read_only,
+)
 
 CELL_M: Final = 0.2
 """Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
@@ -258,6 +268,8 @@ def warm_up() -> None:
     ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
     ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
     kernels.mean_square(heard.gcc.values, lags_s, np.zeros(1), 0.0)
-    kernels.step_powers(np.zeros((2, 800), dtype=np.float32), np.zeros(10, dtype=np.float32))
+    samples = np.zeros((2, 800), dtype=np.float32)
+    read_only(samples)  # as a frame's are: for the compiler another type
+    kernels.step_powers(samples, np.zeros(10, dtype=np.float32))
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
     SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))
