@@ -210,8 +210,7 @@ def _block(lags: int) -> int:
 def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
     """Where among the running maxima the shortest run is that begins in the block of `low` and holds `high`."""
     first = low // block
-    level = np.searchsorted(vectorised.RUNS, high // block - first + 1)
-    return (level * vectorised.BLOCKS + first).astype(np.uint16)
+    return _PLACE_OF_LENGTH[high // block - first + 1] + first
 
 
 def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
@@ -228,6 +227,10 @@ def _by_cube(table: UInt16Array, cubes: Sequence[int], count: int) -> UInt16Arra
     split = padded.reshape(len(table), *(n for along in cubes for n in (along, count)))
     return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(len(table), -1, count**3)
 
+
+_PLACE_OF_LENGTH: Final = np.array(
+    [vectorised.BLOCKS * np.searchsorted(vectorised.RUNS, blocks) for blocks in range(vectorised.BLOCKS + 1)], np.uint16
+)
 
 _SETS: Final = 16
 """Sets of arrays that are kept ready."""
