@@ -158,6 +158,7 @@ def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
         "sample_rate_hz": status.sample_rate_hz,
         "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),
         "clock": None if status.clock is None else str(status.clock),
+        "agreement": {"agreed": status.agreed, "disagreed": status.disagreed},
         "counters": dict(status.counters),
     }
 
@@ -180,6 +181,8 @@ def _contribution(contribution: Contribution) -> JsonObject:
         "azimuth_deg": round(contribution.azimuth_deg, 2),
         "elevation_deg": round(contribution.elevation_deg, 2),
         "distance_m": round(contribution.distance_m, 3),
+        "agrees": contribution.agrees,
+        "off_deg": None if contribution.off_deg is None else round(contribution.off_deg, 1),
     }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from livessl.core import peaks
 from livessl.core.geometry import Grid
-from livessl.core.srp import PairTerms, SRPFunctional
+from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
 from livessl.core.types import FloatArray, HeardBy
 
 NEAR_M: Final = 0.5
@@ -99,8 +99,8 @@ def judge(
     grid : Grid
     """
     terms = functional.pair_terms(position_m)
-    standing = sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(peaks.margin(power, rival_power), standing)
+    together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
+    signs = Signs(peaks.margin(power, rival_power), together)
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
     refused = None
     if signs.confidence < LEAST_CONFIDENCE:
@@ -111,7 +111,18 @@ def judge(
     return Judgement(covariance_m2, signs, refused)
 
 
-def _standing(heard: HeardBy, term: PairTerms) -> float:
-    noise = float(np.sqrt(np.square(heard.gcc.values).mean(dtype=np.float64)))
-    delays = len(heard.spec.microphones_m) - 1
-    return delays / _DELAYS * max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0
+def standing(heard: HeardBy, power: float) -> float:
+    """An array's share of the standing: how high its SRP, of this power, stands over what its GCCs are elsewhere.
+
+    Silent pairs, of a microphone that was left out, are no measure of what the others are.
+    """
+    values = heard.gcc.values
+    square = np.einsum("pl,pl->p", values, values)
+    live = np.count_nonzero(square)
+    noise = float(np.sqrt(square.sum(dtype=np.float64) / (live * values.shape[1]))) if live else 0.0
+    return max(0.0, power) / (_DELAYS * noise) if live else 0.0
+
+
+def array_power(heard: HeardBy, term: PairTerms) -> float:
+    """An array's SRP at a point, from its pairs' terms there."""
+    return pair_weight(len(heard.spec.microphones_m)) * float(term.values.sum())

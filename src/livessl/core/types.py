@@ -305,6 +305,11 @@ class Contribution:
         Its in-band mean power over that time, full scale squared.
     azimuth_deg, elevation_deg, distance_m : float
         Direction and distance from the array's centre to the position found; azimuth counter-clockwise from +x.
+    agrees : bool or None
+        Whether it agrees with the others; one that does not was outvoted, and has no part in the position. None where
+        nobody can tell: it was alone, or the estimator does not ask.
+    off_deg : float or None
+        By what angle it heard the sound elsewhere, where it does not agree.
     """
 
     array: str
@@ -313,6 +318,8 @@ class Contribution:
     azimuth_deg: float
     elevation_deg: float
     distance_m: float
+    agrees: bool | None = None
+    off_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
