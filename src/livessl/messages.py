@@ -92,6 +92,7 @@ class Messages:
             "latency_stages_s": _stages(stages),
             "late": event.late,
             "replaces": [],
+            "source": event.source,
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
@@ -108,10 +109,20 @@ class Messages:
             "arrays": arrays,
             "status": str(update.status),
             "contributions": [_contribution(c) for c in update.contributions],
+            "others": [self._other(other) for other in update.others],
             "zones": self._site.zones_of(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
             "latency_stages_s": _stages(stages),
+        }
+
+    def _other(self, estimate: Estimate) -> JsonObject:
+        position, covariance, confidence, _ = self._where(estimate)
+        return {
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "zones": self._site.zones_of(position),
         }
 
     def track(self, track: Track) -> JsonObject:

@@ -892,3 +892,47 @@ def test_a_microphone_that_hears_nothing_is_told() -> None:
     again: Arrivals = [(k + 1.0, frame("north", k, samples=samples[[0, 1, 0, 1]])) for k in range(40, 44)]
     play(fusion, again, 44, 40)
     assert status_of(fusion, "north", 44).state is ArrayState.HEALTHY
+
+
+# --- several sources
+
+
+OTHER_M = SOURCE_M - np.array([0.0, 1.5, 0.0])
+
+
+class Duet(Scripted):
+    """An estimator that finds two places where it may."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        found = super().locate(sounds)
+        if not all(sound.moments for sound in sounds.values()):
+            return found
+        return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
+
+    def listener(self, array: str, sample_rate_hz: float) -> Any:
+        return Ear([])
+
+
+def test_each_of_two_sources_has_an_event() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), updates=True)
+    outputs = sound_at(fusion, 0, ("north", "south"))
+    one, other = (output for output in outputs if isinstance(output, Event))
+    assert (one.id, one.source) == (f"site-{(START + 5) * 50}", 1)
+    assert (other.id, other.source) == (f"{one.id}-2", 2)
+    assert other.estimate is not None
+    np.testing.assert_array_equal(other.estimate.position_m, OTHER_M)
+    assert (other.start_ns, other.end_ns, other.status) == (one.start_ns, one.end_ns, Status.LOCATED)
+    assert other.estimate.confidence == 0.7
+    assert other.contributions[0].azimuth_deg != one.contributions[0].azimuth_deg
+    assert all(output.others == () for output in outputs if isinstance(output, Update))  # unless it is asked for
+    alone = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(sources=1))
+    assert [event.source for event in sound_at(alone, 0, ("north", "south")) if isinstance(event, Event)] == [1]
+
+
+def test_windows_tell_of_a_second_where_the_site_asks() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(live_sources=2), updates=True)
+    outputs = sound_at(fusion, 0, ("north", "south"))
+    (update,) = (output for output in outputs if isinstance(output, Update))
+    (other,) = update.others
+    np.testing.assert_array_equal(other.position_m, OTHER_M)
+    assert {output.id for output in outputs if isinstance(output, Track)} == {1, 2}

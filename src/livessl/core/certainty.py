@@ -25,6 +25,12 @@ LEAST_CONFIDENCE: Final = 0.8
 _LOGISTIC: Final = (-3.34, 2.69, 1.03)
 """Intercept, weight of the margin and of the standing in the log-odds of a right place."""
 
+LEAST_CONFIDENCE_OF_SECOND: Final = 0.6
+"""Below it a second source is not told of."""
+
+_LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
+"""As `_LOGISTIC`, of the best place left when the first source is taken out: is there a second, and is it there?"""
+
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
 
@@ -51,13 +57,21 @@ class Signs:
     @property
     def confidence(self) -> float:
         """Probability that the place is right to within `NEAR_M`."""
-        intercept, of_margin, of_standing = _LOGISTIC
-        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
+        return self._probability(_LOGISTIC)
+
+    @property
+    def confidence_of_second(self) -> float:
+        """Probability that there is a second source and the place right, where the first has been taken out."""
+        return self._probability(_LOGISTIC_OF_SECOND)
 
     @property
     def tell_direction(self) -> bool:
         """Whether there is anything at the place, be it only a direction: noise alone stands as high as its rms."""
         return self.standing >= 1.0
+
+    def _probability(self, logistic: tuple[float, float, float]) -> float:
+        intercept, of_margin, of_standing = logistic
+        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
 
-from livessl.core import agreement, certainty, peaks
+from livessl.core import agreement, certainty, peaks, several
 from livessl.core.activity import dead_channels
 from livessl.core.certainty import Signs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
@@ -31,6 +31,8 @@ class Sound:
     """What the estimator's listener made of its frames and those around them, where there is one."""
     doubted: bool = False
     """Whether the array has disagreed with the others lately."""
+    moments: tuple[OnsetGCC, ...] = ()
+    """The onsets frame by frame, where a second source is to be looked for."""
 
     def live(self, gcc: GCC) -> GCC:
         """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
@@ -60,6 +62,8 @@ class Localization:
     outvoted: Mapping[str, float] | None = None
     """Arrays that it was found without, for they disagree with the others, and by what angle in degrees; None where
     nobody asked."""
+    others: tuple[Localization, ...] = ()
+    """Other sources that sounded at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,11 +280,13 @@ class Onset(SrpPhat):
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
         doubted = [name for name, sound in sounds.items() if sound.doubted]
         agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
+        second = self._second(agreed.place, sounds)
         place = agreed.place
-        judged = certainty.judge(
-            place.functional, place.evidence, place.position_m, place.power, place.rival_power, self._grid
-        )
-        refused = agreed.refused or judged.refused
+        others: tuple[Localization, ...] = ()
+        if second is not None:
+            place, others = second[0], (replace(second[1], outvoted=agreed.outvoted),)
+        judged = _judged(place, self._grid)
+        refused = judged.refused if second is not None else agreed.refused or judged.refused
         if not place.proven:
             refused = "nothing stands out: the search for the place was given up"
         return Localization(
@@ -292,7 +298,40 @@ class Onset(SrpPhat):
             judged.signs,
             refused,
             agreed.outvoted,
+            others,
         )
+
+    def _second(
+        self, first: agreement.Place, sounds: Mapping[str, Sound]
+    ) -> tuple[agreement.Place, Localization] | None:
+        """The first place as it is without a second source, and the second; None where there is none.
+
+        What the first explains is taken out, and the second looked for; without that the first is looked for again, and
+        then the second once more.
+        """
+        specs = [heard.spec for heard in first.evidence]
+        if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
+            return None
+        if any(uses_envelope(spec.band_hz) for spec in specs):
+            return None  # magnitudes do not add up
+        moments = [self._moments(heard, sounds[heard.spec.name]) for heard in first.evidence]
+        places = [first]
+        for _ in range(3):
+            terms = places[-1].functional.pair_terms(places[-1].position_m)
+            left = [each.without(term.lags_s) for each, term in zip(moments, terms, strict=True)]
+            places.append(self._place(left))
+        again, second = places[-2:]
+        judged = _judged(second, self._grid)
+        confidence = judged.signs.confidence_of_second
+        apart_m = float(np.linalg.norm(again.position_m - second.position_m))
+        if confidence < certainty.LEAST_CONFIDENCE_OF_SECOND or apart_m < several.APART_M or not second.proven:
+            return None
+        evidence = tuple(second.evidence)
+        return again, Localization(second.position_m, judged.covariance_m2, confidence, evidence, signs=judged.signs)
+
+    def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
+        sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
+        return several.Moments.of(heard.spec, sampling, sound.moments, np.any(heard.gcc.values, axis=1))
 
     def _place(self, evidence: Sequence[HeardBy]) -> agreement.Place:
         evidence = tuple(sorted(evidence, key=lambda heard: heard.spec.name))  # sums depend on the order
@@ -324,6 +363,10 @@ class Onset(SrpPhat):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
+
+
+def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
+    return certainty.judge(place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid)
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import reduce
 from operator import add
@@ -115,6 +115,8 @@ class FusionParameters:
         The activity rule's.
     pre_roll_s, hang_over_s : float
         As the nodes use them: an event ends after a quiet hang-over.
+    sources, live_sources : int
+        How many sources, 1 or 2, are looked for in a sound that has ended, and in the windows of one that goes on.
     """
 
     deadline_s: float = 0.5
@@ -125,6 +127,8 @@ class FusionParameters:
     threshold: float = THRESHOLD
     pre_roll_s: float = 0.4
     hang_over_s: float = 0.3
+    sources: int = 2
+    live_sources: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,10 +261,9 @@ class _Stream:
         self.unheard.clear()
         self.onsets.clear()
 
-    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
-        """All that was listened to at `rasters` together; None for nothing."""
-        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        return reduce(add, heard) if heard else None
+    def onsets_at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
+        """What was listened to at `rasters`."""
+        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
 
 
 @dataclass(slots=True)
@@ -542,7 +545,7 @@ class Fusion:
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds = _Sounds()
+        sounds = _Sounds(self._parameters.live_sources)
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
@@ -559,8 +562,9 @@ class Fusion:
         loudest = max(float(power.max()) for power in powers.values())
         contributions = self._contributions(powers, estimate, found)
         complete_ns = window.stop * FRAME_NS
-        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
-        trusted = [] if status is Status.REFUSED else [estimate]
+        others = self._others(found, middle_ns, sounds)
+        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns, others)
+        trusted = [*([] if status is Status.REFUSED else [estimate]), *others]
         tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
@@ -569,12 +573,12 @@ class Fusion:
         assert event is not None
         parameters = self._parameters
         span = range(self._span_start(event.start), event.closed + 1)
-        sounds = _Sounds({name for name, votes in self._votes.items() if _doubts(votes)})
+        sounds = _Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)})
         powers: dict[str, FloatArray] = {}
         self._heard_until = event.last_active + 1
         if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
             return []
-        first, last = event.last_active, event.start
+        earliest, last = event.last_active, event.start
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -593,40 +597,62 @@ class Fusion:
                 stream.listen(span, self._estimator, self._shared)
             sounds.pieces[name], powers[name] = pieces, power[mask]
             sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
-            first, last = min(first, rasters[0]), max(last, rasters[-1])
+            earliest, last = min(earliest, rasters[0]), max(last, rasters[-1])
         if not sounds:
             return []
-        start_ns, end_ns = first * FRAME_NS, (last + 1) * FRAME_NS
+        start_ns, end_ns = earliest * FRAME_NS, (last + 1) * FRAME_NS
+        middle_ns = (start_ns + end_ns) // 2
         estimate: Estimate | None = None
         status = Status.REFUSED
         contributions: tuple[Contribution, ...] = ()
+        others: tuple[Estimate, ...] = ()
         reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
         if len(sounds) >= parameters.min_arrays:
             found = self._estimator.locate(sounds)
-            estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
+            estimate = _estimate(found, middle_ns, sounds)
             status, reason = self._judge(estimate, found)
+            others = self._others(found, middle_ns, sounds)
             if status is Status.REFUSED:
                 estimate = None
             else:
                 self._count_votes(event.start, found, sounds)
                 contributions = self._contributions(powers, estimate, found)
-        return [
-            Event(
-                id=self._id(event.start),
-                start_ns=start_ns,
-                end_ns=end_ns,
-                status=status,
-                reason=reason,
-                estimate=estimate,
-                power=max(float(power.max()) for power in powers.values()),
-                method=self._estimator.name,
-                contributions=contributions,
-                heard_by=tuple(sounds),
-                late_frames=event.late_frames,
-                latency_s=(self._now_ns - end_ns) / 1e9,
-                complete_ns=(event.closed + 1) * FRAME_NS,
-            )
-        ]
+        first = Event(
+            id=self._id(event.start),
+            start_ns=start_ns,
+            end_ns=end_ns,
+            status=status,
+            reason=reason,
+            estimate=estimate,
+            power=max(float(power.max()) for power in powers.values()),
+            method=self._estimator.name,
+            contributions=contributions,
+            heard_by=tuple(sounds),
+            late_frames=event.late_frames,
+            latency_s=(self._now_ns - end_ns) / 1e9,
+            complete_ns=(event.closed + 1) * FRAME_NS,
+        )
+        return [first, *(self._other(first, source, other, powers, found) for source, other in enumerate(others, 2))]
+
+    def _others(self, found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> tuple[Estimate, ...]:
+        """Further sources of the same sound: those that are places."""
+        estimates = (_estimate(other, time_ns, sounds) for other in found.others)
+        places = zip(estimates, found.others, strict=True)
+        return tuple(estimate for estimate, other in places if self._judge(estimate, other)[0] is Status.LOCATED)
+
+    def _other(
+        self, first: Event, source: int, estimate: Estimate, powers: Mapping[str, FloatArray], found: Localization
+    ) -> Event:
+        """The event of a further source: of what both were heard by and how loud, nobody can tell apart."""
+        return replace(
+            first,
+            id=f"{first.id}-{source}",
+            source=source,
+            status=Status.LOCATED,
+            reason=None,
+            estimate=estimate,
+            contributions=self._contributions(powers, estimate, found),
+        )
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         """Whether the estimate is a place, only a direction, or neither, and why."""
@@ -671,15 +697,23 @@ class Fusion:
 class _Sounds(Mapping[str, Sound]):
     """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
 
-    def __init__(self, doubted: Collection[str] = ()) -> None:
+    def __init__(self, sources: int, doubted: Collection[str] = ()) -> None:
         self.doubted = doubted
+        self.sources = sources
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
-        self.onsets: dict[str, OnsetGCC | None] = {}
+        self.onsets: dict[str, tuple[OnsetGCC, ...]] = {}
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
         segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array], array in self.doubted)
+        onsets = self.onsets[array]
+        return Sound(
+            segments,
+            pieces[0][0].sample_rate_hz,
+            reduce(add, onsets) if onsets else None,
+            array in self.doubted,
+            onsets if self.sources > 1 else (),
+        )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)

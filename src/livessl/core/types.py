@@ -332,6 +332,8 @@ class Update:
     power: float
     contributions: tuple[Contribution, ...] = ()
     complete_ns: int = 0
+    others: tuple[Estimate, ...] = ()
+    """Further sources that sound at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,6 +368,8 @@ class Event:
         Whether sound took part in it that came after its windows had closed.
     complete_ns : int
         Site time at which all had happened that the answer waits for: the sound, and the quiet that ends it.
+    source : int
+        1; or 2 for the second of two sources that sounded at the same time, of which each has an event.
     """
 
     id: str
@@ -382,6 +386,7 @@ class Event:
     latency_s: float = 0.0
     late: bool = False
     complete_ns: int = 0
+    source: int = 1
 
     @property
     def duration_s(self) -> float:
