@@ -166,7 +166,7 @@ def test_two_estimates_of_one_moment_are_never_one_track() -> None:
 
 
 def test_walkers_that_cross_keep_their_names() -> None:
-    """At a right angle, 0.2 m apart at the nearest, two scatters of an estimate: mostly each goes on where it was going.
+    """At a right angle, 0.2 m apart at the nearest, two scatters of an estimate: mostly each goes on as it went.
 
     By a coin's toss a run in two would swap; 16 of 20 or more happen so in 0.6 % of all series.
     """
