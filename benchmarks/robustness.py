@@ -126,7 +126,7 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
                 active = active_frames(samples)
                 dead = samples.copy()
                 dead[9] = np.rint(rng.standard_normal(samples.shape[1])) / 32768.0
-                hiss = convolved(rng.standard_normal(samples.shape[1], dtype=np.float32), beside)
+                hiss = convolved(rng.standard_normal((samples.shape[1],), dtype=np.float32), beside)
                 hiss = hiss[:, : samples.shape[1]]
                 level = np.sqrt(np.square(samples[8:, lead:]).mean() / np.square(hiss[8:, lead:]).mean())
                 noisy = np.asarray(0.5 * (samples + np.float32(level) * hiss), dtype=np.float32)
@@ -142,9 +142,7 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
                 two = {name: heard[""][name] for name in "ab"}
                 _judge(rows.setdefault("none: two good ones only", []), first, two, source_m)
         print(f"\nRT60 {rt60_s:g} s, {'clean' if np.isinf(snr_db) else f'{snr_db:g} dB'}\n")
-        print(
-            "| the third array | events | median (m) | located, over 0.5 m | lost | outvoted |\n|---|---|---|---|---|---|"
-        )
+        print("| the third array | events | median (m) | wrong | lost | outvoted |\n|---|---|---|---|---|---|")
         for name, each in rows.items():
             print(told(name, *map(list, zip(*each, strict=True))), flush=True)
 

@@ -496,6 +496,14 @@ class _Metrics(Collector):
             "Of the last ten sounds that three arrays or more heard, in how many it agreed with the others, or not.",
             labels=["array", "verdict"],
         )
+        off = GaugeMetricFamily(
+            "livessl_array_clock_offset_seconds",
+            "How far ahead of the reference its clock is, by the sounds heard.",
+            labels=["array", "reference"],
+        )
+        unsure = GaugeMetricFamily(
+            "livessl_array_clock_offset_std_seconds", "Standard deviation of that.", labels=["array", "reference"]
+        )
         counts = CounterMetricFamily("livessl_array", "Counts of an array.", labels=["array", "what"])
         for array in self._engine.arrays():
             up.add_metric([array["name"]], float(array["state"] == "healthy"))
@@ -505,6 +513,9 @@ class _Metrics(Collector):
                 level.add_metric([array["name"]], array["level_dbfs"])
             for verdict, count in array["agreement"].items():
                 agreement.add_metric([array["name"], verdict], count)
+            if (clock := array["clock_offset"]) is not None:
+                off.add_metric([array["name"], clock["reference"]], clock["offset_s"])
+                unsure.add_metric([array["name"], clock["reference"]], clock["std_s"])
             for what, count in array["counters"].items():
                 counts.add_metric([array["name"], what], count)
-        yield from (up, age, level, agreement, counts)
+        yield from (up, age, level, agreement, off, unsure, counts)
