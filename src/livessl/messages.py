@@ -194,6 +194,7 @@ def _contribution(contribution: Contribution) -> JsonObject:
         "azimuth_deg": round(contribution.azimuth_deg, 2),
         "elevation_deg": round(contribution.elevation_deg, 2),
         "distance_m": round(contribution.distance_m, 3),
+        "asked": contribution.asked,
     }
 
 

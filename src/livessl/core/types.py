@@ -99,7 +99,8 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Counts the array's frames since its node started, from 1.
+        Counts the array's frames since its node started, from 1. 0 is a frame that the server asked for, and the node
+        would not have sent.
     raster : int
         Index on the site-time raster: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
@@ -305,6 +306,8 @@ class Contribution:
         Its in-band mean power over that time, full scale squared.
     azimuth_deg, elevation_deg, distance_m : float
         Direction and distance from the array's centre to the position found; azimuth counter-clockwise from +x.
+    asked : bool
+        It had not found the sound active by itself, and was asked for what it had.
     """
 
     array: str
@@ -313,6 +316,7 @@ class Contribution:
     azimuth_deg: float
     elevation_deg: float
     distance_m: float
+    asked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,8 +428,24 @@ class Window:
     evidence: tuple[HeardBy, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A wish for an array's frames of a time at which it sent none.
+
+    Parameters
+    ----------
+    array : str
+    first, last : int
+        Raster intervals, both included, by the array's own clock.
+    """
+
+    array: str
+    first: int
+    last: int
+
+
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | Window
+Output = Update | Event | Track | Window | Ask
 """What fusion says."""
