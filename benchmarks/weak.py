@@ -1,16 +1,18 @@
 """What it is worth to ask arrays that did not find a sound: one scene, ever weaker at one of two arrays.
 
 `python benchmarks/weak.py --cache FOLDER` simulates development sounds in the demo's room, the south array hearing them
-so many dB lower in the same noise, and localizes them with and without asking. What came out is in docs/accuracy.md.
+so many dB lower in the same noise, and localizes them with and without asking. What came out is in
+docs/accuracy/arrays.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import soundfile
@@ -42,7 +44,7 @@ def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) 
     return [Part(array, Placed(WavRecording(path), START_NS), tuple(range(1, 5))) for array, path in paths.items()]
 
 
-def figures(scene: Scene, events: list[Event]) -> dict[str, Any]:
+def figures(scene: Scene, events: list[Event]) -> dict[str, int]:
     """What became of the sounds."""
     near = wrong = alone = helped = 0
     told = by_sound(scene, events)
@@ -62,19 +64,21 @@ def main() -> None:
     parser.add_argument("--sounds", type=int, default=36)
     parser.add_argument("--rt60", type=float, default=0.7)
     parser.add_argument("--noise-dbfs", type=float, default=-60.0)
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--seeds", type=int, nargs="+", default=(7, 8, 9))
     parser.add_argument("--lower-db", type=float, nargs="+", default=LOWER_DB)
     parser.add_argument("--cache", type=Path, required=True)
     a = parser.parse_args()
     site = load_site(SITE_FILE)
-    scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, a.seed), noise_dbfs=a.noise_dbfs)
-    name = f"{a.sounds}-{a.rt60:g}-{a.seed}{a.noise_dbfs:g}"
     for lower_db in a.lower_db:
-        parts = parts_of(site, scene, a.cache, name, lower_db)
         for ask in (False, True):
-            outputs = replay.run(site, parts, UnpacedClock(), ask=ask)
-            found = figures(scene, [output for output in outputs if isinstance(output, Event)])
-            print(json.dumps({"lower_db": lower_db, "ask": ask, **found}), flush=True)
+            total: Counter[str] = Counter()
+            for seed in a.seeds:
+                scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, seed), noise_dbfs=a.noise_dbfs)
+                name = f"{a.sounds}-{a.rt60:g}-{seed}{a.noise_dbfs:g}"
+                parts = parts_of(site, scene, a.cache, name, lower_db)
+                outputs = replay.run(site, parts, UnpacedClock(), ask=ask)
+                total += Counter(figures(scene, [output for output in outputs if isinstance(output, Event)]))
+            print(json.dumps({"lower_db": lower_db, "ask": ask, **total}), flush=True)
 
 
 if __name__ == "__main__":

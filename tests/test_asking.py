@@ -1,8 +1,10 @@
-"""Arrays that did not find a sound are asked for it: offline, live, over TCP, the same answers; and old nodes as ever."""
+"""Arrays that did not find a sound are asked for it, offline and live alike; and old nodes work as ever."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+import urllib.request
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -13,15 +15,16 @@ import pytest
 from livessl import replay
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.line import played_messages
+from livessl.capture.node import send_session
 from livessl.capture.recorded import Part, lines_of
-from livessl.clock import UnpacedClock
+from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.config import Site
 from livessl.core.asking import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
 from livessl.core.segmenter import RECENT_S
 from livessl.core.settling import Settled, Settling
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Ask, Event, Frame, Message, Output, Status
 from livessl.simulate.scene import render
-from small_site import RATE_HZ, scene, site_of
+from small_site import RATE_HZ, running_server, scene, site_of
 
 START_NS = 1_767_225_600_000_000_000
 SOUNDS = 4
@@ -70,18 +73,11 @@ def error_m(event: Event) -> float:
     return float(np.linalg.norm(event.estimate.position_m - source.position_m))
 
 
-def told(events: Iterable[Event]) -> list[tuple[object, ...]]:
+def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
+    places = [None if event.estimate is None else event.estimate.position_m.tolist() for event in events]
     return [
-        (
-            e.id,
-            e.start_ns,
-            e.end_ns,
-            e.status,
-            e.heard_by,
-            e.contributions,
-            e.estimate and e.estimate.position_m.tolist(),
-        )
-        for e in events
+        (e.id, e.start_ns, e.end_ns, e.status, e.heard_by, e.contributions, at)
+        for e, at in zip(events, places, strict=True)
     ]
 
 
@@ -184,9 +180,8 @@ def test_arrays_are_asked_by_their_own_clocks() -> None:
 
 
 def test_nobody_is_asked_where_the_answer_is_sure() -> None:
-    """Both hear the scene, and none is asked; a third that is far off and silent is not either."""
     loud = [
-        replace(part, placed=Placed(ArrayRecording("n", float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
     ]
     fusion = site().make_fusion(updates=False)
@@ -234,3 +229,19 @@ def test_frames_that_nobody_asked_for_change_nothing() -> None:
     assert fusion.step([stray], START_NS) == []
     assert fusion.closed is None
     assert fusion.status(START_NS)[1].counters["frames"] == 0
+
+
+@pytest.mark.parametrize("speed", [4.0, 20.0])
+def test_a_session_played_to_a_server_gives_the_same_answers(speed: float) -> None:
+    expected = offline()
+    with running_server(site_of({**NODES, "server.bind": "tcp://127.0.0.1:*"})) as server:
+        pace = PacedClock(START_NS, speed)
+        send_session(site(), server.engine.endpoint, parts(), pace, SystemClock(), "run-1", lambda: False)
+        server.engine.wait_idle()
+        with urllib.request.urlopen(f"{server.url}/api/v1/events") as answer:
+            found = json.load(answer)["events"][::-1]
+    assert [event["id"] for event in found] == [event.id for event in expected]
+    for event, other in zip(found, expected, strict=True):
+        assert other.estimate is not None
+        assert event["arrays"] == ["north", "south"]
+        np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)

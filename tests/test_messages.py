@@ -99,6 +99,7 @@ def test_event_says_when_and_where() -> None:
             "azimuth_deg": 12.35,
             "elevation_deg": -6.79,
             "distance_m": 2.5,
+            "asked": False,
         }
     ]
 

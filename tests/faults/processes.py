@@ -28,7 +28,7 @@ from livessl.clock import utc_ns, utc_text
 from livessl.config import load_site
 from livessl.simulate.export import write_scene
 from livessl.simulate.scene import make_scene
-from small_site import RATE_HZ, hiss, small
+from small_site import RATE_HZ, Changes, hiss, small
 
 Event = dict[str, Any]
 
@@ -82,12 +82,15 @@ class Playing:
         For site file, database, spools and what the processes say.
     lead_s : float
         From now to the recordings' first sample, seconds.
+    changes : dict
+        Of the site file: see `small_site.small`.
     """
 
     recordings: Path
     directory: Path
     lead_s: float = 40.0
     seed: int = 0
+    changes: Changes = field(default_factory=dict)
     proxies: dict[str, Proxy] = field(default_factory=dict)
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     start_ns: int = 0
@@ -100,7 +103,7 @@ class Playing:
         port, self.http = free_port(), free_port()
         for k, name in enumerate(NODES):
             self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
-        data = small({"server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http})
+        data = small({"server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http, **self.changes})
         data["server"]["events_db"] = str(self.directory / "events.db")
         data["nodes"] = {
             name: {
