@@ -15,7 +15,7 @@ from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, Event, Frame, Message, Output, Track, TrackState, Update
+from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -207,6 +207,8 @@ class Engine:
         counters["duplicates"] = ingest.duplicates[status.name] + settling.duplicates.get(status.name, 0)
         counters["sequence_gaps"] = ingest.sequence_gaps[status.name]
         counters["backfilled"] = settling.backfilled.get(status.name, 0)
+        counters["asked"] = settling.asked.get(status.name, 0)
+        counters["helped"] = settling.helped.get(status.name, 0)
         counters["too_late"] = settling.too_late.get(status.name, 0)
         problem = ingest.problem_of(status.name)
         if problem is not None:
@@ -285,7 +287,7 @@ class Engine:
         if isinstance(item, Joined):
             self._join(item.hello)
         for array in item.hello.arrays:
-            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
+            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns(), answers=item.hello.answers)
 
     def _watch_arrays(self, now_ns: int) -> None:
         arrays = self.arrays()
@@ -353,6 +355,8 @@ class Engine:
                 self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
                 self._publish(self._messages.update(output, self._stages(output, "update")))
+            elif isinstance(output, Ask):
+                self._receiver.ask(output)
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
