@@ -11,6 +11,7 @@ from typing import Any, Final
 from livessl.config import load_site
 from livessl.evaluate.layout import layout_of
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
+from livessl.evaluate.scenarios import ROOMS, SCENARIOS
 
 HALVES: Final = ("development", "test")
 LOCALIZER: Final = "localizer"
@@ -47,14 +48,20 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
     parser.add_argument(
         "--snr",
-        type=float,
-        metavar="DB",
-        help="white sensor noise, so far below each recording's mean power (default: none)",
+        metavar="DB[,DB…]",
+        help=f"white sensor noise, so far below each recording's mean power, inf for none (default: none); {LOCALIZER} "
+        "takes several",
     )
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
     parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
     parser.add_argument("--half", choices=HALVES, default="test", help=f"{LOCALIZER}: half of the clips (default test)")
+    parser.add_argument(
+        "--scenario",
+        default=ROOMS,
+        metavar="NAME[,NAME…]",
+        help=f"{LOCALIZER}: of {', '.join(SCENARIOS)} (default {ROOMS}); those named share sounds and rooms",
+    )
     parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
 
@@ -89,7 +96,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
         seed=arguments.seed,
         sample_rate_hz=float(arguments.sample_rate),
         spacing_m=arguments.grid or experiment.spacing_m,
-        snr_db=arguments.snr,
+        snr_db=_one_level_db(arguments.snr),
         segment=arguments.segment,
         band_limit=not arguments.no_band_limit,
         layout=layout,
@@ -141,11 +148,12 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[
     settings = LocalizerSettings(
         positions=arguments.positions or POSITIONS,
         rt60s_s=RT60S_S if arguments.rt is None else reverberation_times_s(arguments.rt),
-        snrs_db=SNRS_DB if arguments.snr is None else (arguments.snr,),
+        snrs_db=SNRS_DB if arguments.snr is None else levels_db(arguments.snr),
         seed=arguments.seed,
         sample_rate_hz=float(arguments.sample_rate),
         spacing_m=arguments.grid or SPACING_M,
         half=arguments.half,
+        scenarios=_scenarios(arguments.scenario),
     )
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
@@ -174,6 +182,40 @@ def reverberation_times_s(text: str) -> tuple[float, ...]:
     except (ValueError, ZeroDivisionError, OverflowError):
         raise ValueError(f"--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got {text!r}") from None
     return tuple(sorted(set(times)))
+
+
+def levels_db(text: str) -> tuple[float, ...]:
+    """Levels from `inf,20,10`, dB.
+
+    Raises
+    ------
+    ValueError
+        Where the text is none.
+    """
+    try:
+        levels = tuple(dict.fromkeys(float(part) for part in text.split(",")))
+        if not all(level > -math.inf for level in levels):  # nor NaN
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"--snr: expected decibels such as 20 or inf,20,10, got {text!r}") from None
+    return levels
+
+
+def _one_level_db(text: str | None) -> float | None:
+    if text is None:
+        return None
+    level, *more = levels_db(text)
+    if more:
+        raise ValueError(f"--snr: expected one level, for only {LOCALIZER} takes several, got {text}")
+    return None if level == math.inf else level
+
+
+def _scenarios(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    unknown = [name for name in names if name not in SCENARIOS]
+    if unknown:
+        raise ValueError(f"--scenario: expected some of {', '.join(SCENARIOS)}, got {', '.join(unknown)}")
+    return names
 
 
 def _whole(text: str) -> int:
