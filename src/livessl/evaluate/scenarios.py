@@ -174,6 +174,89 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
 """By their names on the command line."""
 
 
+@dataclass(frozen=True, slots=True)
+class SessionCase:
+    """A session with two arrays: what sounds in it, and what is wrong with the second array's clock.
+
+    Parameters
+    ----------
+    name : str
+        As it stands in the results.
+    rounds : int
+        How often each class of sound is played, from a new place each time.
+    pairs : bool
+        Whether sounds are played two at once.
+    alone : bool
+        Whether of such two the second is left out.
+    walks : bool or None
+        Whether a talker, the only sound, walks or stands; None for none.
+    late_s, drift_ppm : float
+        How far its clock is ahead, which is what its stamps are too late by; how much faster than nominal its device
+        samples.
+    """
+
+    name: str
+    rounds: int = 1
+    pairs: bool = False
+    alone: bool = False
+    walks: bool | None = None
+    late_s: float = 0.0
+    drift_ppm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionScenario:
+    """Sessions that are compared with the first one's case, on the same sounds.
+
+    Parameters
+    ----------
+    title, about : str
+    rt60_s : float
+        Where none is given.
+    cases : tuple of SessionCase
+    """
+
+    title: str
+    about: str
+    rt60_s: float
+    cases: tuple[SessionCase, ...]
+
+
+SESSION_SNR_DB: Final = 20.0
+"""Where none is given."""
+
+SESSIONS: Final[Mapping[str, SessionScenario]] = {
+    "clocks": SessionScenario(
+        "Clocks that disagree",
+        "Eight sounds, two of each class, each from a place of its own, one after the other; the clock of the second "
+        "array's node is ahead of the first's, or its device samples faster than it says.",
+        0.4,
+        (
+            SessionCase("clocks agree", rounds=2),
+            SessionCase("50 ms off", rounds=2, late_s=0.05),
+            SessionCase("150 ms off", rounds=2, late_s=0.15),
+            SessionCase("100 ppm fast", rounds=2, drift_ppm=100.0),
+            SessionCase("150 ms off, 100 ppm fast", rounds=2, late_s=0.15, drift_ppm=100.0),
+        ),
+    ),
+    "two-sources": SessionScenario(
+        "Two sources at once",
+        "Two sounds of different classes, of the same mean power, that begin within 0.1 s of one another, at least 1.5 m "
+        "apart; two such pairs, one after the other. Alone: the first of each.",
+        0.4,
+        (SessionCase("alone", pairs=True, alone=True), SessionCase("two at once", pairs=True)),
+    ),
+    "walking": SessionScenario(
+        "A talker who walks",
+        "Someone talks for some 9 s, with short pauses, and walks at 1 m/s from place to place, 1.5 m high and at least "
+        "1 m from the walls; or stands where the walk began.",
+        0.6,
+        (SessionCase("stands", walks=False), SessionCase("walks", walks=True)),
+    ),
+}
+"""By their names on the command line; each is a campaign of its own, through the whole fusion."""
+
+
 def _direction(rng: np.random.Generator) -> FloatArray:
     vector = rng.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))
