@@ -1,7 +1,7 @@
 """Breaks things on purpose and counts what is lost.
 
-`python benchmarks/faults.py replayed --seeds 1000` in simulated time, `processes --out FOLDER` with real processes, and
-`wire` with damaged messages. What came out is in docs/reliability.md.
+`python benchmarks/faults.py replayed --seeds 1000` in simulated time, `soak` for a day of it, `processes --out FOLDER`
+with real processes, and `wire` with damaged messages. What came out is in docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).par
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
+from soak import GROWTH, soak
 
 
 def replayed(seed: int) -> list[str]:
@@ -152,6 +154,21 @@ def damaged(count: int) -> int:
     return 0
 
 
+def soaked(hours: float, seed: int) -> int:
+    """So many hours of four arrays; 1 where the memory has grown too much after the first, or a sound is lost."""
+    logging.disable(logging.CRITICAL)
+
+    def tell(at_hours: float, resident_mb: float) -> None:
+        print(f"{at_hours:5.2f} h {resident_mb:6.1f} MB", flush=True)
+
+    with tempfile.TemporaryDirectory() as directory:
+        outcome = soak(Path(directory), hours, seed=seed, tell=tell)
+    for name, value in asdict(outcome).items():
+        print(f"{name:<20} {value}")
+    print(f"{'growth':<20} {outcome.growth:.2%}")
+    return 1 if outcome.growth > GROWTH or outcome.unheard else 0
+
+
 def main() -> int:
     """Run a campaign; 1 where anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -165,7 +182,12 @@ def main() -> int:
     sub.add_argument("--fault", choices=list(PROCESSES), action="append", help="only these (all)")
     sub = campaigns.add_parser("wire", help="damaged messages, given to the server's ingest")
     sub.add_argument("--count", type=int, default=1_000_000, help="how many (1 000 000)")
+    sub = campaigns.add_parser("soak", help="simulated time: a day of four arrays, and the server's memory")
+    sub.add_argument("--hours", type=float, default=24.0, help="how long (24)")
+    sub.add_argument("--seed", type=int, default=0, help="of what goes wrong meanwhile (0)")
     arguments = parser.parse_args()
+    if arguments.campaign == "soak":
+        return soaked(arguments.hours, arguments.seed)
     if arguments.campaign == "wire":
         return damaged(arguments.count)
     began = time.monotonic()

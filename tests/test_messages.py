@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from livessl.core.clock_offsets import ClockOffset
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.types import ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status, dbfs
@@ -187,9 +188,22 @@ def test_array_status() -> None:
         "sample_rate_hz": 16000.0,
         "drift_ppm": 12.35,
         "clock": "locked",
+        "clock_offset": None,
         "counters": {"frames": 3},
     }
     assert strict_json(told) == told
+
+
+def test_clock_offset_of_an_array() -> None:
+    offset = ClockOffset(-0.13764, 0.00123, 7, "lab-pc")
+    told = array_status(status_of(clock_offset=offset, corrected_frames=-3), "door-pc")
+    assert told["clock_offset"] == {
+        "offset_s": -0.1376,
+        "std_s": 0.0012,
+        "sounds": 7,
+        "reference": "lab-pc",
+        "corrected_s": -0.15,
+    }
 
 
 def test_array_not_heard_from_has_nulls() -> None:

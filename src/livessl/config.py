@@ -24,6 +24,7 @@ from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, Floa
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
+    from livessl.core.clock_offsets import ClockOffsets
     from livessl.core.fusion import Fusion
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
@@ -433,8 +434,24 @@ class Site(_Model):
             hang_over_s=a.hang_over_s,
         )
 
-    def make_fusion(self, method: str | None = None, *, updates: bool = True, live: bool = False) -> Fusion:
-        """A new fusion of this site's arrays, by the site's method or another of `METHODS`."""
+    def make_clock_offsets(self) -> ClockOffsets:
+        """What nobody knows yet of this site's clocks: one each node, or each array that is on none."""
+        from livessl.core.clock_offsets import ClockOffsets
+
+        return ClockOffsets({spec.name: self.node_of(spec.name) or spec.name for spec in self.processed}, self.c_m_s)
+
+    def make_fusion(
+        self,
+        method: str | None = None,
+        *,
+        updates: bool = True,
+        live: bool = False,
+        clock_offsets: ClockOffsets | None = None,
+    ) -> Fusion:
+        """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
+
+        `clock_offsets` is what is known already of the arrays' clocks.
+        """
         from livessl.core.estimators import ESTIMATORS
         from livessl.core.fusion import Fusion, FusionParameters
 
@@ -450,7 +467,15 @@ class Site(_Model):
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,
         )
-        return Fusion(self.site, self.processed, estimator, parameters, updates=updates, newest_only=live)
+        return Fusion(
+            self.site,
+            self.processed,
+            estimator,
+            parameters,
+            updates=updates,
+            newest_only=live,
+            clock_offsets=self.make_clock_offsets() if clock_offsets is None else clock_offsets,
+        )
 
     def node_of(self, array: str) -> str | None:
         """Name of the node that captures an array; a joint one's arrays are all on one."""

@@ -11,7 +11,7 @@ import orjson
 from livessl.clock import utc_text
 from livessl.config import Site
 from livessl.core.fusion import ArrayStatus
-from livessl.core.types import Contribution, Estimate, Event, Track, Update
+from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
 
 API_VERSION: Final = 1
 
@@ -158,7 +158,21 @@ def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
         "sample_rate_hz": status.sample_rate_hz,
         "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),
         "clock": None if status.clock is None else str(status.clock),
+        "clock_offset": _clock_offset(status),
         "counters": dict(status.counters),
+    }
+
+
+def _clock_offset(status: ArrayStatus) -> JsonObject | None:
+    offset = status.clock_offset
+    if offset is None:
+        return None
+    return {
+        "offset_s": round(offset.offset_s, 4),
+        "std_s": round(offset.std_s, 4),
+        "sounds": offset.sounds,
+        "reference": offset.reference,
+        "corrected_s": round(status.corrected_frames * FRAME_S, 2),
     }
 
 

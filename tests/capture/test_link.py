@@ -176,6 +176,21 @@ def test_server_that_was_started_anew_gets_what_the_old_one_had_not_acknowledged
             together(link, router, lambda: router.frames()[-3:] == [3, 4, 5], "the frames")
 
 
+def test_broken_connection_is_noticed_before_anything_goes_over_the_next() -> None:
+    """What was on its way is lost with it; a greeting that did not count it would tell the server that it has come."""
+    with linked(free_endpoint()) as link:
+        with Router(link.endpoint) as router:
+            connect(link, router)
+            link.send([frame(k) for k in range(1, 5)])
+            together(link, router, lambda: len(router.frames()) == 4, "the frames")
+        with Router(link.endpoint) as router:
+            link.tell("a greeting for another reason")
+            together(link, router, lambda: router.got, "anything")
+            first = router.got[0]
+            assert isinstance(first, wire.Hello)
+            assert first.backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 5)}
+
+
 def test_silence_of_the_server_is_noticed_and_survived() -> None:
     clock = HandClock()
     with Router() as router, linked(router.endpoint, clock) as link:

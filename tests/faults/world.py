@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 import numpy as np
@@ -106,9 +106,23 @@ class Cable(Dealer):
     def __init__(self, world: World, node: str) -> None:
         self._world = world
         self._node = node
+        self._wire: Wire | None = None
+        self._broken = False
+
+    def broken(self) -> bool:
+        self._look()
+        broken, self._broken = self._broken, False
+        return broken
+
+    def _look(self) -> None:
+        wire_ = self._world.wires.get(self._node)
+        self._broken |= self._wire is not None and wire_ is not self._wire
+        self._wire = wire_
 
     def send(self, data: bytes) -> bool:
-        return self._world.send_up(self._node, data)
+        sent = self._world.send_up(self._node, data)
+        self._look()
+        return sent
 
     def receive(self) -> bytes | None:
         return self._world.receive_down(self._node)
@@ -236,6 +250,8 @@ class World:
         Where the nodes keep their frames; None keeps them in memory.
     """
 
+    array_of: ClassVar[Mapping[str, str]] = ARRAY_OF
+
     def __init__(
         self, seed: int, sounds: int = 8, delay_ticks: tuple[int, int] = (0, 1), spools: Path | None = None
     ) -> None:
@@ -253,9 +269,9 @@ class World:
         self.sounds = self._make_sounds(sounds)
         self.server: Engine | None = None
         self.nodes: dict[str, Node] = {}
-        self.down: dict[str, list[tuple[int, int]]] = {"a": [], "b": []}
+        self.down: dict[str, list[tuple[int, int]]] = {name: [] for name in self.array_of}
         self.start_server()
-        for name in ARRAY_OF:
+        for name in self.array_of:
             self.start_node(name)
 
     @property
@@ -287,16 +303,17 @@ class World:
         self.wires.clear()
 
     def start_node(self, name: str) -> None:
-        array = ARRAY_OF[name]
+        array = self.array_of[name]
         self._runs += 1
-        active = frozenset(r for of, rasters in self.sounds for r in rasters if of == array)
         spool = Spool(None if self._spools is None else self._spools / name)
         hello = wire.Hello(name, f"run-{self._runs}", {array: float(RATE_HZ)})
-        self.nodes[name] = Node(
-            name, Microphones(array, active), Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
-        )
+        link = Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
+        self.nodes[name] = Node(name, self._microphones(array), link)
         if self.down[name]:
             self.down[name][-1] = (self.down[name][-1][0], self.raster)
+
+    def _microphones(self, array: str) -> Microphones:
+        return Microphones(array, frozenset(r for of, rasters in self.sounds for r in rasters if of == array))
 
     def kill_node(self, name: str) -> None:
         """Its files stay as they are; whatever was in memory is gone."""
@@ -398,7 +415,7 @@ class World:
         self.store.dies, self.store.full = None, False
         if self.server is None:
             self.start_server()
-        for name in ARRAY_OF:
+        for name in self.array_of:
             if name not in self.nodes:
                 self.start_node(name)
             self.nodes[name].stopped = False

@@ -59,7 +59,19 @@ class Dealer:
             self._socket.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
             self._socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
             self._socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
+        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         self._socket.connect(endpoint)
+
+    def broken(self) -> bool:
+        """Whether the connection has broken since this was last asked, and with it what was on its way.
+
+        ZeroMQ makes another by itself, and says nothing of it; not before it has waited for a tenth of a second.
+        """
+        broken = False
+        while self._monitor.poll(0):
+            self._monitor.recv_multipart()
+            broken = True
+        return broken
 
     def send(self, data: bytes) -> bool:
         """Whether the message could be handed over."""
@@ -84,6 +96,8 @@ class Dealer:
         """End the connection, once; what was handed over has so long to go out."""
         if self._socket.closed:
             return
+        self._socket.disable_monitor()
+        self._monitor.close()
         self._socket.setsockopt(zmq.LINGER, linger_ms)
         self._socket.close()
         self._context.term()
@@ -168,7 +182,8 @@ class Link:
         """Let the server know what is wrong with the device, or that nothing is any more."""
         if problem != self._hello.problem:
             self._hello = replace(self._hello, problem=problem)
-            self._say_hello()
+            self._owes_hello = True
+            self.service()
 
     def send(self, messages: Iterable[Message]) -> None:
         """Queue messages and move what can be moved."""
@@ -184,6 +199,10 @@ class Link:
     def service(self) -> None:
         """Read acknowledgements, greet if nobody knows us, send what waits."""
         self._receive()
+        if self._dealer.broken() and self._greeted:
+            _log.info("the connection to the server at %s broke; what was on its way is sent again", self.endpoint)
+            self._lose()
+            self._hello_ns = -SILENT_NS  # at once, before anything else goes over the new one
         now_ns = self._clock.monotonic_ns()
         if not self.connected:
             if self._greeted:

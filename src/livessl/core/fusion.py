@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import reduce
 from operator import add
@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
+from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
@@ -132,6 +133,8 @@ class ArrayStatus:
     drift_ppm: float | None
     clock: ClockState | None
     counters: Mapping[str, int]
+    clock_offset: ClockOffset | None = None
+    corrected_frames: int = 0
 
 
 @dataclass(slots=True)
@@ -152,6 +155,8 @@ class _Stream:
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
+    ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
+    rest_ns: int = 0  # that it is ahead besides
     listener: OnsetFrontEnd | None = None
     chain: int = 0  # names the frames listened to, in their order
     unheard: deque[int] = field(
@@ -200,7 +205,7 @@ class _Stream:
                 self.chain = 0
                 self.unheard.clear()
                 continue
-            self.chain = hash((self.chain, raster, frame.active, frame.sample_rate_hz))
+            self.chain = hash((self.chain, raster, frame.time_ns, frame.active, frame.sample_rate_hz))
             onsets = shared.get((self.spec.name, self.chain))
             if onsets is None:
                 onsets = self._push(frame, estimator)
@@ -228,6 +233,14 @@ class _Stream:
                 self.listener.push(one.samples, quiet=not one.active)
         return self.listener.push(frame.samples, quiet=not frame.active)
 
+    def move(self, frames: int) -> None:
+        """Take it that its clock is ahead by so many frames more."""
+        self.ahead += frames
+        self.frames = {r - frames: replace(frame, raster=r - frames) for r, frame in self.frames.items()}
+        if self.watermark is not None:
+            self.watermark -= frames
+        self.forget()
+
     def forget(self) -> None:
         """Forget what was listened to."""
         self.listener, self.chain = None, 0
@@ -247,6 +260,7 @@ class _OpenEvent:
     closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
     ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
+    became_quiet: bool = False
 
 
 class Fusion:
@@ -264,6 +278,8 @@ class Fusion:
     newest_only : bool
         Whether, of several windows that are due at once, the newest alone is localized: what is live must not fall
         further behind. `updates_left_out` counts the others.
+    clock_offsets : ClockOffsets or None
+        What is known of the arrays' clocks, learned from the events told; None takes them all to agree.
     """
 
     def __init__(
@@ -275,12 +291,15 @@ class Fusion:
         *,
         updates: bool = True,
         newest_only: bool = False,
+        clock_offsets: ClockOffsets | None = None,
     ) -> None:
         self._site = site
         self._estimator = estimator
         self._parameters = parameters or FusionParameters()
         self._updates = updates
         self._newest_only = newest_only
+        self.clock_offsets = clock_offsets
+        self._learns = True
         self._streams = {spec.name: _Stream(spec) for spec in arrays}
         self._tracker = Tracker()
         self._next: int | None = None
@@ -297,13 +316,22 @@ class Fusion:
     def twin(self) -> Fusion:
         """Another of the same site around the same estimator, at its beginning, that makes events only."""
         specs = [stream.spec for stream in self._streams.values()]
-        other = Fusion(self._site, specs, self._estimator, self._parameters, updates=False)
+        other = Fusion(
+            self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
+        )
         other._shared = self._shared
+        other._align()
+        self._learns = False  # the twin hears all, and in order
         return other
 
     def begin(self, raster: int) -> None:
         """Take it that everything before this raster interval has been told."""
         self._heard_until = raster
+
+    def frames_ahead(self, array: str) -> int:
+        """By how many frames an array's raster intervals are ahead of the joint ones."""
+        stream = self._streams.get(array)
+        return 0 if stream is None else stream.ahead
 
     def leave_out(self, told: int, closing: int) -> None:
         """Tell no event that another fusion tells: of sound before `told`, or that comes to its end by `closing`."""
@@ -335,6 +363,8 @@ class Fusion:
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output]:
         """Take in messages, in any order between arrays; return what there is to tell."""
         outputs = self._start_over() if self._went_back(now_ns) else []
+        if not self._learns and self._event is None:
+            self._align()
         self._now_ns = now_ns
         for message in messages:
             self._accept(message)
@@ -367,7 +397,11 @@ class Fusion:
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
-        return [_status(stream, now_ns) for stream in self._streams.values()]
+        clocks = self.clock_offsets
+        return [
+            _status(stream, now_ns, None if clocks is None else clocks.of(name))
+            for name, stream in self._streams.items()
+        ]
 
     def _went_back(self, now_ns: int) -> bool:
         return self._next is not None and (self._next - 1) * FRAME_NS - now_ns > LATEST_NS
@@ -376,7 +410,10 @@ class Fusion:
         """The server's clock was set back: what came before lies in its future now, and would make all else late."""
         outputs = self._finish() if self._event is not None else []
         outputs += self._tracker.step(self._now_ns + round(2e9 * SILENCE_S))
-        self._streams = {name: _Stream(old.spec, counters=old.counters) for name, old in self._streams.items()}
+        self._streams = {
+            name: _Stream(old.spec, counters=old.counters, ahead=old.ahead, rest_ns=old.rest_ns)
+            for name, old in self._streams.items()
+        }
         self._reached.clear()
         self._shared.clear()
         self._next, self._heard_until = None, -(2**63)
@@ -387,6 +424,8 @@ class Fusion:
         if stream is None:
             self.unknown_arrays += 1
             return
+        if stream.ahead:
+            message = replace(message, raster=message.raster - stream.ahead)
         ahead_ns = message.raster * FRAME_NS - self._now_ns
         if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
             stream.counters["rejected"] += 1
@@ -433,18 +472,21 @@ class Fusion:
         outputs: list[Output] = []
         if self._next is None:
             return outputs
-        newest = max(stream.watermark for stream in self._streams.values() if stream.watermark is not None)
+        newest = self._newest()
         if newest - self._next > JUMP_FRAMES:
             outputs += self._finish() if self._event is not None else []
             self._next = newest
-        while self._next <= newest and self._may_close(self._next):
-            outputs += self._close(self._next)
-            self._next += 1
+        while self._next <= self._newest() and self._may_close(self._next):
+            raster, self._next = self._next, self._next + 1
+            outputs += self._close(raster)
             self._prune()
         due, self._due = self._due, None
         if due is not None and self._event is not None and due >= self._event.start:
             outputs += self._update(self._event, due)
         return outputs
+
+    def _newest(self) -> int:
+        return max(stream.watermark for stream in self._streams.values() if stream.watermark is not None)
 
     def _may_close(self, raster: int) -> bool:
         while self._reached and self._reached[0][0] < raster:
@@ -482,7 +524,7 @@ class Fusion:
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
-            event.ended = True
+            event.ended = event.became_quiet = True
             return self._finish()
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
@@ -540,6 +582,30 @@ class Fusion:
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None
         assert event is not None
+        told = self._told(event)
+        if event.became_quiet:
+            self._align()
+        return told
+
+    def _align(self) -> None:
+        """Join the arrays by what is known of their clocks, from here on; amid a sound it would be torn.
+
+        What has been told of an array that moves on in time is not told again.
+        """
+        if self.clock_offsets is None:
+            return
+        onward = 0
+        for name, stream in self._streams.items():
+            by = self.clock_offsets.frames_ahead(name) - stream.ahead
+            if by:
+                stream.move(by)
+                onward = max(onward, -by)
+            stream.rest_ns = round(1e9 * self.clock_offsets.rest_s(name))
+        if onward and self._next is not None:
+            self._heard_until += onward
+            self._next = max(self._next, self._heard_until)
+
+    def _told(self, event: _OpenEvent) -> list[Output]:
         parameters = self._parameters
         span = range(self._span_start(event.start), event.closed + 1)
         sounds = _Sounds()
@@ -547,7 +613,8 @@ class Fusion:
         self._heard_until = event.last_active + 1
         if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
             return []
-        first, last = event.last_active, event.start
+        starts_ns: list[int] = []
+        ends_ns: list[int] = []
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -566,10 +633,11 @@ class Fusion:
                 stream.listen(span, self._estimator, self._shared)
             sounds.pieces[name], powers[name] = pieces, power[mask]
             sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
-            first, last = min(first, rasters[0]), max(last, rasters[-1])
+            starts_ns.append(rasters[0] * FRAME_NS - stream.rest_ns)
+            ends_ns.append((rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
         if not sounds:
             return []
-        start_ns, end_ns = first * FRAME_NS, (last + 1) * FRAME_NS
+        start_ns, end_ns = min(starts_ns), max(ends_ns)
         estimate: Estimate | None = None
         status = Status.REFUSED
         reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
@@ -577,7 +645,9 @@ class Fusion:
             found = self._estimator.locate(sounds)
             estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
             status, reason = self._judge(estimate, found)
-            if status is Status.REFUSED:
+            if status is Status.LOCATED and event.became_quiet:
+                self._learn_clocks(end_ns, estimate, span)
+            elif status is Status.REFUSED:
                 estimate = None
         return [
             Event(
@@ -596,6 +666,14 @@ class Fusion:
                 complete_ns=(event.closed + 1) * FRAME_NS,
             )
         ]
+
+    def _learn_clocks(self, time_ns: int, estimate: Estimate, span: range) -> None:
+        clocks = self.clock_offsets
+        if clocks is None or not self._learns or not clocks.tell_apart(estimate.arrays):
+            return
+        streams = [self._streams[name] for name in estimate.arrays]
+        whole = [(stream.spec, max(stream.segments(span)[0], key=len)) for stream in streams]
+        clocks.hear(time_ns, estimate.position_m, whole)
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         return judged(found, [self._streams[name].spec for name in estimate.arrays])
@@ -685,10 +763,12 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
         stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
-def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
+def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArrayStatus:
     mark = stream.mark
     age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
     state, reason = _state(stream, age_ns, now_ns)
+    if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
+        state, reason = ArrayState.DEGRADED, clock_is_off(offset)
     return ArrayStatus(
         name=stream.spec.name,
         state=state,
@@ -702,6 +782,8 @@ def _status(stream: _Stream, now_ns: int) -> ArrayStatus:
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,
         counters=dict(stream.counters),
+        clock_offset=offset,
+        corrected_frames=stream.ahead,
     )
 
 

@@ -39,7 +39,7 @@ class Settled:
 
 @dataclass(slots=True)
 class _Source:
-    """How much of one array's sound is known."""
+    """How much of one array's sound is known, in raster intervals of its own clock."""
 
     live_until: int = _NEVER
     backlog_at: int | None = None
@@ -84,6 +84,12 @@ class Settling:
     def settled(self) -> int | None:
         """Before this raster interval no frame will be looked at again; None at the beginning."""
         return self._slow.needed_from if self._slow.needed_from is not None else self._settled
+
+    @property
+    def settled_of(self) -> dict[str, int]:
+        """The same for each array, by its own clock: what its node calls that raster interval."""
+        settled = self.settled
+        return {} if settled is None else {name: settled + self._ahead(name) for name in self._sources}
 
     def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int) -> None:
         """An array's node has said what it kept: raster indices of its oldest frame and of the first live one."""
@@ -150,22 +156,23 @@ class Settling:
         source = self._sources.get(message.array)
         if source is None:
             return True
-        raster, backlog = message.raster, source.is_backlog(message.raster)
+        own, backlog = message.raster, source.is_backlog(message.raster)
+        raster = own - self._ahead(message.array)
         ahead_ns = raster * FRAME_NS - now_ns
         if ahead_ns > LATEST_NS or (ahead_ns < EARLIEST_NS and not backlog):
             return True  # it will be rejected there, and the reason told
         source.heard_ns, source.left = now_ns, False
         self._newest = max(self._newest, raster)
         if isinstance(message, Mark):
-            source.live_until = max(source.live_until, raster)
+            source.live_until = max(source.live_until, own)
             return True
         if backlog:
-            source.backlog_at = max(source.known_until, raster)
-        if raster in source.seen or (self.settled is not None and raster < self.settled):
-            too_late = raster not in source.seen and _NEVER < source.live_until < raster
+            source.backlog_at = max(source.known_until, own)
+        if own in source.seen or (self.settled is not None and raster < self.settled):
+            too_late = own not in source.seen and _NEVER < source.live_until < own
             (self.too_late if too_late else self.duplicates)[message.array] += 1
         else:
-            self._keep(source, message, now_ns)
+            self._keep(source, message, raster, now_ns)
             self.backfilled[message.array] += backlog
             closed = self.live.closed
             in_time = -ahead_ns < self.live.parameters.deadline_s * 1e9 if backlog else True
@@ -174,12 +181,16 @@ class Settling:
             return in_time
         return False
 
-    def _keep(self, source: _Source, frame: Frame, now_ns: int) -> None:
+    def _ahead(self, array: str) -> int:
+        """By how many raster intervals its clock is taken to be ahead."""
+        return self._slow.frames_ahead(array)
+
+    def _keep(self, source: _Source, frame: Frame, raster: int, now_ns: int) -> None:
         source.seen.add(frame.raster)
         if source.backlog_at is None or frame.raster >= source.live_from:
             source.live_until = max(source.live_until, frame.raster)
-        heapq.heappush(self._waiting, (frame.raster, frame.array, frame))
-        self._held.append((now_ns, frame.raster, frame.samples.nbytes))
+        heapq.heappush(self._waiting, (raster, frame.array, frame))
+        self._held.append((now_ns, raster, frame.samples.nbytes))
         self._bytes += frame.samples.nbytes
 
     def _frontier(self, now_ns: int) -> int:
@@ -195,9 +206,10 @@ class Settling:
                 break
             excess -= size
             self._held.popleft()
-        awaited = [source for source in self._sources.values() if not source.left]
-        there = [source.known_until for source in awaited if source.is_there(now_ns)]
-        away = [source.known_until for source in awaited if not source.is_there(now_ns)]
+        awaited = {name: source for name, source in self._sources.items() if not source.left}
+        known_until = {name: source.known_until - self._ahead(name) for name, source in awaited.items()}
+        there = [known_until[name] for name, source in awaited.items() if source.is_there(now_ns)]
+        away = [known_until[name] for name, source in awaited.items() if not source.is_there(now_ns)]
         known = min(min(there, default=_ALWAYS), max(min(away), self._overdue) if away else _ALWAYS)
         return max(self._end() if known == _ALWAYS else known, self._forced)
 
@@ -218,8 +230,12 @@ class Settling:
                 frame = heapq.heappop(self._waiting)[2]
                 self._bytes -= frame.samples.nbytes
                 batch.append(frame)
-            batch += [Mark(name, 0, end, 0.0, 0.0, ()) for name in self._sources]
+            ahead = {name: self._ahead(name) for name in self._sources}
+            batch += [Mark(name, 0, end + frames, 0.0, 0.0, ()) for name, frames in ahead.items()]
             outputs = self._slow.step(batch, (end + 1) * FRAME_NS)
+            if any(self._ahead(name) != frames for name, frames in ahead.items()):
+                self._waiting = [(f.raster - self._ahead(f.array), f.array, f) for _, _, f in self._waiting]
+                heapq.heapify(self._waiting)
             events += [self._dated(output, now_ns) for output in outputs if isinstance(output, Event)]
             self._position = end
         self._forget()
@@ -239,6 +255,6 @@ class Settling:
             return
         self._forgotten = settled
         self._late = {raster for raster in self._late if raster >= settled}
-        for source in self._sources.values():
+        for name, source in self._sources.items():
             if source.seen:
-                source.seen = {raster for raster in source.seen if raster >= settled}
+                source.seen = {own for own in source.seen if own >= settled + self._ahead(name)}

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Final
 
 import uvicorn
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidState
 
 from livessl.clock import Clock
 from livessl.config import ConfigError, Fault, HttpConfig, Site, open_doors
@@ -49,6 +51,16 @@ EXPIRE_S: Final = 600.0
 DAY_NS: Final = 86_400_000_000_000
 
 _log = logging.getLogger(__name__)
+
+
+class _Socket(WebSocketsSansIOProtocol):
+    """A WebSocket whose end is no trouble where its client is just closing it: uvicorn's would stop the server's."""
+
+    def shutdown(self) -> None:
+        try:
+            super().shutdown()
+        except InvalidState:
+            self.transport.close()
 
 
 class Server:
@@ -107,7 +119,7 @@ class Server:
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
-                ws="websockets-sansio",  # the quickest to send many small messages
+                ws=_Socket,  # of all kinds the quickest to send many small messages
                 log_level="warning",
                 http="h11",  # the one that limits a request's head
                 h11_max_incomplete_event_size=MAX_HEAD_BYTES,

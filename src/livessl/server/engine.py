@@ -55,11 +55,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Unsaved:
-    """Events and their start times, the ids they take the place of, and the raster interval they settle all before."""
+    """Events and their start times, the ids they take the place of, and the raster interval they settle all before.
+
+    `clocks` is what was known of the arrays' clocks then: without it, a raster interval is another one to each.
+    """
 
     events: Sequence[tuple[JsonObject, int]]
     replaced: Sequence[str]
     until: int
+    clocks: JsonObject
 
 
 class Engine:
@@ -196,11 +200,17 @@ class Engine:
 
     def _begin_live(self) -> None:
         arrays = [spec.name for spec in self._site.processed]
-        self._begin(arrays, self._store.settled(self._site.site), live=True)
+        self._begin(arrays, *self._store.settled(self._site.site), live=True)
 
-    def _begin(self, arrays: Iterable[str], settled: int | None, *, live: bool = False) -> None:
+    def _begin(
+        self, arrays: Iterable[str], settled: int | None, clocks: JsonObject | None = None, *, live: bool = False
+    ) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._settling = Settling(self._site.make_fusion(live=live), arrays, settled)
+        self._clocks = self._site.make_clock_offsets()
+        if clocks is not None:
+            self._clocks.restore(clocks)
+        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks)
+        self._settling = Settling(fusion, arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
 
@@ -299,7 +309,7 @@ class Engine:
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
         self._tell(self._settling.step(batch, self.now_ns()))
         if not self._unsaved:
-            self._receiver.ingest.settled = self._settling.settled
+            self._receiver.ingest.settled = self._settling.settled_of
 
     def _tell(self, outputs: Sequence[Output | Settled]) -> None:
         if self._messages is None:
@@ -361,7 +371,8 @@ class Engine:
                 events[k] = (same, start_ns)
             else:
                 news.append(event)
-        self._unsaved.append(_Unsaved(events, [old for old, by in replaced.items() if by is not None], settled.until))
+        gone = [old for old, by in replaced.items() if by is not None]
+        self._unsaved.append(_Unsaved(events, gone, settled.until, self._clocks.state()))
         self._save()
         for event in news:
             self._publish_event(event)
@@ -381,7 +392,7 @@ class Engine:
         while self._unsaved:
             first = self._unsaved[0]
             try:
-                self._store.settle(self._site.site, first.events, first.replaced, first.until)
+                self._store.settle(self._site.site, first.events, first.replaced, first.until, first.clocks)
             except StoreError as error:
                 _log.error("%s", error)
                 break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -83,7 +84,7 @@ class Ingest:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
-        self.settled: int | None = None
+        self.settled: Mapping[str, int] = {}  # of each array, by its own clock; replaced, never changed
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
         names = [spec.name for spec in site.processed]
@@ -201,7 +202,8 @@ class Ingest:
         return Arrival(greeted=hello if hello.backlog != same_run.hello.backlog else None, reply=reply)
 
     def _ack(self, peer: Peer) -> wire.Ack:
-        return wire.Ack(peer.hello.run_id, dict(peer.received), self.settled)
+        settled = [self.settled[array] for array in peer.hello.arrays if array in self.settled]
+        return wire.Ack(peer.hello.run_id, dict(peer.received), min(settled, default=None))
 
     def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
         """A key speaks for the node that it was enrolled for, and for the arrays that are that node's."""

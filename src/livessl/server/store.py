@@ -89,6 +89,7 @@ class Store:
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
                 db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
+                db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
             if path is not None:
                 self._reading = _Connection(f"{path.resolve().as_uri()}?mode=ro")
         except sqlite3.Error as error:
@@ -109,8 +110,17 @@ class Store:
             if provisional:
                 db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
 
-    def settle(self, site: str, events: Sequence[tuple[JsonObject, int]], replaced: Iterable[str], raster: int) -> None:
+    def settle(
+        self,
+        site: str,
+        events: Sequence[tuple[JsonObject, int]],
+        replaced: Iterable[str],
+        raster: int,
+        clocks: JsonObject,
+    ) -> None:
         """Keep events that stay, in place of others; before a raster interval all others stay too. All or nothing.
+
+        With them goes what is known of the clocks, by which the raster intervals of arrays are those of the site.
 
         Raises
         ------
@@ -127,11 +137,16 @@ class Store:
                 (raster * FRAME_NS,),
             )
             db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, raster))
+            db.execute("INSERT OR REPLACE INTO clocks VALUES (?, ?)", (site, json.dumps(clocks)))
 
-    def settled(self, site: str) -> int | None:
-        """The raster interval before which all sound of the site has become events that stay."""
-        rows = self._reading.rows("SELECT raster FROM settled WHERE site = ?", (site,))
-        return None if not rows else int(rows[0][0])
+    def settled(self, site: str) -> tuple[int | None, JsonObject | None]:
+        """The raster interval before which all sound of the site has become events that stay; what clocks were then."""
+        sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
+        rows = self._reading.rows(sql, (site,))
+        if not rows:
+            return None, None
+        raster, clocks = rows[0]
+        return int(raster), None if clocks is None else json.loads(clocks)
 
     def provisional(self, raster: int) -> list[JsonObject]:
         """Events before a raster interval that may still be replaced.

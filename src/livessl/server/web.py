@@ -491,6 +491,14 @@ class _Metrics(Collector):
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
         level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])
+        off = GaugeMetricFamily(
+            "livessl_array_clock_offset_seconds",
+            "How far ahead of the reference its clock is, by the sounds heard.",
+            labels=["array", "reference"],
+        )
+        unsure = GaugeMetricFamily(
+            "livessl_array_clock_offset_std_seconds", "Standard deviation of that.", labels=["array", "reference"]
+        )
         counts = CounterMetricFamily("livessl_array", "Counts of an array.", labels=["array", "what"])
         for array in self._engine.arrays():
             up.add_metric([array["name"]], float(array["state"] == "healthy"))
@@ -498,6 +506,9 @@ class _Metrics(Collector):
                 age.add_metric([array["name"]], array["age_s"])
             if array["level_dbfs"] is not None:
                 level.add_metric([array["name"]], array["level_dbfs"])
+            if (clock := array["clock_offset"]) is not None:
+                off.add_metric([array["name"], clock["reference"]], clock["offset_s"])
+                unsure.add_metric([array["name"], clock["reference"]], clock["std_s"])
             for what, count in array["counters"].items():
                 counts.add_metric([array["name"], what], count)
-        yield from (up, age, level, counts)
+        yield from (up, age, level, off, unsure, counts)

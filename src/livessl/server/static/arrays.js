@@ -5,6 +5,7 @@ import { duration, el, number, signed, write } from "./format.js";
 const FLOOR_DBFS = -96;
 const AMBER_S = 1;
 const LOST_S = 2;
+const FRAME_S = 0.05;
 /** Sound is taken for active at four times the noise floor's power (fusion's default) where the server names no gate. */
 const GATE_ABOVE_FLOOR_DB = 10 * Math.log10(4);
 const TROUBLES = {
@@ -55,6 +56,12 @@ export function effectiveState(held, nowMs, link) {
   const age = ageS(held, nowMs);
   const { state } = held.array;
   return age !== null && age > LOST_S && state !== "starting" && state !== "quiet" ? "lost" : state;
+}
+
+/** How far its clock is off, by the sounds that it and others heard; more than a frame is trouble. */
+function offset({ offset_s: off, std_s: std, sounds, reference }) {
+  const told = std === 0 ? "others are timed by its clock" : `${signed(1000 * off, 0)} ± ${number(1000 * std, 0)} ms to ${reference}, by ${sounds} sounds`;
+  return [told, Math.abs(off) > FRAME_S ? "trouble" : ""];
 }
 
 export class ArraysPanel {
@@ -170,6 +177,7 @@ export class ArraysPanel {
     const facts = [];
     if (Number.isFinite(array.drift_ppm)) facts.push([`drift ${signed(array.drift_ppm, 1)} ppm`, ""]);
     if (array.clock) facts.push([`clock ${array.clock}`, array.clock === "stepped" ? "trouble" : ""]);
+    if (array.clock_offset) facts.push(offset(array.clock_offset));
     if (Number.isFinite(array.sample_rate_hz)) facts.push([`${number(array.sample_rate_hz / 1000, 2)} kHz`, ""]);
     if (array.node) facts.push([`node ${array.node}`, ""]);
     facts.push([`${frames.toLocaleString("en").replaceAll(",", "\u202f")} frames`, ""]);

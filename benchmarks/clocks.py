@@ -1,0 +1,164 @@
+"""What arrays cost that disagree about time: one scene, played again with one array's clock off, and drifting.
+
+`python benchmarks/clocks.py --cache FOLDER` simulates a scene in the demo's room once, and localizes it with the south
+array's clock off by every offset and drift. What came out is in docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import soundfile
+
+from livessl.capture.devices import Placed, WavRecording
+from livessl.capture.line import played_messages
+from livessl.capture.recorded import Part, lines_of
+from livessl.clock import UnpacedClock
+from livessl.config import Site, load_site
+from livessl.core.clock_offsets import ClockOffset
+from livessl.core.types import Block, Event, Output, Status
+from livessl.demo import SITE_FILE
+from livessl.simulate.scene import Scene, make_scene, read_sounds, render
+from recordings import CLASSES, DATA
+
+RATE_HZ: Final = 16000.0
+START_NS: Final = 1_767_225_600_000_000_000
+OFFSETS_S: Final = (0.0, 0.03, 0.075, 0.15, -0.15, 0.3)
+DRIFTS_PPM: Final = (0.0, 100.0)
+NEAR_M: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Drifting:
+    """A recording by a node whose clock gains: its blocks are stamped by it."""
+
+    once: WavRecording
+    drift_ppm: float
+
+    def __getattr__(self, name: str) -> Any:
+        """What else there is to know of a recording."""
+        return getattr(self.once, name)
+
+    def blocks(self, start_ns: int) -> Iterator[Block]:
+        """The recording's, stamped by that clock."""
+        for block in self.once.blocks(start_ns):
+            gained_ns = round((block.stamp_ns - start_ns) * self.drift_ppm * 1e-6)
+            yield Block(block.first_index, block.samples, block.stamp_ns + gained_ns)
+
+
+def scene_of(site: Site, sounds: int, rt60_s: float, gap_s: float, seed: int) -> Scene:
+    """Development sounds of every class, anywhere in the room."""
+    chosen = [sound for name in CLASSES for sound in read_sounds(DATA / "dcase2016_task2", RATE_HZ) if name in sound[0]]
+    return make_scene(
+        site.room.size_m,
+        rt60_s=rt60_s,
+        sounds=chosen[::2],
+        count=sounds,
+        sample_rate_hz=RATE_HZ,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=seed,
+        gap_s=gap_s,
+    )
+
+
+def recorded(site: Site, scene: Scene, cache: Path, name: str) -> dict[str, Path]:
+    """Each array's recording of a scene, simulated once."""
+    cache.mkdir(parents=True, exist_ok=True)
+    paths = {}
+    for number, spec in enumerate(site.specs):
+        path = paths[spec.name] = cache / f"{name}-{spec.name}.wav"
+        if not path.exists():
+            samples = render(scene, spec.microphones_m, seed=number + 1)
+            soundfile.write(path, samples.T, round(RATE_HZ), subtype="PCM_16")
+    return paths
+
+
+def heard_with(
+    site: Site, paths: dict[str, Path], offset_s: float, drift_ppm: float, *, corrected: bool
+) -> tuple[list[Event], ClockOffset | None]:
+    """What is found where the last array's clock is off, and what is known of it in the end."""
+    late = list(paths)[-1]
+    parts = []
+    for array, path in paths.items():
+        recording = WavRecording(path)
+        start_ns = START_NS
+        if array == late:
+            start_ns += round(offset_s * 1e9)
+        placed = Placed(Drifting(recording, drift_ppm if array == late else 0.0), start_ns)
+        parts.append(Part(array, placed, tuple(range(1, 5))))
+    fusion = site.make_fusion(updates=False)
+    if not corrected:
+        fusion.clock_offsets = None
+    outputs: list[Output] = []
+    now_ns = 0
+    for now_ns, batch in played_messages(*lines_of(site, parts), UnpacedClock()):
+        outputs += fusion.step(batch, now_ns)
+    outputs += fusion.flush(now_ns)
+    known = {status.name: status.clock_offset for status in fusion.status(now_ns)}
+    return [output for output in outputs if isinstance(output, Event)], known[late]
+
+
+def figures(scene: Scene, events: list[Event]) -> dict[str, Any]:
+    """How many sounds have one event, by both arrays and near; and how far off these are."""
+    starts_s = np.array([source.start_s for source in scene.sources])
+    of_sound: list[list[Event]] = [[] for _ in scene.sources]
+    for event in events:
+        at_s = (event.start_ns - START_NS) / 1e9
+        of_sound[max(0, int(np.searchsorted(starts_s, at_s + 0.25)) - 1)].append(event)
+    errors_m, both, one = [], 0, 0
+    for source, found in zip(scene.sources, of_sound, strict=True):
+        one += len(found) == 1
+        both += any(len(event.heard_by) == 2 for event in found)
+        placed = [event.estimate for event in found if event.status is Status.LOCATED and event.estimate is not None]
+        if placed:
+            errors_m.append(min(float(np.linalg.norm(e.position_m - source.position_m)) for e in placed))
+    near = sum(error_m <= NEAR_M for error_m in errors_m)
+    return {
+        "sounds": len(scene.sources),
+        "events": len(events),
+        "one_event": one,
+        "both": both,
+        "located": len(errors_m),
+        "near": near,
+        "median_m": round(float(np.median(errors_m)), 4) if errors_m else None,
+        "p90_m": round(float(np.quantile(errors_m, 0.9)), 3) if errors_m else None,
+    }
+
+
+def main() -> None:
+    """Simulate, listen, print a line for each offset and drift."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sounds", type=int, default=36)
+    parser.add_argument("--rt60", type=float, default=0.7)
+    parser.add_argument("--gap", type=float, default=0.8)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--noise-dbfs", type=float, default=-75.0)
+    parser.add_argument("--uncorrected", action="store_true", help="as if nobody knew of clocks")
+    parser.add_argument("--offsets", type=float, nargs="+", default=OFFSETS_S)
+    parser.add_argument("--cache", type=Path, required=True)
+    arguments = parser.parse_args()
+    site = load_site(SITE_FILE)
+    a = arguments
+    scene = replace(scene_of(site, a.sounds, a.rt60, a.gap, a.seed), noise_dbfs=a.noise_dbfs)
+    name = f"{a.sounds}-{a.rt60:g}-{a.gap:g}-{a.seed}{a.noise_dbfs:g}"
+    paths = recorded(site, scene, arguments.cache, name)
+    for drift_ppm in DRIFTS_PPM:
+        for offset_s in arguments.offsets:
+            events, clock = heard_with(site, paths, offset_s, drift_ppm, corrected=not arguments.uncorrected)
+            found = figures(scene, events)
+            if clock is not None:
+                last_s = (events[-1].end_ns - START_NS) / 1e9
+                wrong_s = clock.offset_s - offset_s - drift_ppm * 1e-6 * last_s
+                found |= {"offset_wrong_ms": round(1e3 * wrong_s, 2), "offset_std_ms": round(1e3 * clock.std_s, 2)}
+            print(json.dumps({"offset_s": offset_s, "drift_ppm": drift_ppm, **found}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

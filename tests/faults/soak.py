@@ -1,0 +1,473 @@
+"""A day of a site with four arrays in some minutes: nodes, links, server, store and clients, in simulated time.
+
+All of it is real but two things: what nodes send reaches the server without a socket, and its fusion is stepped from
+here. Sounds are rendered once, segmented as a node does it, and come again and again; between them it is quiet.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import os
+import random
+import socket
+import threading
+import time
+import urllib.request
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+from unittest.mock import patch
+
+from mutation import mutated, originals
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+from world import START, Event, HandClock, Microphones, Post, World
+
+from clients import open_client
+from livessl import wire
+from livessl.capture.devices import ArrayRecording, Placed
+from livessl.capture.line import played_messages
+from livessl.capture.recorded import Part, lines_of
+from livessl.clock import UnpacedClock, utc_ns
+from livessl.config import Site
+from livessl.core.types import FRAME_NS, Frame, Message
+from livessl.server.app import Server
+from livessl.server.engine import Engine
+from livessl.server.latency import Arrival
+from livessl.server.refusals import Refusals
+from livessl.simulate.scene import make_scene, render
+from small_site import RATE_HZ, hiss, site_of
+
+SECOND = 20
+HOUR = 3600 * SECOND
+SLOT = 20 * SECOND
+"""One sound in each, but for every eighth hour, which is quiet."""
+
+SAMPLE = 180 * SECOND
+"""Between two looks at the memory."""
+
+SOUNDS = 8
+"""Different ones, each at a place of its own."""
+
+PLACES = {
+    "a": ("north", [1.9, 1.0, 1.4]),
+    "b": ("south", [2.2, 4.1, 1.5]),
+    "c": ("east", [3.3, 2.6, 1.6]),
+    "d": ("west", [0.7, 2.3, 1.5]),
+}
+"""Nodes, each with an array and its place."""
+
+GROWTH = 0.05
+"""Of the memory after the first hour, at most."""
+
+RETENTION_S = 3600.0
+"""Of events: so that what is kept of them is as much after an hour as after a day."""
+
+
+def soak_site(directory: Path) -> Site:
+    """Four arrays on four nodes in the small room, and a database that forgets."""
+    data: dict[str, Any] = {
+        "arrays": {
+            array: {"geometry": {"tetrahedron": {"edge_m": 0.3}}, "position_m": place}
+            for array, place in PLACES.values()
+        },
+        "nodes": {
+            node: {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {array: [1, 2, 3, 4]}}
+            for node, (array, _) in PLACES.items()
+        },
+        "server.events_db": str(directory / "events.db"),
+        "store.retention_days": RETENTION_S / 86_400.0,
+    }
+    return site_of(data)
+
+
+Tell = Callable[[float, float], None]
+
+Heard = Mapping[int, Sequence[Frame]]
+"""What an array's node sends of a sound, by raster interval since the sound's recording began."""
+
+
+def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
+    """Each of the sounds as every array's node sends it."""
+    sounds: list[dict[str, Heard]] = []
+    for k in range(SOUNDS):
+        scene = make_scene(
+            site.room.size_m,
+            rt60_s=0.2,
+            sounds=[("burst", hiss(0.2 + 0.1 * k, 1, seed=k)[0])],
+            count=1,
+            sample_rate_hz=RATE_HZ,
+            c_m_s=site.c_m_s,
+            keep_away_m=[spec.centre_m for spec in site.specs],
+            seed=k,
+            lead_s=1.0,
+        )
+        heard: dict[str, Heard] = {}
+        for spec in site.specs:
+            samples = render(scene, spec.microphones_m, seed=k)
+            part = Part(spec.name, Placed(ArrayRecording(spec.name, float(RATE_HZ), samples), 0), (1, 2, 3, 4))
+            heard[spec.name] = _by_interval(site, part)
+        sounds.append(heard)
+    return sounds
+
+
+def _by_interval(site: Site, part: Part) -> dict[int, list[Frame]]:
+    found: dict[int, list[Frame]] = {}
+    run_up: list[Frame] = []
+    for _, batch in played_messages(*lines_of(site, [part]), UnpacedClock()):
+        for message in batch:
+            if isinstance(message, Frame):
+                run_up.append(message)
+                if message.active or message.raster - 1 in found:
+                    found[message.raster], run_up = run_up, []
+    return found
+
+
+@dataclass
+class Player(Microphones):
+    """An array in a room where the rendered sounds come again and again."""
+
+    sounds: Sequence[Mapping[str, Heard]] = ()
+    sent: Counter[str] = field(default_factory=Counter)
+
+    def hear(self, raster: int) -> list[Message]:
+        messages = self._heard(raster)
+        self.sent.update(type(message).__name__ for message in messages)
+        return messages
+
+    def _heard(self, raster: int) -> list[Message]:
+        slot, since = divmod(raster - START, SLOT)
+        played = sound_of(slot, len(self.sounds))
+        if played is None:
+            return super().hear(raster)
+        began = raster - since + played[0]
+        frames = self.sounds[played[1]][self.array].get(raster - began, ())
+        if not frames:
+            return super().hear(raster)
+        messages: list[Message] = []
+        for frame in frames:
+            self.sequence += 1
+            at = frame.raster + began
+            messages.append(replace(frame, sequence=self.sequence, raster=at, time_ns=frame.time_ns + began * FRAME_NS))
+        return messages
+
+
+def sound_of(slot: int, count: int) -> tuple[int, int] | None:
+    """When in its slot a sound's recording begins, in intervals, and which it is."""
+    if slot * SLOT // HOUR % 8 == 7:
+        return None
+    rng = random.Random(slot)
+    return rng.randrange(SLOT // 2), rng.randrange(count)
+
+
+class _Post(Post):
+    """As the receiver, its books on arrivals included."""
+
+    endpoint = "nowhere"
+
+    def __init__(self, site: Site, clock: HandClock) -> None:
+        super().__init__(site, clock)
+        self.refusals = Refusals(clock)
+        self.enrolled: list[str] = []
+
+    def receive(self, routing_id: bytes, data: bytes) -> list[tuple[bytes, wire.Ack]]:
+        before = len(self.queue)
+        replies = super().receive(routing_id, data)
+        if len(self.queue) > before and isinstance(item := self.queue[-1], Message):
+            self.arrivals.note(item.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+        return replies
+
+    def start(self) -> None:
+        """There is no thread."""
+
+    def stop(self) -> None:
+        """There is no socket."""
+
+
+class _Driven(Engine):
+    """An engine whose turns are taken from outside."""
+
+    def start(self) -> None:
+        self.maps.start()
+
+
+class Soak(World):
+    """The site, disturbed every few minutes. Use as a context.
+
+    Parameters
+    ----------
+    directory : Path
+        For the database.
+    seed : int
+        Of the faults.
+    tell : callable
+        Gets the hours that have passed and the memory in MB, every three minutes.
+    """
+
+    array_of: ClassVar = {node: array for node, (array, _) in PLACES.items()}
+
+    def __init__(self, directory: Path, seed: int = 0, tell: Tell = lambda hours, mb: None) -> None:
+        self._tell = tell
+        self._soaked = soak_site(directory)
+        self._rendered = rendered_sounds(self._soaked)
+        self.faults: Counter[str] = Counter()
+        self.sent: Counter[str] = Counter()
+        self.slots: set[int] = set()
+        self.memory_mb: list[tuple[float, float]] = []
+        super().__init__(seed)
+
+    def _make_sounds(self, count: int) -> list[tuple[str, frozenset[int]]]:
+        return []
+
+    def _microphones(self, array: str) -> Player:
+        return Player(array, frozenset(), sounds=self._rendered, sent=self.sent)
+
+    def start_server(self) -> None:
+        self.site = self._soaked
+        with patch("livessl.server.engine.Receiver", _Post), patch("livessl.server.app.Engine", _Driven):
+            self.http = Server(self.site, self.clock, on_event=self._note)
+        self.server = self.http.engine
+
+    def _note(self, event: Event) -> None:
+        self.slots.add((utc_ns(event["time_utc"]) // FRAME_NS - START) // SLOT)
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self.http.run, daemon=True)
+        self._thread.start()
+        while not self.http._uvicorn.started:
+            time.sleep(0.01)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.http.stop()
+        self._thread.join(timeout=10)
+
+    @property
+    def hours(self) -> float:
+        """That have passed."""
+        return (self.raster - START) / HOUR
+
+    def run(self, ticks: int) -> None:
+        for _ in range(ticks):
+            self.tick()
+            if self.raster % SECOND == 0:
+                self._breathe()
+            if (self.raster - START) % SAMPLE == 0:
+                self.memory_mb.append((self.hours, resident_mb()))
+                self._tell(*self.memory_mb[-1])
+
+    def _breathe(self) -> None:
+        """The server's loop has told all that it was given; else it would fall behind by hours."""
+        if self.http.engine.failure is not None:
+            raise RuntimeError("the server has failed") from self.http.engine.failure
+        assert self.http._loop is not None
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result(timeout=30)
+
+    def disturbances(self) -> Iterator[int]:
+        """Do something bad, and say how many intervals shall pass before the next."""
+        pool = originals()
+        while True:
+            yield self.rng.randint(60 * SECOND, 600 * SECOND)
+            name = self.rng.choice(list(self.array_of))
+            what = self.rng.choices(
+                ["cut", "reset", "stopped", "killed", "rubbish", "away"], weights=[4, 4, 4, 4, 4, 1]
+            )[0]
+            self.faults[what] += 1
+            match what:
+                case "cut" | "away":
+                    self.cut.add(name)
+                    yield self.rng.randint(*((5, 120) if what == "cut" else (900, 1200))) * SECOND
+                    self.heal(name)
+                case "reset":
+                    self.reset(name)
+                case "stopped":
+                    node = self.nodes[name]
+                    node.stopped = True
+                    yield self.rng.randint(1, 2 * SECOND)
+                    node.stopped = False
+                case "killed":
+                    self.kill_node(name)
+                    yield self.rng.randint(1, 60) * SECOND
+                    self.start_node(name)
+                case _ if name in self.wires:
+                    self.wires[name].up.extend((self.clock.time_ns, mutated(self.rng, pool)) for _ in range(100))
+
+
+class Crowd:
+    """Clients in a thread of their own: some that read, one that stalls, one that comes and goes, one that asks.
+
+    Parameters
+    ----------
+    url : str
+        The server's.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._live = f"ws{url.removeprefix('http')}/api/v1"
+        self.heard: Counter[str] = Counter()
+        self._connections: set[ClientConnection] = set()
+        self._ended = threading.Event()
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._listen, self._poll)]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(timeout=10)
+
+    def _listen(self) -> None:
+        asyncio.run(self._listen_all())
+
+    async def _listen_all(self) -> None:
+        works = [self._read("live") for _ in range(3)] + [self._read("map"), self._come_and_go(), self._stall()]
+        tasks = [asyncio.create_task(work) for work in works]
+        while not self._ended.is_set():
+            await asyncio.sleep(0.1)
+            for task in tasks:
+                if task.done():
+                    task.result()  # nobody ends before the others
+        await asyncio.gather(*(each.close() for each in self._connections))
+        await asyncio.gather(*tasks)
+
+    async def _read(self, what: str) -> None:
+        async with self._connected(f"{self._live}/{what}") as connection:
+            async for text in connection:
+                self.heard[what if isinstance(text, bytes) else json.loads(text)["kind"]] += 1
+
+    async def _come_and_go(self) -> None:
+        address = f"{self._live}/live"
+        while not self._ended.is_set():
+            async with self._connected(address) as connection:
+                try:
+                    for _ in range(20):
+                        seq = json.loads(await connection.recv()).get("seq")
+                        address = address if seq is None else f"{self._live}/live?since_seq={seq}"
+                    self.heard["visits"] += 1
+                except ConnectionClosed:
+                    self.heard["visits cut"] += 1
+            await asyncio.sleep(0.2)
+
+    @asynccontextmanager
+    async def _connected(self, address: str) -> AsyncIterator[ClientConnection]:
+        async with connect(address, compression=None, ping_interval=None) as connection:
+            self._connections.add(connection)
+            try:
+                yield connection
+            finally:
+                self._connections.discard(connection)
+
+    async def _stall(self) -> None:
+        host, port = self._url.removeprefix("http://").split(":")
+        while not self._ended.is_set():
+            with await asyncio.to_thread(open_client, host, int(port), 4096) as lazy:
+                while not (_hung_up(lazy) or self._ended.is_set()):
+                    await asyncio.sleep(0.2)
+            self.heard["stalled clients"] += 1
+
+    def _poll(self) -> None:
+        asked = ["health", "arrays", "events?limit=200", "tracks", "map", "../../metrics", "openapi.json"]
+        for k in range(10**9):
+            if self._ended.wait(0.3):
+                return
+            address = f"{self._url}/api/v1/{asked[k % len(asked)]}".replace("/api/v1/../..", "")
+            with urllib.request.urlopen(address, timeout=30) as answer:
+                answer.read()
+            self.heard["answers"] += 1
+
+
+def _hung_up(connection: socket.socket) -> bool:
+    """Whether the server has cut it; what it sent stays unread."""
+    try:
+        connection.send(b"")
+        return connection.recv(1, socket.MSG_PEEK) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def resident_mb() -> float:
+    """Of this process, now."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it: the memory at the reference, the least and most after it, and how much was done."""
+
+    hours: float
+    sounds: int
+    events: int
+    unheard: int
+    messages: dict[str, int]
+    begin_mb: float
+    reference_mb: float
+    least_mb: float
+    most_mb: float
+    end_mb: float
+    stored: int
+    faults: dict[str, int]
+    clients: dict[str, int]
+    seconds: float
+
+    @property
+    def growth(self) -> float:
+        """The most after the reference, relative to it, less one."""
+        return self.most_mb / self.reference_mb - 1.0
+
+
+def soak(
+    directory: Path,
+    hours: float,
+    reference_hours: float = 1.0,
+    seed: int = 0,
+    tell: Tell = lambda hours, mb: None,
+) -> Outcome:
+    """Let so many hours pass, and hold the memory against what it was after the first of them."""
+    began_s = time.monotonic()
+    with (
+        patch("livessl.server.app.EXPIRE_S", 2.0),
+        Soak(directory, seed, tell) as world,
+        Crowd(world.http.url) as crowd,
+    ):
+        begin_mb = resident_mb()
+        end = START + round(hours * HOUR)
+        for ticks in world.disturbances():
+            world.run(min(ticks, end - world.raster))
+            if world.raster >= end:
+                break
+        world.run(SLOT)  # the last sound's end
+        sounds = {slot for slot in range(round(hours * HOUR) // SLOT) if sound_of(slot, SOUNDS) is not None}
+        after = [mb for at, mb in world.memory_mb if at >= reference_hours]
+        return Outcome(
+            hours=hours,
+            sounds=len(sounds),
+            events=world.http.engine.events,
+            unheard=len(sounds - world.slots),
+            messages=dict(world.sent),
+            begin_mb=round(begin_mb, 1),
+            reference_mb=round(after[0], 1),
+            least_mb=round(min(after), 1),
+            most_mb=round(max(after), 1),
+            end_mb=round(after[-1], 1),
+            stored=world.http._store.count(),
+            faults=dict(world.faults),
+            clients=dict(crowd.heard),
+            seconds=round(time.monotonic() - began_s, 1),
+        )

@@ -1,0 +1,218 @@
+"""Nodes whose clocks are off: the same answers as of clocks that agree, each sound once, whatever starts again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from livessl.capture.devices import Placed
+from livessl.capture.line import played_messages
+from livessl.capture.recorded import lines_of
+from livessl.clock import UnpacedClock
+from livessl.config import Site
+from livessl.core.clock_offsets import LEAST_SOUNDS, ClockOffset
+from livessl.core.fusion import ArrayState, ArrayStatus, Fusion
+from livessl.core.settling import Settled, Settling
+from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
+from small_site import RATE_HZ, scene, scene_parts, site_of
+
+START_NS = 1_767_225_600_000_000_000
+SOUNDS = 8
+NODES: dict[str, Any] = {
+    "nodes": {
+        name: {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {array: [1, 2, 3, 4]}}
+        for name, array in (("a", "north"), ("b", "south"))
+    }
+}
+
+Batches = Sequence[tuple[int, list[Message]]]
+
+
+@cache
+def site() -> Site:
+    return site_of(NODES)
+
+
+@cache
+def batches(ahead_s: float) -> Batches:
+    """What the two nodes send of the scene, the second one with its clock ahead, and when."""
+    ahead_ns = round(ahead_s * 1e9)
+    parts = [
+        replace(part, placed=Placed(part.placed.recording, START_NS + ahead_ns * (part.array == "south")))
+        for part in scene_parts(START_NS, SOUNDS)
+    ]
+    return list(played_messages(*lines_of(site(), parts), UnpacedClock()))
+
+
+def located(ahead_s: float) -> tuple[list[Event], ArrayStatus]:
+    """Offline: the events, and how the array with the wrong clock is doing in the end."""
+    fusion = site().make_fusion(updates=False)
+    outputs: list[Output] = []
+    for now_ns, batch in batches(ahead_s):
+        outputs += fusion.step(batch, now_ns)
+    outputs += fusion.flush(now_ns)
+    _, south = fusion.status(now_ns)
+    return [output for output in outputs if isinstance(output, Event)], south
+
+
+def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
+    """All of events that does not depend on when they were found out."""
+    return [
+        (
+            e.id,
+            e.start_ns,
+            e.end_ns,
+            e.status,
+            e.heard_by,
+            None if e.estimate is None else e.estimate.position_m.tolist(),
+        )
+        for e in events
+    ]
+
+
+@pytest.mark.parametrize("ahead_s", [0.137, -0.15, 0.15, -0.09])
+def test_answers_are_those_of_clocks_that_agree(ahead_s: float) -> None:
+    expected, agreeing = located(0.0)
+    events, south = located(ahead_s)
+    assert len(events) == len(expected) == SOUNDS
+    for event, other in zip(events, expected, strict=True):
+        assert event.heard_by == ("north", "south")
+        assert event.estimate is not None
+        assert other.estimate is not None
+        # frames are cut elsewhere in the sound, which moves a place by millimetres
+        assert np.linalg.norm(event.estimate.position_m - other.estimate.position_m) < 0.02
+    for event, source in zip(events[LEAST_SOUNDS:], scene(SOUNDS).sources[LEAST_SOUNDS:], strict=True):
+        begun_s = (event.start_ns - START_NS) / 1e9 - source.start_s
+        assert -0.051 < begun_s < 0.03  # a frame of 50 ms holds its beginning; it travelled up to 10 ms
+    assert south.clock_offset is not None
+    assert south.clock_offset.offset_s == pytest.approx(ahead_s, abs=0.003)
+    assert south.clock_offset.std_s < 0.003
+    assert south.state is ArrayState.DEGRADED
+    assert south.reason is not None
+    assert f"{1e3 * abs(south.clock_offset.offset_s):.0f} ms" in south.reason
+    assert ("ahead of" if ahead_s > 0 else "behind") in south.reason
+    assert "set both by NTP" in south.reason
+    assert agreeing.clock_offset is not None
+    assert abs(agreeing.clock_offset.offset_s) < 0.003
+    assert agreeing.state is ArrayState.HEALTHY
+    assert agreeing.corrected_frames == 0
+
+
+def test_sounds_close_to_one_another_stay_apart() -> None:
+    """Pauses of 0.4 s are longer than the hang-over of 0.3 s, but not by as much as the clocks differ.
+
+    Joined by their own times the arrays would hear on without a pause, and two sounds be one.
+    """
+
+    def told_of(*, corrected: bool) -> list[Event]:
+        fusion = site().make_fusion(updates=False)
+        if not corrected:
+            fusion.clock_offsets = None
+        else:
+            assert fusion.clock_offsets is not None
+            for k in range(LEAST_SOUNDS):
+                fusion.clock_offsets.learn(START_NS + k, {"north": 0.0, "south": 0.15})
+            fusion.step([], START_NS)
+            fusion._align()
+        messages: list[Message] = []
+        for first in (20, 33):
+            for array, ahead in (("north", 0), ("south", 3)):
+                messages += [_frame(array, START_NS // FRAME_NS + first + ahead + k) for k in range(5)]
+        ends = {"north": 60, "south": 63}
+        messages += [Mark(name, 0, START_NS // FRAME_NS + end, 0.0, 0.0, ()) for name, end in ends.items()]
+        begin: list[Message] = [Mark(name, 0, START_NS // FRAME_NS, 0.0, 0.0, ()) for name in ends]
+        outputs = fusion.step(begin, START_NS)
+        outputs += fusion.step(messages, START_NS + 60 * FRAME_NS)
+        return [output for output in outputs if isinstance(output, Event)]
+
+    assert len(told_of(corrected=False)) == 1
+    events = told_of(corrected=True)
+    assert [event.start_ns for event in events] == [START_NS + 20 * FRAME_NS, START_NS + 33 * FRAME_NS]
+    assert [event.heard_by for event in events] == [("north", "south")] * 2
+
+
+def _frame(array: str, raster: int) -> Frame:
+    samples = np.random.default_rng(raster).standard_normal((4, 800)).astype(np.float32)
+    return Frame(array, 1, raster, raster * FRAME_NS, float(RATE_HZ), samples, 0.01, True)
+
+
+def settled_events(outputs: Iterable[Output | Settled]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+
+
+def settling(fusion: Fusion | None = None, settled: int | None = None) -> Settling:
+    return Settling(fusion or site().make_fusion(live=True), ("north", "south"), settled)
+
+
+@pytest.mark.parametrize("step", [1, 7, 100])
+@pytest.mark.parametrize("ahead_s", [0.137, -0.15])
+def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
+    """However many messages come at a time; and none of them only from the fusion that does not wait."""
+    into = settling()
+    outputs: list[Output | Settled] = []
+    all_batches = batches(ahead_s)
+    for at in range(0, len(all_batches), step):
+        some = all_batches[at : at + step]
+        outputs += into.step([m for _, batch in some for m in batch], some[-1][0])
+    outputs += into.flush(all_batches[-1][0])
+    assert told(settled_events(outputs)) == told(located(ahead_s)[0])
+    assert not [output for output in outputs if isinstance(output, Event)]
+
+
+@pytest.mark.parametrize("ahead_s", [0.137, -0.15])
+def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -> None:
+    """Nodes keep what is not settled by their own clocks, and send it again; the server knows the clocks it had."""
+    expected = told(located(ahead_s)[0])
+    arrays = ("north", "south")
+    kept: dict[str, list[Frame]] = {name: [] for name in arrays}
+    stored: tuple[int | None, dict[str, Any] | None] = (None, None)
+    events: list[Event] = []
+    into = settling()
+    for k, (now_ns, batch) in enumerate(batches(ahead_s)):
+        for message in batch:
+            if isinstance(message, Frame):
+                kept[message.array].append(message)
+        outputs = into.step(batch, now_ns)
+        if k % 29 == 28:  # it is killed, and starts again with what is stored
+            fusion = site().make_fusion(live=True)
+            if stored[1] is not None:
+                assert fusion.clock_offsets is not None
+                fusion.clock_offsets.restore(stored[1])
+            again = settling(fusion, stored[0])
+            for name in arrays:
+                if kept[name]:
+                    again.greet(name, (kept[name][0].raster, kept[name][-1].raster + 1), now_ns)
+            outputs += again.step([frame for name in arrays for frame in kept[name]], now_ns)
+            for name in arrays:
+                again.greet(name, None, now_ns)
+            into = again
+        for output in outputs:
+            if isinstance(output, Settled):
+                events += output.events
+                assert into.live.clock_offsets is not None
+                stored = output.until, into.live.clock_offsets.state()
+        for name, settled in into.settled_of.items():
+            kept[name] = [frame for frame in kept[name] if frame.raster >= settled]
+    events += settled_events(into.flush(now_ns))
+    assert told(events) == expected
+
+
+def test_offset_is_shown_to_the_reference() -> None:
+    north, south = _status_after(0.137)
+    assert north.clock_offset is not None
+    assert north.clock_offset.reference == "a"
+    assert (north.clock_offset.offset_s, north.clock_offset.std_s) == (0.0, 0.0)
+    assert isinstance(south.clock_offset, ClockOffset)
+    assert south.corrected_frames == 3
+
+
+def _status_after(ahead_s: float) -> list[ArrayStatus]:
+    fusion = site().make_fusion(updates=False)
+    for now_ns, batch in batches(ahead_s):
+        fusion.step(batch, now_ns)
+    return fusion.status(now_ns)
