@@ -22,8 +22,12 @@ NEAR_M: Final = 0.5
 LEAST_CONFIDENCE: Final = 0.8
 """Below it a place is refused."""
 
-_LOGISTIC: Final = (-3.34, 2.69, 1.03)
-"""Intercept, weight of the margin and of the standing in the log-odds of a right place."""
+_HEARD: Final = (-3.34, 2.69, 1.03)
+"""Intercept, weights of margin and standing in the log-odds of a right place, of arrays that tell distance."""
+
+_NOWHERE_ELSE: Final = (-0.04, 62.2)
+"""Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
+side by side, many are."""
 
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
@@ -50,9 +54,15 @@ class Signs:
 
     @property
     def confidence(self) -> float:
-        """Probability that the place is right to within `NEAR_M`."""
-        intercept, of_margin, of_standing = _LOGISTIC
-        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
+        """Probability that the place is right to within `NEAR_M`: heard, and nowhere else."""
+        intercept, of_margin = _NOWHERE_ELSE
+        return self.heard * _likely(intercept + of_margin * self.margin)
+
+    @property
+    def heard(self) -> float:
+        """The same, where the arrays tell distance."""
+        intercept, of_margin, of_standing = _HEARD
+        return _likely(intercept + of_margin * self.margin + of_standing * self.standing)
 
     @property
     def tell_direction(self) -> bool:
@@ -109,6 +119,10 @@ def judge(
             f"{LEAST_CONFIDENCE:g} wanted"
         )
     return Judgement(covariance_m2, signs, refused)
+
+
+def _likely(log_odds: float) -> float:
+    return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
 def _standing(heard: HeardBy, term: PairTerms) -> float:

@@ -16,8 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+from scipy.optimize import minimize
 
 from livessl.core.activity import exact_mask, runs
+from livessl.core.certainty import Signs
 from livessl.core.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.fusion import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
@@ -224,6 +226,24 @@ def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, f
         weights = weights + np.linalg.solve(hessian, gradient)
     intercept, of_margin, of_standing = (float(weight) for weight in weights)
     return intercept, of_margin, of_standing
+
+
+def rivals_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float]:
+    """Intercept and weight of the margin of what tells that no other place is as good, given how well it is heard.
+
+    Parameters are those of `development_fit`, of events of which the arrays may tell nothing but directions.
+    """
+    right = np.asarray(columns["error_m"]) <= near_m
+    signs = [Signs(float(m), float(s)) for m, s in zip(columns["margin"], columns["standing"], strict=True)]
+    log_heard, margin = np.log([each.heard for each in signs]), np.array([each.margin for each in signs])
+
+    def surprise(constants: FloatArray) -> float:
+        log_likely = log_heard - np.logaddexp(0.0, -constants[0] - constants[1] * margin)
+        log_unlikely = np.log(-np.expm1(np.minimum(log_likely, -1e-12)))
+        return float(-np.where(right, log_likely, log_unlikely).mean())
+
+    intercept, of_margin = minimize(surprise, [0.0, 20.0], method="Nelder-Mead").x
+    return float(intercept), float(of_margin)
 
 
 def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:

@@ -241,15 +241,15 @@ SESSIONS: Final[Mapping[str, SessionScenario]] = {
     ),
     "two-sources": SessionScenario(
         "Two sources at once",
-        "Two sounds of different classes, of the same mean power, that begin within 0.1 s of one another, at least 1.5 m "
-        "apart; two such pairs, one after the other. Alone: the first of each.",
+        "Two sounds of different classes, of the same mean power, that begin within 0.1 s of one another, at least "
+        "1.5 m apart; two such pairs, one after the other. Alone: the first of each.",
         0.4,
         (SessionCase("alone", pairs=True, alone=True), SessionCase("two at once", pairs=True)),
     ),
     "walking": SessionScenario(
         "A talker who walks",
-        "Someone talks for some 9 s, with short pauses, and walks at 1 m/s from place to place, 1.5 m high and at least "
-        "1 m from the walls; or stands where the walk began.",
+        "Someone talks for some 9 s, with short pauses, and walks at 1 m/s from place to place, 1.5 m high and at "
+        "least 1 m from the walls; or stands where the walk began.",
         0.6,
         (SessionCase("stands", walks=False), SessionCase("walks", walks=True)),
     ),

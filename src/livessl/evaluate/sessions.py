@@ -1,7 +1,7 @@
 """The localizer through the whole fusion: many seconds of sound, cut into frames by each array's clock, as live.
 
-What clocks that disagree, two sources at once, and a talker who walks do to it. A session is one position of a campaign:
-its rows are truths, and what was told.
+What clocks that disagree, two sources at once, and a talker who walks do to it. A session is one position of a
+campaign: its rows are truths, and what was told.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ SCHEMA: Final = pa.schema(
         *((f"c{axes}_m2", pa.float32()) for axes in COVARIANCE),
     ]
 )
-"""One row for each truth, event and state of a track: its `kind`. A moment is one sound, or two at once; `number` counts
-its sources, or is the track's id."""
+"""One row for each truth, event and state of a track: its `kind`. A moment is one sound, or two at once; `number`
+counts its sources, or is the track's id."""
 
 START_NS: Final = 1_800_000_000_000_000_000
 """Site time at which every session begins: any would do."""
@@ -165,7 +165,7 @@ class SessionPosition:
         moments = []
         for one, other in zip(sounds[::2], sounds[1::2], strict=True):
             while np.linalg.norm(one.place_m - other.place_m) < APART_M:
-                other = self._sounding(other.name, rt60_s, rng)  # noqa: PLW2901 - another draw of it
+                other = self._sounding(other.name, rt60_s, rng)
             lag = round(rng.uniform(0.0, TOGETHER_S) * self._settings.sample_rate_hz)
             moments.append(self._moment([one] if case.alone else [one, other.later(lag)]))
         return moments
@@ -326,7 +326,7 @@ def _when(entry: tuple[int, str, Block]) -> tuple[int, str]:
 
 @dataclass(frozen=True, slots=True)
 class _Sounding:
-    """A clip at a place: what microphones hear (K, n), and where in it the clip's emission begins and how long it is."""
+    """A clip at a place: what microphones hear (K, n), where in it its emission begins, and how long that is."""
 
     name: str
     clip: str
@@ -364,7 +364,12 @@ def _schedule(moments: Sequence[Moment], sample_rate_hz: float) -> tuple[FloatAr
 
 
 def _row(kind: str, number: int, time_s: float, place_m: Iterable[float]) -> Row:
-    return {"kind": kind, "number": number, "time_s": time_s, **{f"{a}_m": v for a, v in zip("xyz", place_m, strict=True)}}
+    return {
+        "kind": kind,
+        "number": number,
+        "time_s": time_s,
+        **{f"{a}_m": v for a, v in zip("xyz", place_m, strict=True)},
+    }
 
 
 def _told(output: Output) -> Row | None:
@@ -373,7 +378,10 @@ def _told(output: Output) -> Row | None:
         case Event(estimate=estimate):
             begin_s, end_s = ((time_ns - START_NS) / 1e9 for time_ns in (output.start_ns, output.end_ns))
             place_m = [np.nan] * 3 if estimate is None else estimate.position_m
-            row = _row("event", 0, (begin_s + end_s) / 2.0, place_m) | {"begin_s": begin_s, "status": str(output.status)}
+            row = _row("event", 0, (begin_s + end_s) / 2.0, place_m) | {
+                "begin_s": begin_s,
+                "status": str(output.status),
+            }
             if estimate is None:
                 return row
             c = estimate.covariance_m2
@@ -396,5 +404,9 @@ def _site_text() -> str:
         lines.append(f"    microphones_m: {ARRAYS[name].microphones_m.tolist()}")
     lines.append("nodes:")
     for name in TWO.arrays:
-        lines += [f"  pc-{name}:", "    device: {name: any, sample_rate_hz: 16000}", f"    arrays: {{{name}: [1, 2, 3, 4]}}"]
+        lines += [
+            f"  pc-{name}:",
+            "    device: {name: any, sample_rate_hz: 16000}",
+            f"    arrays: {{{name}: [1, 2, 3, 4]}}",
+        ]
     return "\n".join(lines) + "\n"

@@ -1,13 +1,14 @@
 """How well several sources, and tracks of them, were found: OSPA, and the measures of the LOCATA challenge.
 
-OSPA: Schuhmacher, Vo and Vo, IEEE Trans. Signal Process. 56(8), 2008. LOCATA: Evers et al., IEEE/ACM Trans. Audio Speech
-Lang. Process. 28, 2020; there of directions, here of places.
+OSPA: Schuhmacher, Vo and Vo, IEEE Trans. Signal Process. 56(8), 2008. LOCATA: Evers et al., IEEE/ACM Trans. Audio
+Speech Lang. Process. 28, 2020; there of directions, here of places.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -130,8 +131,8 @@ def score(times_s: FloatArray, truth_m: FloatArray, tracks: Mapping[int, tuple[F
         rmse_m=float(np.sqrt(np.mean(np.square(errors_m)))) if errors_m else float("nan"),
         detected=len(known) / len(with_it),
         ids=len(set(known)),
-        swaps=sum(one != other for one, other in zip(known, known[1:], strict=False)),
-        breaks=sum(later - earlier > 1 for earlier, later in zip(found_at, found_at[1:], strict=False)),
+        swaps=sum(one != other for one, other in pairwise(known)),
+        breaks=sum(later - earlier > 1 for earlier, later in pairwise(found_at)),
         false_per_s=false / len(times_s),
         latency_s=float(times_s[found_at[0]] - times_s[0]) if found_at else float("nan"),
         ospa_m=float(np.mean(ospas_m)),
