@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
 from livessl.core.certainty import Signs
 from livessl.core.geometry import speed_of_sound_m_s
 from livessl.evaluate.campaign import Job, compute, read_clips, run_campaign
+from livessl.evaluate.command import add_arguments, run
 from livessl.evaluate.localizer import METHODS, LocalizerSettings, development_fit, rivals_fit
 from livessl.evaluate.localizer_report import area_under_roc, read_columns, summary, write_localizer_report
 from livessl.evaluate.scenarios import ARRAYS, ROOM_C, ROOMS, SCENARIOS, Case
@@ -171,3 +173,20 @@ def test_fit_finds_the_odds_of_rivals() -> None:
     # five standard errors, from the inverse of the information there: 0.04 and 0.7
     np.testing.assert_allclose(rivals_fit(columns, 0.5), (-0.5, 20.0), atol=0.2, rtol=0.16)
     assert abs(rivals_fit(columns | {"margin": columns["margin"][::-1]}, 0.5)[1] - 20.0) > 3.5
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (["--scenario", "poses,walking"], "walking: each of clocks, two-sources, walking is run alone"),
+        (["--scenario", "nowhere"], "expected some of rooms, arrays, .*, got nowhere"),
+        (["--snr", "loud"], "expected decibels such as 20 or inf,20,10, got 'loud'"),
+        (["--snr", "nan"], "got 'nan'"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(tmp_path: Path, option: list[str], said: str) -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    asked = ["localizer", "--events", str(write_sounds(tmp_path)), "--out", str(tmp_path / "out"), *option]
+    with pytest.raises(ValueError, match=said):
+        run(parser.parse_args(asked), 1, lambda done, total: None)

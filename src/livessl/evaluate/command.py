@@ -11,7 +11,7 @@ from typing import Any, Final
 from livessl.config import load_site
 from livessl.evaluate.layout import layout_of
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
-from livessl.evaluate.scenarios import ROOMS, SCENARIOS
+from livessl.evaluate.scenarios import ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
 
 HALVES: Final = ("development", "test")
 LOCALIZER: Final = "localizer"
@@ -60,7 +60,8 @@ def add_arguments(parser: Any) -> None:
         "--scenario",
         default=ROOMS,
         metavar="NAME[,NAME…]",
-        help=f"{LOCALIZER}: of {', '.join(SCENARIOS)} (default {ROOMS}); those named share sounds and rooms",
+        help=f"{LOCALIZER}: some of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); or one of "
+        f"{', '.join(SESSIONS)}",
     )
     parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
@@ -142,24 +143,43 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
     from livessl.evaluate.campaign import Job, read_clips, run_campaign
-    from livessl.evaluate.localizer import POSITIONS, RT60S_S, SNRS_DB, SPACING_M, LocalizerSettings
     from livessl.evaluate.localizer_report import write_localizer_report
+    from livessl.evaluate.sessions import SessionSettings
+    from livessl.evaluate.sessions_report import write_sessions_report
 
-    settings = LocalizerSettings(
-        positions=arguments.positions or POSITIONS,
-        rt60s_s=RT60S_S if arguments.rt is None else reverberation_times_s(arguments.rt),
-        snrs_db=SNRS_DB if arguments.snr is None else levels_db(arguments.snr),
-        seed=arguments.seed,
-        sample_rate_hz=float(arguments.sample_rate),
-        spacing_m=arguments.grid or SPACING_M,
-        half=arguments.half,
-        scenarios=_scenarios(arguments.scenario),
-    )
+    settings = _localizer_settings(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     job = Job(settings, clips)
     results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress)
-    return [results, *write_localizer_report(arguments.out)]
+    write = write_sessions_report if isinstance(settings, SessionSettings) else write_localizer_report
+    return [results, *write(arguments.out)]
+
+
+def _localizer_settings(arguments: argparse.Namespace) -> Any:
+    """What was asked for: `SessionSettings` of a session's scenario, else `LocalizerSettings`."""
+    from livessl.evaluate import localizer, sessions
+
+    names = _scenarios(arguments.scenario)
+    rt60s_s = None if arguments.rt is None else reverberation_times_s(arguments.rt)
+    snrs_db = None if arguments.snr is None else levels_db(arguments.snr)
+    common = {"seed": arguments.seed, "sample_rate_hz": float(arguments.sample_rate), "half": arguments.half}
+    if names[0] in SESSIONS:
+        return sessions.SessionSettings(
+            positions=arguments.positions or sessions.POSITIONS,
+            scenario=names[0],
+            rt60s_s=rt60s_s or (SESSIONS[names[0]].rt60_s,),
+            snrs_db=snrs_db or (SESSION_SNR_DB,),
+            **common,
+        )
+    return localizer.LocalizerSettings(
+        positions=arguments.positions or localizer.POSITIONS,
+        rt60s_s=rt60s_s or localizer.RT60S_S,
+        snrs_db=snrs_db or localizer.SNRS_DB,
+        spacing_m=arguments.grid or localizer.SPACING_M,
+        scenarios=names,
+        **common,
+    )
 
 
 def reverberation_times_s(text: str) -> tuple[float, ...]:
@@ -212,9 +232,13 @@ def _one_level_db(text: str | None) -> float | None:
 
 def _scenarios(text: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    unknown = [name for name in names if name not in SCENARIOS]
+    unknown = [name for name in names if name not in SCENARIOS and name not in SESSIONS]
     if unknown:
-        raise ValueError(f"--scenario: expected some of {', '.join(SCENARIOS)}, got {', '.join(unknown)}")
+        known = ", ".join([*SCENARIOS, *SESSIONS])
+        raise ValueError(f"--scenario: expected some of {known}, got {', '.join(unknown)}")
+    if len(names) > 1 and any(name in SESSIONS for name in names):
+        alone = " and ".join(name for name in names if name in SESSIONS)
+        raise ValueError(f"--scenario: {alone}: each of {', '.join(SESSIONS)} is run alone, got {', '.join(names)}")
     return names
 
 

@@ -177,6 +177,29 @@ def draw_scenario(directory: Path, name: str, points: Sequence[ScenarioPoint]) -
     figure.savefig(directory / f"{name}.svg", metadata={"Date": None})
 
 
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """Where a talker was, (T, 3), and the places of each track, (S, 3), in metres."""
+
+    way_m: FloatArray
+    tracks_m: Sequence[FloatArray]
+
+
+def draw_walks(directory: Path, walks: Sequence[Walk]) -> None:
+    """Draw walks and their tracks from above."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mpl.rcParams["svg.hashsalt"] = "livessl"
+    columns = min(3, len(walks))
+    figure, axes = _figure(-(-len(walks) // columns), columns, (4.0 * columns, 5.0 * -(-len(walks) // columns)))
+    for axis, walk in zip(axes.flat, walks, strict=False):
+        axis.plot(*walk.way_m[:, :2].T, ".", color="0.75", markersize=6)
+        for index, places_m in enumerate(walk.tracks_m):
+            axis.plot(*places_m[:, :2].T, ".-", color=COLOURS[index % len(COLOURS)], markersize=3, linewidth=0.8)
+        axis.set(xlim=(0, ROOM_M[0]), ylim=(0, ROOM_M[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    figure.savefig(directory / "walks.png", dpi=110, metadata={"Software": None})
+    figure.savefig(directory / "walks.svg", metadata={"Date": None})
+
+
 def sigma_theta_deg(theta_deg: FloatArray, spacing_m: FloatArray | float, sample_rate_hz: float) -> FloatArray:
     """Angular error of a delay rounded to samples: arcsin(sin theta + c/(fs d sqrt 12)) - theta, from broadside.
 

@@ -79,6 +79,9 @@ MARGIN_M: Final = 1.0
 TRUTH_S: Final = 0.05
 """Time between two truths of a talker."""
 
+SPEECH: Final = "speech"
+"""Class of what a talker says."""
+
 BLOCK_S: Final = 0.04
 
 
@@ -133,12 +136,19 @@ class SessionPosition:
     settings : SessionSettings
     clips : Clips
         All; the settings say which half counts.
+
+    Raises
+    ------
+    ValueError
+        Where a class is missing that the scenario needs.
     """
 
     def __init__(self, settings: SessionSettings, clips: Clips) -> None:
         self._settings = settings
         first = HALVES.index(settings.half)
         self._clips = {name: ours[first :: len(HALVES)] for name, ours in clips.items()}
+        if any(case.walks is not None for case in SESSIONS[settings.scenario].cases) and SPEECH not in clips:
+            raise ValueError(f"--classes: who walks talks, so expected {SPEECH} among them, got {', '.join(clips)}")
         self._microphones_m = np.vstack([ARRAYS[name].microphones_m for name in TWO.arrays])
         self._site = parse_site(_site_text())
 
@@ -178,7 +188,7 @@ class SessionPosition:
         return _Sounding(name, clip, place_m, _at_unit_power(wet), len(sound))
 
     def _responses(self, place_m: FloatArray, rt60_s: float) -> Float32Array:
-        return impulse_responses(
+        responses = impulse_responses(
             ROOM_M,
             place_m,
             self._microphones_m,
@@ -187,7 +197,8 @@ class SessionPosition:
             c_m_s=C_M_S,
             own_lengths=True,
             compiled=True,
-        )[0]
+        )
+        return np.asarray(responses[0])
 
     def _moment(self, sounds: Sequence[_Sounding]) -> Moment:
         wet = np.zeros((len(self._microphones_m), max(sound.wet.shape[1] for sound in sounds)), dtype=np.float32)
@@ -200,7 +211,7 @@ class SessionPosition:
 
     def _talker(self, walks: bool, rt60_s: float, rng: np.random.Generator) -> Moment:
         rate_hz = self._settings.sample_rate_hz
-        clips = self._clips["speech"]
+        clips = self._clips[SPEECH]
         parts: list[Float32Array] = []
         spoken: list[tuple[float, float]] = []
         length = 0
