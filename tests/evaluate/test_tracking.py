@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from livessl.core.types import FloatArray
 from livessl.evaluate.tracking import assigned, ospa_m, score
 
 NONE_M = np.zeros((0, 3))
@@ -14,8 +15,8 @@ TIMES_S = np.arange(0.0, 2.0, 0.05)
 WALK_M = np.column_stack([1.0 + TIMES_S, np.full_like(TIMES_S, 3.0), np.full_like(TIMES_S, 1.5)])
 
 
-def shifted(places_m: np.ndarray, along_x_m: float) -> np.ndarray:
-    return places_m + np.array([along_x_m, 0.0, 0.0])
+def shifted(places_m: FloatArray, along_x_m: float) -> FloatArray:
+    return np.asarray(places_m + np.array([along_x_m, 0.0, 0.0]))
 
 
 def test_ospa_counts_errors_up_to_the_cut_off_and_what_is_missing_or_too_much_as_the_cut_off() -> None:

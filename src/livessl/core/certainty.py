@@ -35,6 +35,10 @@ _DELAYS: Final = 3.0
 _INFLATION: Final = 1.6
 """What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
 
+_FINEST_M: Final = 0.01
+"""Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
+of which the lag axis tells nothing, move several arrays' places by as much."""
+
 
 @dataclass(frozen=True, slots=True)
 class Signs:
@@ -112,6 +116,8 @@ def judge(
     standing = sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True))
     signs = Signs(peaks.margin(power, rival_power), standing)
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    for axis in grid.free_axes:
+        covariance_m2[axis, axis] += _FINEST_M**2
     refused = None
     if signs.confidence < LEAST_CONFIDENCE:
         refused = (
