@@ -257,11 +257,12 @@ _TITLES: Final = ("RT60", "SNR", "method", "located", "median", "95 %", "over 0.
 def _cells(row: SummaryRow) -> tuple[str, ...]:
     more = f"{100 * row['more_lost']:+.1f} ({100 * row['more_lost_low']:+.1f} to {100 * row['more_lost_high']:+.1f})"
     any_located = row["located"] > 0.0
+    only = f", direction only {100 * row['direction_only']:.1f} %" if row["direction_only"] > 0.0 else ""
     return (
         f"{row['rt60_s']:g} s",
         _snr(row),
         row["method"],
-        f"{100 * row['located']:.1f} %",
+        f"{100 * row['located']:.1f} %{only}",
         f"{row['median_m']:.3f} ({row['median_m_low']:.3f} to {row['median_m_high']:.3f}) m" if any_located else "",
         f"{row['p95_m']:.2f} m" if any_located else "",
         f"{100 * row['over_0.5_m']:.1f} %" if any_located else "",
