@@ -425,11 +425,13 @@ def _warm_up() -> None:
 
 
 def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:
-    """The event that shares some of its time with an old one."""
+    """The event that shares some of its time with an old one; of two sources of one sound, the one of its number."""
     begin_ns = utc_ns(old["time_utc"])
     end_ns = begin_ns + old["duration_s"] * 1e9
+    sharing = []
     for event in events:
         start_ns = utc_ns(event["time_utc"])
         if start_ns < end_ns and begin_ns < start_ns + event["duration_s"] * 1e9:
-            return event
-    return None
+            sharing.append(event)
+    same = (event for event in sharing if event["source"] == old.get("source", 1))
+    return next(same, sharing[0] if sharing else None)
