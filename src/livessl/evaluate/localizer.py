@@ -52,12 +52,13 @@ SCHEMA: Final = pa.schema(
         *((f"found_{axis}_m", pa.float32()) for axis in "xyz"),
         *((name, pa.float32()) for name in ("error_m", "bearing_deg", "mahalanobis2")),
         ("status", NAME),
+        ("outvoted", NAME),
         *((name, pa.float32()) for name in ("confidence", "margin", "standing")),
     ]
 )
 """One row per event, condition, case and method. `bearing_deg` is the error of the direction from the nearest array,
 `mahalanobis2` the error's square in units of the covariance; `margin` and `standing` are the `Signs` of `onset`'s
-confidence, so that another fit of it needs no other run."""
+confidence, so that another fit of it needs no other run. `outvoted` names the arrays that the others outvoted."""
 
 _NOISE, _POSE = 1, 2
 """What random numbers are for, besides a position's place and clips: each case sees the same whatever else is run."""
@@ -249,6 +250,7 @@ def rivals_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float]
 def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
     """What an estimator makes of an event, and how far that is from the truth."""
     found = estimator.locate(sounds)
+    outvoted = found.outvoted or {}
     error = found.position_m - source_m
     nearest_m = min((spec.centre_m for spec in specs), key=lambda centre_m: float(np.linalg.norm(centre_m - source_m)))
     row: Row = {
@@ -258,7 +260,8 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
         "error_m": float(np.linalg.norm(error)),
         "bearing_deg": _angle_deg(found.position_m - nearest_m, source_m - nearest_m),
         "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
-        "status": str(judged(found, specs)[0]),
+        "status": str(judged(found, [spec for spec in specs if spec.name not in outvoted])[0]),
+        "outvoted": "".join(sorted(outvoted)),
     }
     row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
     row |= {f"found_{axis}_m": value for axis, value in zip("xyz", found.position_m, strict=True)}

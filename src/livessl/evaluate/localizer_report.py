@@ -17,7 +17,7 @@ from livessl.evaluate.command import HALVES
 from livessl.evaluate.figures import LocalizerCurve, ScenarioPoint, draw_localizer, draw_scenario
 from livessl.evaluate.localizer import METHODS, development_fit
 from livessl.evaluate.report import Block, Heading, Picture, Table, as_markdown
-from livessl.evaluate.scenarios import ROOMS, SCENARIOS
+from livessl.evaluate.scenarios import ROOMS, SCENARIOS, Case
 from livessl.evaluate.statistics import INTERVAL, RESAMPLES, write_csv
 
 NINETY_PERCENT: Final = 6.251
@@ -65,7 +65,8 @@ def summary(columns: Columns, scenario: str) -> list[SummaryRow]:
     the same events. `grown` is the median error over that of the scenario's first case, by the same method. Intervals
     are 99 % ones by bootstrap over positions.
     """
-    cases = [case.name for case in SCENARIOS[scenario].cases]
+    cases = {case.name: case for case in SCENARIOS[scenario].cases}
+    first_case = next(iter(cases))
     sounds = ["all", *(sorted(set(columns["sound"].tolist())) if scenario == ROOMS else ())]
     rows: list[SummaryRow] = []
     for rt60_s, snr_db in _conditions(columns):
@@ -77,12 +78,14 @@ def summary(columns: Columns, scenario: str) -> list[SummaryRow]:
                     m: np.flatnonzero(here & (columns["case"] == case) & (columns["method"] == m)) for m in METHODS
                 }
                 first = {
-                    m: np.flatnonzero(here & (columns["case"] == cases[0]) & (columns["method"] == m)) for m in METHODS
+                    m: np.flatnonzero(here & (columns["case"] == first_case) & (columns["method"] == m))
+                    for m in METHODS
                 }
                 for method in METHODS:
                     head = {"scenario": scenario, "case": case, "rt60_s": round(float(rt60_s), 3)}
                     head |= {"snr_db": float(snr_db), "sound": sound, "method": method}
-                    rows.append(head | _measured(columns, chosen[method], chosen[STANDARD], first[method]))
+                    row = _measured(columns, chosen[method], chosen[STANDARD], first[method])
+                    rows.append(head | row | _outvoted(columns, chosen[method], cases[case]))
     return rows
 
 
@@ -127,6 +130,15 @@ def _measured(columns: Columns, chosen: Any, standard: Any, first: Any) -> Summa
         **_with_interval("grown", grown[0], grown[1:]),
     }
     return {name: value if name == "events" else round(float(value), 4) for name, value in row.items()}
+
+
+def _outvoted(columns: Columns, chosen: Any, case: Case) -> SummaryRow:
+    """In what share of events the array that has a fault was outvoted, and in what share another was."""
+    bad = [case.faulty(number) if case.spoilt else "" for number in columns["position"][chosen].tolist()]
+    named = [set(each or "") for each in columns["outvoted"][chosen].tolist()]
+    it = np.mean([bool(of & set(which)) for which, of in zip(bad, named, strict=True)]) if case.spoilt else np.nan
+    others = np.mean([bool(of - set(which)) for which, of in zip(bad, named, strict=True)])
+    return {"outvotes_it": round(float(it), 4), "outvotes_others": round(float(others), 4)}
 
 
 def _lost(columns: Columns, chosen: Any) -> BoolArray:
@@ -210,8 +222,11 @@ def _rooms(columns: Columns, rows: Sequence[SummaryRow]) -> list[Block]:
 def _scenario(columns: Columns, name: str, rows: Sequence[SummaryRow]) -> list[Block]:
     scenario = SCENARIOS[name]
     first = scenario.cases[0].name
-    titles = ("case", *_TITLES, f"median over that of {first}")
-    cells = [(row["case"], *_cells(row), _grown(row) if row["case"] != first else "") for row in rows]
+    titles = ["case", *_TITLES, f"median over that of {first}"]
+    cells = [[row["case"], *_cells(row), _grown(row) if row["case"] != first else ""] for row in rows]
+    if any(case.spoilt for case in scenario.cases):
+        titles += ["outvotes it", "outvotes another"]
+        cells = [[*cell, *_votes(row)] for cell, row in zip(cells, rows, strict=True)]
     return [
         Heading(2, scenario.title),
         scenario.about,
@@ -271,6 +286,13 @@ def _cells(row: SummaryRow) -> tuple[str, ...]:
         f"{100 * row['lost']:.1f} %",
         "" if row["method"] == STANDARD else f"{more} %",
     )
+
+
+def _votes(row: SummaryRow) -> tuple[str, str]:
+    if row["method"] == STANDARD:
+        return "", ""
+    it = f"{100 * row['outvotes_it']:.1f} %" if np.isfinite(row["outvotes_it"]) else ""
+    return it, f"{100 * row['outvotes_others']:.1f} %"
 
 
 def _grown(row: SummaryRow) -> str:

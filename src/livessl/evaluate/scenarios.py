@@ -61,6 +61,11 @@ class Case:
         """Whether poses are drawn anew at every position."""
         return self.moved_m > 0.0 or self.turned_deg > 0.0
 
+    @property
+    def spoilt(self) -> bool:
+        """Whether one array that is listened to has a fault."""
+        return self.of_one and not self.without_it
+
     def faulty(self, number: int) -> str:
         """Names of the arrays that have the fault at a position."""
         return self.arrays[number % len(self.arrays)] if self.of_one else self.arrays
