@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pytest
 from free_field import C_M_S, RATE_HZ, burst, delayed, tetra
 
-from livessl.core.clock_offsets import HOP_S, LEAST_SOUNDS, ClockOffsets, Steps, lateness_s
+from livessl.core.clock_offsets import HOP_S, LEAST_SOUNDS, ClockOffsets, lateness_s
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, FloatArray, Frame
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
@@ -47,14 +47,10 @@ def travel_s(specs: Iterable[ArraySpec]) -> dict[str, float]:
     return {spec.name: float(np.linalg.norm(spec.centre_m - SOURCE_M)) / C_M_S for spec in specs}
 
 
-def lateness(heard: Mapping[str, Sequence[Frame]], travel: Mapping[str, float]) -> dict[str, float]:
-    return lateness_s({name: Steps.of(frames) for name, frames in heard.items()}, travel)
-
-
 @pytest.mark.parametrize("ahead_s", [0.0, 0.0137, -0.15, 0.31])
 def test_lateness_is_the_clocks_difference(ahead_s: float) -> None:
     heard = {"north": frames_of(NORTH, knocks()), "south": frames_of(SOUTH, knocks(), ahead_s)}
-    late = lateness(heard, travel_s([NORTH, SOUTH]))
+    late = lateness_s(heard, travel_s([NORTH, SOUTH]))
     # a rise is known to the piece it falls into; three of them, interpolated, to half a piece
     assert late["south"] - late["north"] == pytest.approx(ahead_s, abs=HOP_S / 2)
 
@@ -63,8 +59,8 @@ def test_travel_time_is_taken_off() -> None:
     heard = {"north": frames_of(NORTH, knocks()), "east": frames_of(EAST, knocks())}
     true_s = travel_s([NORTH, EAST])
     assert true_s["east"] - true_s["north"] > 2 * HOP_S
-    assert lateness(heard, true_s)["east"] == pytest.approx(0.0, abs=HOP_S / 2)
-    without = lateness(heard, {"north": 0.0, "east": 0.0})
+    assert lateness_s(heard, true_s)["east"] == pytest.approx(0.0, abs=HOP_S / 2)
+    without = lateness_s(heard, {"north": 0.0, "east": 0.0})
     assert without["east"] == pytest.approx(true_s["east"] - true_s["north"], abs=HOP_S / 2)
 
 
@@ -76,15 +72,15 @@ def test_a_sound_that_repeats_itself_tells_nothing() -> None:
         sound[begin : begin + 1200] += burst(1200)
     # so much noise that the first rises no more than the others, out of what is left of the one before
     heard = {"north": frames_of(NORTH, sound, noise=0.01), "south": frames_of(SOUTH, sound, noise=0.01)}
-    assert lateness(heard, travel_s([NORTH, SOUTH])) == {}
+    assert lateness_s(heard, travel_s([NORTH, SOUTH])) == {}
     once = {name: frames[:10] for name, frames in heard.items()}
-    assert len(lateness(once, travel_s([NORTH, SOUTH]))) == 2
+    assert len(lateness_s(once, travel_s([NORTH, SOUTH]))) == 2
 
 
 def test_noise_tells_nothing() -> None:
     silence = np.zeros(round(2.0 * RATE_HZ))
     heard = {"north": frames_of(NORTH, silence), "south": frames_of(SOUTH, silence)}
-    assert lateness(heard, travel_s([NORTH, SOUTH])) == {}
+    assert lateness_s(heard, travel_s([NORTH, SOUTH])) == {}
 
 
 def learned(

@@ -73,16 +73,6 @@ def test_windows_are_cut_a_hop_apart_and_filled_up(kernels: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-@pytest.mark.parametrize("count", [800, 807])
-def test_step_powers_are_means_over_pieces(kernels: ModuleType, count: int) -> None:
-    samples = np.random.default_rng(0).standard_normal((3, count)).astype(np.float32)
-    powers = np.empty(10, np.float32)
-    kernels.step_powers(samples, powers)
-    square = np.square(np.diff(samples.astype(np.float64), axis=1, prepend=samples[:, :1])).mean(axis=0)
-    np.testing.assert_allclose(powers, [part.mean() for part in np.array_split(square, 10)], rtol=1e-5)
-
-
-@pytest.mark.parametrize("kernels", KERNELS)
 def test_mean_square_leaves_out_what_is_near(kernels: ModuleType) -> None:
     lags_s = np.arange(-20, 21) / 1000.0
     values = np.ones((2, 41), np.float32)

@@ -17,7 +17,7 @@ import zmq
 from livessl import wire
 from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
-from livessl.core.types import Frame, Mark, Message
+from livessl.core.types import Ask, Frame, Mark, Message
 from livessl.keys import NodeKeys
 
 BACKLOG_FRAMES: Final = 16
@@ -134,6 +134,8 @@ class Link:
         Where frames are kept; None keeps them in memory. It is closed with the link.
     dealer : Dealer or None
         The connection, instead of one of its own.
+    recent : callable or None
+        Gives what is remembered of an array's sound, whether or not it was sent; None where nothing is.
     """
 
     def __init__(
@@ -145,9 +147,11 @@ class Link:
         *,
         spool: Spool | None = None,
         dealer: Dealer | None = None,
+        recent: Callable[[Ask], list[Message]] | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._clock = clock
+        self._recent = recent
         self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
         self._dealer = Dealer(endpoint, keys, len(hello.arrays)) if dealer is None else dealer
@@ -302,6 +306,20 @@ class Link:
                 continue
             if isinstance(message, wire.Ack):
                 self._acknowledge(message)
+            elif isinstance(message, wire.Request) and message.run_id == self._hello.run_id:
+                self._answer(message)
+
+    def _answer(self, request: wire.Request) -> None:
+        """Send what is wanted, past the spool: an answer that is lost is not missed for long, and nobody waits."""
+        if self._recent is None:
+            return
+        if not self._hello.answers:
+            self._hello = replace(self._hello, answers=True)
+            self._say_hello()
+        for array, (first, last) in request.wanted.items():
+            for message in self._recent(Ask(array, first, last - 1)):
+                if not self._try_send(wire.encode(message)):
+                    return
 
     def _acknowledge(self, ack: wire.Ack) -> None:
         if ack.who_are_you:
@@ -363,7 +381,8 @@ class Link:
         for queue in (self._live, self._live_sent, self._backlog_sent):
             queue.clear()
         self._backlog = deque(self._spool.frames())
-        self._hello = replace(self._hello, backlog=_spans(self._backlog))  # the next server may be another
+        spans = _spans(self._backlog)
+        self._hello = replace(self._hello, backlog=spans, answers=False)  # the next server may be another, and older
 
     def _say_hello(self) -> None:
         self._owes_hello = not self._try_send(wire.encode(self._hello))

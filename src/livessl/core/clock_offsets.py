@@ -16,8 +16,7 @@ from typing import Any, Final
 import numpy as np
 import scipy.fft
 
-from livessl.core.kernels import kernels
-from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame
+from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
 
 MOST_OFF_S: Final = 0.6
 """Offsets beyond it are not looked for: such arrays' sounds do not meet in one event."""
@@ -52,6 +51,9 @@ _STANDS_OUT: Final = 0.3
 _RIVAL: Final = 0.8
 """Highest other peak, of the first: a sound that repeats itself does not tell by how many periods it is late."""
 
+_MICROPHONES: Final = 2
+"""Listened to of each array: one may be dead."""
+
 _LEAST_POWER: Final = 2.0**-30 / 12.0
 """Rounding to 16 bits, full scale squared: below it nothing is heard."""
 
@@ -69,6 +71,9 @@ _LEAST_SCATTER_S: Final = 1e-3
 
 _TUKEY: Final = 4.7
 """Scatters beyond which a sound does not count."""
+
+_ITERATIONS: Final = 6
+"""Of the weights; more change less than a sound's own scatter."""
 
 _STEP_S: Final = 0.05
 """So many last sounds as are needed to believe an offset, this far off and at one: the clock was set."""
@@ -112,6 +117,7 @@ class ClockOffsets:
             clock: deque(maxlen=MOST_SOUNDS) for clock in self._clock_of.values()
         }
         self._known: dict[str, ClockOffset] = {}
+        self._lines: dict[str, _Line] = {}  # of the clocks that have not been heard since
         self._frames: dict[str, int] = dict.fromkeys(self._heard, 0)
 
     def of(self, array: str) -> ClockOffset | None:
@@ -133,10 +139,10 @@ class ClockOffsets:
         """Whether the arrays have different clocks."""
         return len({self._clock_of[array] for array in arrays}) > 1
 
-    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Steps]]) -> None:
-        """Learn from a sound of known place: of each array what is left of it, without gaps, its run-up first."""
+    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Sequence[Frame]]]) -> None:
+        """Learn from a sound of known place: of each array the frames of it, without gaps, its run-up first."""
         travel_s = {s.name: float(np.linalg.norm(s.centre_m - position_m)) / self._c_m_s for s, _ in heard}
-        late_s = lateness_s({spec.name: steps for spec, steps in heard}, travel_s)
+        late_s = lateness_s({spec.name: frames for spec, frames in heard}, travel_s)
         if self.tell_apart(late_s):
             self.learn(time_ns, late_s)
 
@@ -154,13 +160,12 @@ class ClockOffsets:
         for array, late in late_s.items():
             each.setdefault(self._clock_of[array], []).append(late)
         now = {clock: float(np.median(values)) for clock, values in each.items()}
-        known = [clock for clock in now if self._heard[clock]]
-        lines = _lines([self._heard[clock] for clock in known], time_ns)
-        expected = {clock: line.offset_s for clock, line in zip(known, lines, strict=True)}
+        expected = {clock: self._line(clock).at(time_ns)[0] for clock in now if self._heard[clock]}
         moment = float(np.median([now[clock] - expected.get(clock, 0.0) for clock in expected or now]))
         for clock, late in now.items():
+            self._forget_before_step(clock, time_ns, late - moment)
             self._heard[clock].append((time_ns, late - moment))
-        self._forget_before_steps(now)
+            self._lines.pop(clock, None)
         self._know(time_ns)
 
     def state(self) -> dict[str, Any]:
@@ -179,35 +184,40 @@ class ClockOffsets:
             if clock in state["known"]:
                 self._known[clock] = ClockOffset(*state["known"][clock])
 
-    def _forget_before_steps(self, clocks: Iterable[str]) -> None:
-        """Of clocks that were just heard: forget what was before one was set."""
-        heards = [heard for clock in clocks if len(heard := self._heard[clock]) >= 2 * LEAST_SOUNDS]
-        lines = _lines([list(heard)[:-LEAST_SOUNDS] for heard in heards], heards[0][-1][0]) if heards else []
-        for heard, line in zip(heards, lines, strict=True):
-            last = np.array(list(heard)[-LEAST_SOUNDS:], dtype=np.float64)
-            off_s = last[:, 1] - line.offset_s - line.drift * (last[:, 0] - last[-1, 0]) / 1e9
-            if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2:
-                for _ in range(len(heard) - LEAST_SOUNDS):
-                    heard.popleft()
+    def _line(self, clock: str) -> _Line:
+        if clock not in self._lines:
+            self._lines[clock] = _line(*zip(*self._heard[clock], strict=True))
+        return self._lines[clock]
+
+    def _forget_before_step(self, clock: str, time_ns: int, late_s: float) -> None:
+        """Forget all but the last sounds where these and the new one agree, and are far off what was before."""
+        heard = self._heard[clock]
+        if len(heard) < 2 * LEAST_SOUNDS:
+            return
+        line = self._line(clock)
+        last = [*list(heard)[1 - LEAST_SOUNDS :], (time_ns, late_s)]
+        off_s = np.array([late - line.at(at_ns)[0] for at_ns, late in last])
+        if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2.0:
+            while len(heard) >= LEAST_SOUNDS:
+                heard.popleft()
 
     def _know(self, time_ns: int) -> None:
-        enough = [clock for clock, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS]
-        lines = dict(zip(enough, _lines([self._heard[clock] for clock in enough], time_ns), strict=True))
-        known = [clock for clock in self._heard if clock in lines and lines[clock].std_s < KNOWN_S]
+        found = {c: self._line(c).at(time_ns) for c, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS}
+        known = {clock: (offset_s, std_s) for clock, (offset_s, std_s) in found.items() if std_s < KNOWN_S}
         if len(known) < 2:
             return
-        ordered = sorted(known, key=lambda clock: lines[clock].offset_s)
+        ordered = sorted(known, key=lambda clock: known[clock][0])
         middle = ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]
-        reference = min(middle, key=known.index)
-        zero = lines[reference]
+        reference = next(clock for clock in known if clock in middle)
+        zero_s, zero_std_s = known[reference]
         self._known = {
             clock: ClockOffset(
-                lines[clock].offset_s - zero.offset_s,
-                0.0 if clock == reference else lines[clock].std_s + zero.std_s,
+                offset_s - zero_s,
+                0.0 if clock == reference else std_s + zero_std_s,
                 len(self._heard[clock]),
                 reference,
             )
-            for clock in known
+            for clock, (offset_s, std_s) in known.items()
         }
         for clock, offset in self._known.items():
             if abs(offset.offset_s - self._frames[clock] * FRAME_S) > _MUCH * FRAME_S:
@@ -225,96 +235,66 @@ def clock_is_off(offset: ClockOffset) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    offset_s: float  # at time 0
+    origin_ns: int
+    offset_s: float
     drift: float
-    std_s: float
+    covariance: FloatArray  # (2, 2) of offset and drift
+
+    def at(self, time_ns: int) -> tuple[float, float]:
+        """Offset at a time and its standard deviation, seconds."""
+        since_s = (time_ns - self.origin_ns) / 1e9
+        terms = np.array([1.0, since_s])
+        return self.offset_s + self.drift * since_s, float(np.sqrt(terms @ self.covariance @ terms))
 
 
-def _lines(heard: Sequence[Sequence[tuple[int, float]]], zero_ns: int) -> list[_Line]:
-    """Lines through (time in ns, offset in s) by iterated weights (Tukey's); flat where too few tell the slope."""
-    if not heard:
-        return []
-    count = np.array([len(points) for points in heard])
-    there = np.arange(count.max()) < count[:, None]
-    times_s, offsets_s = np.zeros(there.shape), np.zeros(there.shape)
-    for row, points in enumerate(heard):
-        times_ns, offsets_s[row, : count[row]] = zip(*points, strict=True)
-        times_s[row, : count[row]] = (np.array(times_ns) - zero_ns) / 1e9
-    terms = np.stack([np.ones_like(times_s), times_s], axis=2)
-    found = np.stack([_medians(offsets_s, there), np.zeros(len(heard))], axis=1)
-    for _ in range(10):
-        off = offsets_s - (terms @ found[:, :, None])[:, :, 0]
-        scatter = np.maximum(_LEAST_SCATTER_S, 1.4826 * _medians(np.abs(off), there))
-        weights = there * np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * scatter[:, None]))))
-        weighed = (terms * weights[:, :, None]).swapaxes(1, 2)
-        normal = weighed @ terms
-        normal[:, 1, 1] += (scatter / _DRIFT) ** 2
-        found = np.linalg.solve(normal, weighed @ offsets_s[:, :, None])[:, :, 0]
-    std_s = scatter * np.sqrt(np.linalg.inv(normal)[:, 0, 0])
-    return [_Line(*numbers) for numbers in np.column_stack([found, std_s]).tolist()]
+def _line(times_ns: Sequence[int], offsets_s: Sequence[float]) -> _Line:
+    """Line through the offsets at some times by iterated weights (Tukey's); flat where too few tell its slope."""
+    origin_ns, late_s = times_ns[-1], np.array(offsets_s)
+    terms = np.stack([np.ones_like(late_s), (np.array(times_ns) - origin_ns) / 1e9], axis=1)
+    found = np.array([np.median(late_s), 0.0])
+    for _ in range(_ITERATIONS):
+        off_s = late_s - terms @ found
+        scatter_s = max(_LEAST_SCATTER_S, 1.4826 * float(np.median(np.abs(off_s))))
+        weights = np.square(np.maximum(0.0, 1.0 - np.square(off_s / (_TUKEY * scatter_s))))
+        normal = (terms.T * weights) @ terms + np.diag([0.0, (scatter_s / _DRIFT) ** 2])
+        found = np.linalg.solve(normal, (terms.T * weights) @ late_s)
+    return _Line(origin_ns, float(found[0]), float(found[1]), scatter_s**2 * np.linalg.inv(normal))
 
 
-def _medians(values: FloatArray, there: BoolArray) -> FloatArray:
-    """Of each row, the median of the values that are there."""
-    ordered, count = np.sort(np.where(there, values, np.inf), axis=1), there.sum(axis=1)
-    middle = np.stack([(count - 1) // 2, count // 2], axis=1)
-    return np.asarray(np.take_along_axis(ordered, middle, axis=1).mean(axis=1))
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """What is left of an array's sound to compare clocks by.
+def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, float]) -> dict[str, float]:
+    """How late each array heard a sound against one that did well, but for the travel time; none where it is not sure.
 
     Parameters
     ----------
-    began_ns : int
-        Time of the first sample, by the array's clock.
-    powers : (n,) float32
-        Mean square of the steps from sample to sample, which hold no rumble, of pieces of `HOP_S`.
-    """
-
-    began_ns: int
-    powers: Float32Array
-
-    @classmethod
-    def of(cls, frames: Sequence[Frame]) -> Steps:
-        """Of frames without gaps."""
-        return cls(frames[0].time_ns, np.concatenate([step_powers(frame) for frame in frames]))
-
-
-def step_powers(frame: Frame) -> Float32Array:
-    """One frame's part of `Steps.powers`."""
-    powers = np.empty(round(FRAME_S / HOP_S), dtype=np.float32)
-    kernels.step_powers(frame.samples, powers)
-    return powers
-
-
-def lateness_s(sound: Mapping[str, Steps], travel_s: Mapping[str, float]) -> dict[str, float]:
-    """How late each array heard a sound against the first one, but for the travel time; none where it is not sure.
-
-    Parameters
-    ----------
-    sound : mapping of array to what is left of its sound
+    frames : mapping of array to its frames
         Without gaps, from the run-up on.
     travel_s : mapping of array to float
         From the sound's place to the array.
     """
-    rises = {array: _rises(steps.powers) for array, steps in sound.items() if len(steps.powers) > FRAME_S / HOP_S}
+    rises = {array: _rises(some) for array, some in frames.items() if len(some) > 1}
     if len(rises) < 2:
         return {}
-    first, *others = rises
+    first = max(rises, key=lambda array: float(np.square(rises[array]).sum()))
     late = {first: 0.0}
-    for other in others:
+    for other in (array for array in rises if array != first):
         lag_s = _lag_s(rises[first], rises[other])
         if lag_s is not None:
-            began_s = (sound[other].began_ns - sound[first].began_ns) / 1e9
+            began_s = (frames[other][0].time_ns - frames[first][0].time_ns) / 1e9
             late[other] = lag_s + began_s - (travel_s[other] - travel_s[first])
     return late if len(late) > 1 else {}
 
 
-def _rises(power: Float32Array) -> FloatArray:
+def _rises(frames: Sequence[Frame]) -> FloatArray:
     """By how much the power of each piece of `HOP_S` exceeds all before it, less the decay; log, (n,)."""
-    power, pieces = power[: round(LISTENED_S / HOP_S)], round(FRAME_S / HOP_S)
+    frames = frames[: round(LISTENED_S / FRAME_S)]
+    samples = np.concatenate([frame.samples[:_MICROPHONES] for frame in frames], axis=1)
+    steps = np.diff(samples, axis=1, prepend=samples[:, :1])  # no rumble
+    pieces = round(FRAME_S / HOP_S)
+    lengths = [frame.samples.shape[1] for frame in frames]
+    begins = np.cumsum([0, *lengths[:-1]])
+    edges = np.concatenate([first + np.arange(pieces) * n // pieces for first, n in zip(begins, lengths, strict=True)])
+    energy = np.add.reduceat(np.square(steps).sum(axis=0, dtype=np.float64), edges)
+    power = energy / (len(samples) * np.maximum(1, np.diff(edges, append=samples.shape[1])))
     floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
     decay = np.log(10.0) / 10.0 * _DECAY_DB_S * HOP_S * np.arange(len(level))

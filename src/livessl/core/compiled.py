@@ -132,23 +132,6 @@ def onset_weights(  # type: ignore[no-untyped-def]
             noise[b] += (now - noise[b]) * share
 
 
-@_compiled
-def step_powers(samples, powers):  # type: ignore[no-untyped-def]
-    """Mean square of the step from each sample to the next, piece by piece."""
-    count, pieces = samples.shape[1], len(powers)
-    short, longer = count // pieces, count % pieces
-    square = np.zeros(count, np.float32)
-    for channel in samples:
-        for n in range(1, count):
-            step = channel[n] - channel[n - 1]
-            square[n] += step * step
-    begin = 0
-    for p in range(pieces):
-        end = begin + short + (p < longer)
-        powers[p] = square[begin:end].sum() / np.float32(len(samples) * (end - begin))
-        begin = end
-
-
 def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
     """What `add_power` wants of the places that nodes look up: these."""
     return places

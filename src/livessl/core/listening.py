@@ -38,15 +38,19 @@ class Ear:
         """Whether all of these were heard."""
         return all(raster in self.onsets for raster in rasters)
 
-    def at(self, rasters: Iterable[int]) -> OnsetGCC | None:
-        """All that was heard at `rasters` together; None for nothing."""
-        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        if not heard:
-            return None
-        lags = heard[0].lags.copy()
-        for one in heard[1:]:
-            lags += one.lags
-        return OnsetGCC(lags, sum(one.weight for one in heard))
+    def at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
+        """What was heard at `rasters`."""
+        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
+
+
+def together(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
+    """The sum; None for nothing."""
+    if not heard:
+        return None
+    lags = heard[0].lags.copy()
+    for one in heard[1:]:
+        lags += one.lags
+    return OnsetGCC(lags, sum(one.weight for one in heard))
 
 
 Followed = tuple[str, Ear, Mapping[int, Frame]]

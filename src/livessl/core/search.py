@@ -31,7 +31,6 @@ from livessl.core.types import (
     HeardBy,
     IntArray,
     UInt16Array,
-    read_only,
 )
 
 CELL_M: Final = 0.2
@@ -210,7 +209,7 @@ def _block(lags: int) -> int:
 def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
     """Where among the running maxima the shortest run is that begins in the block of `low` and holds `high`."""
     first = low // block
-    return _PLACE_OF_LENGTH[high // block - first + 1] + first
+    return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
 
 
 def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
@@ -271,8 +270,5 @@ def warm_up() -> None:
     ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
     ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
     kernels.mean_square(heard.gcc.values, lags_s, np.zeros(1), 0.0)
-    samples = np.zeros((2, 800), dtype=np.float32)
-    read_only(samples)  # as a frame's are: for the compiler another type
-    kernels.step_powers(samples, np.zeros(10, dtype=np.float32))
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
     SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))

@@ -80,15 +80,6 @@ def cross_spectra(
         whitened += (np.conj(unit) * weight)[first] * unit[second]
 
 
-def step_powers(samples: Float32Array, powers: Float32Array) -> None:
-    """Mean square of the step from each sample to the next, over the channels (K, n), piece by piece: (pieces,).
-
-    The first sample's step is zero. The pieces are as long as each other, the first ones by a sample longer.
-    """
-    square = np.square(np.diff(samples, axis=1, prepend=samples[:, :1])).mean(axis=0)
-    powers[:] = [part.mean() for part in np.array_split(square, len(powers))]
-
-
 def onset_weights(
     spectra: ComplexArray, low: int, quiet: bool, heard: IntArray, least: np.float32, decay: np.float32,
     warm_up: int, noise_hops: int, loud: np.float32, strongest: np.float32, noise: Float32Array, past: Float32Array,
