@@ -25,7 +25,7 @@ LEAST_CONFIDENCE: Final = 0.8
 _LOGISTIC: Final = (-3.34, 2.69, 1.03)
 """Intercept, weight of the margin and of the standing in the log-odds of a right place."""
 
-LEAST_CONFIDENCE_OF_SECOND: Final = 0.6
+LEAST_CONFIDENCE_OF_SECOND: Final = 0.5
 """Below it a second source is not told of."""
 
 _LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
