@@ -101,6 +101,7 @@ def test_event_says_when_and_where() -> None:
             "distance_m": 2.5,
             "agrees": None,
             "off_deg": None,
+            "asked": False,
         }
     ]
 

@@ -455,12 +455,14 @@ class Site(_Model):
         `clock_offsets` is what is known already of the arrays' clocks.
         """
         from livessl.core.estimators import ESTIMATORS
-        from livessl.core.fusion import Fusion, FusionParameters
+        from livessl.core.fusion import ANSWER_S, Fusion, FusionParameters
+        from livessl.core.segmenter import RECENT_S
 
         f, a = self.fusion, self.activity
         estimator = ESTIMATORS[method or f.method](self.processed, self.search_grid(), self.c_m_s)
         parameters = FusionParameters(
             deadline_s=f.deadline_s,
+            answer_s=ANSWER_S if live else RECENT_S,
             window_s=f.window_s,
             update_s=f.update_s,
             max_event_s=f.max_event_s,

@@ -208,6 +208,7 @@ def _contribution(contribution: Contribution) -> JsonObject:
         "distance_m": round(contribution.distance_m, 3),
         "agrees": contribution.agrees,
         "off_deg": None if contribution.off_deg is None else round(contribution.off_deg, 1),
+        "asked": contribution.asked,
     }
 
 

@@ -95,7 +95,7 @@ def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any
 
 def frame(array: str, raster: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
     made = Frame(
-        array, 0, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
+        array, 1, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
     )
     return replace(made, **changes)
 

@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.activity import THRESHOLD, band_power, dead_channels, exact_mask, runs
+from livessl.core.asking import MOST_ASKED_S, Allowance, Asked, AskedSound, better, is_sure, nearest
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
@@ -26,6 +27,7 @@ from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
     ArraySpec,
+    Ask,
     ClockState,
     Contribution,
     Estimate,
@@ -50,6 +52,9 @@ TROUBLE_NS: Final = 10_000_000_000
 
 SILENT_NS: Final = 1_000_000_000
 """All-zero samples for so long are a dead microphone: any real one has noise."""
+
+ANSWER_S: Final = 0.3
+"""Long against the way to a node and back, short for who waits for an event."""
 
 EARLIEST_NS: Final = -30_000_000_000
 LATEST_NS: Final = 500_000_000
@@ -106,6 +111,8 @@ class FusionParameters:
     ----------
     deadline_s : float
         How long an interval waits for a late array.
+    answer_s : float
+        How long an event waits for what arrays were asked for.
     window_s, update_s : float
         Length of the windows that updates are made from, and the time between updates.
     max_event_s : float
@@ -121,6 +128,7 @@ class FusionParameters:
     """
 
     deadline_s: float = 0.5
+    answer_s: float = ANSWER_S
     window_s: float = 0.2
     update_s: float = 0.1
     max_event_s: float = 10.0
@@ -177,6 +185,7 @@ class _Stream:
     left: bool = False
     ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
     rest_ns: int = 0  # that it is ahead besides
+    allowance: Allowance = field(default_factory=Allowance)
     listener: OnsetFrontEnd | None = None
     chain: int = 0  # names the frames listened to, in their order
     unheard: deque[int] = field(
@@ -287,6 +296,10 @@ class _OpenEvent:
     late_frames: int = 0
     ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
     became_quiet: bool = False
+    heard: _Heard | None = None
+    told: list[Output] | None = None  # by those that heard it, while others are asked
+    asked: dict[str, Asked] = field(default_factory=dict)
+    asked_ns: int = 0
 
 
 class Fusion:
@@ -336,7 +349,10 @@ class Fusion:
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
         self._shared: _Shared = {}
+        self._spared: Collection[str] = ()
         self._votes: dict[str, _Votes] = dict.fromkeys(self._streams, ())
+        self.askable: set[str] = set()
+        """Arrays whose nodes can be asked for what they did not send."""
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
@@ -346,7 +362,7 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._shared, other._votes = self._shared, self._votes
+        other._shared, other._votes, other.askable = self._shared, self._votes, self.askable
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -422,6 +438,10 @@ class Fusion:
         if array in self._streams:
             self._streams[array].left = True
 
+    def spare(self, arrays: Collection[str]) -> None:
+        """Wait for none of these arrays, from now on, and for all others again."""
+        self._spared = arrays
+
     def status(self, now_ns: int) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         clocks = self.clock_offsets
@@ -454,6 +474,9 @@ class Fusion:
             return
         if stream.ahead:
             message = replace(message, raster=message.raster - stream.ahead)
+        if isinstance(message, Frame) and message.sequence == 0:
+            self._take_answer(stream, message)
+            return
         ahead_ns = message.raster * FRAME_NS - self._now_ns
         if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
             stream.counters["rejected"] += 1
@@ -506,12 +529,18 @@ class Fusion:
         if newest - self._next > JUMP_FRAMES:
             outputs += self._finish() if self._event is not None else []
             self._next = newest
-        while self._next <= self._newest() and self._may_close(self._next):
+        while True:
+            if self._event is not None and self._event.asked:
+                if not self._is_answered(self._event):
+                    break
+                outputs += self._finish()
+            if self._next > self._newest() or not self._may_close(self._next):
+                break
             raster, self._next = self._next, self._next + 1
             outputs += self._close(raster)
             self._prune()
         due, self._due = self._due, None
-        if due is not None and self._event is not None and due >= self._event.start:
+        if due is not None and self._event is not None and not self._event.ended and due >= self._event.start:
             outputs += self._update(self._event, due)
         return outputs
 
@@ -533,7 +562,7 @@ class Fusion:
         return True
 
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
-        if stream.watermark is None or stream.heard_ns is None or stream.left:
+        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
             return False
         return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
@@ -554,8 +583,8 @@ class Fusion:
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
-            event.ended = event.became_quiet = True
-            return self._finish()
+            event.became_quiet = True
+            return self._end(event)
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
@@ -565,8 +594,7 @@ class Fusion:
             else:
                 outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
-            event.ended = True
-            outputs += self._finish()
+            outputs += self._end(event)
         return outputs
 
     def _open(self, raster: int) -> _OpenEvent:
@@ -580,6 +608,9 @@ class Fusion:
                 stream.forget()
                 stream.listen(span, self._estimator, self._shared)
         return _OpenEvent(raster, raster, raster)
+
+    def _span(self, event: _OpenEvent) -> range:
+        return range(self._span_start(event.start), event.closed + 1)
 
     def _span_start(self, start: int) -> int:
         """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
@@ -613,7 +644,8 @@ class Fusion:
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None
         assert event is not None
-        told = self._told(event)
+        told = self._told(event) if event.told is None else self._reconsidered(event, event.told)
+        self._heard_until = event.last_active + 1
         if event.became_quiet:
             self._align()
         return told
@@ -637,15 +669,24 @@ class Fusion:
             self._next = max(self._next, self._heard_until)
 
     def _told(self, event: _OpenEvent) -> list[Output]:
-        parameters = self._parameters
-        span = range(self._span_start(event.start), event.closed + 1)
-        sounds = _Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)})
-        powers: dict[str, FloatArray] = {}
-        self._heard_until = event.last_active + 1
+        """What those that heard an event say of it; nothing where another fusion tells it."""
         if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
             return []
-        starts_ns: list[int] = []
-        ends_ns: list[int] = []
+        heard = event.heard = self._heard(event)
+        if not heard.sounds:
+            return []
+        answers, found = self._answer(event, heard)
+        first = answers[0]
+        if first.status is Status.LOCATED and first.estimate is not None and event.became_quiet and len(answers) == 1:
+            self._learn_clocks(first.end_ns, first.estimate, self._span(event))
+        if first.status is not Status.REFUSED and found is not None:
+            self._count_votes(event.start, found, heard.sounds)
+        return [*answers]
+
+    def _heard(self, event: _OpenEvent) -> _Heard:
+        parameters = self._parameters
+        span = self._span(event)
+        heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)}))
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -662,47 +703,65 @@ class Fusion:
             if any(raster not in stream.onsets for raster in there):  # some came late
                 stream.forget()
                 stream.listen(span, self._estimator, self._shared)
-            sounds.pieces[name], powers[name] = pieces, power[mask]
-            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
-            starts_ns.append(rasters[0] * FRAME_NS - stream.rest_ns)
-            ends_ns.append((rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
-        if not sounds:
-            return []
-        start_ns, end_ns = min(starts_ns), max(ends_ns)
-        middle_ns = (start_ns + end_ns) // 2
+            heard.sounds.pieces[name], heard.powers[name] = pieces, power[mask]
+            heard.sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
+            heard.start_ns = min(heard.start_ns, rasters[0] * FRAME_NS - stream.rest_ns)
+            heard.end_ns = max(heard.end_ns, (rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
+        return heard
+
+    def _answer(
+        self, event: _OpenEvent, heard: _Heard, asked: Mapping[str, AskedSound] | None = None
+    ) -> tuple[list[Event], Localization | None]:
+        """What the arrays that heard a sound say of it together with some that were asked, of each source one event."""
+        sounds, powers = heard.with_asked(asked or {})
+        middle_ns = (heard.start_ns + heard.end_ns) // 2
+        found: Localization | None = None
         estimate: Estimate | None = None
         status = Status.REFUSED
         contributions: tuple[Contribution, ...] = ()
         others: tuple[Estimate, ...] = ()
-        reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
-        if len(sounds) >= parameters.min_arrays:
+        reason: str | None = f"heard by {len(sounds)} of at least {self._parameters.min_arrays} arrays"
+        if len(sounds) >= self._parameters.min_arrays:
             found = self._estimator.locate(sounds)
             estimate = _estimate(found, middle_ns, sounds)
             status, reason = self._judge(estimate, found)
             others = self._others(found, middle_ns, sounds)
-            if status is Status.LOCATED and event.became_quiet and not others:
-                self._learn_clocks(end_ns, estimate, span)
             if status is Status.REFUSED:
                 estimate = None
             else:
-                self._count_votes(event.start, found, sounds)
-                contributions = self._contributions(powers, estimate, found)
+                contributions = self._contributions(powers, estimate, found, asked or {})
         first = Event(
             id=self._id(event.start),
-            start_ns=start_ns,
-            end_ns=end_ns,
+            start_ns=heard.start_ns,
+            end_ns=heard.end_ns,
             status=status,
             reason=reason,
             estimate=estimate,
-            power=max(float(power.max()) for power in powers.values()),
+            power=max(float(power.max()) for power in heard.powers.values()),
             method=self._estimator.name,
             contributions=contributions,
-            heard_by=tuple(sounds),
+            heard_by=tuple(heard.sounds),
             late_frames=event.late_frames,
-            latency_s=(self._now_ns - end_ns) / 1e9,
+            latency_s=(self._now_ns - heard.end_ns) / 1e9,
             complete_ns=(event.closed + 1) * FRAME_NS,
         )
-        return [first, *(self._other(first, source, other, powers, found) for source, other in enumerate(others, 2))]
+        if found is None:
+            return [first], None
+        return [
+            first,
+            *(
+                replace(
+                    first,
+                    id=f"{first.id}-{source}",
+                    source=source,
+                    status=Status.LOCATED,
+                    reason=None,
+                    estimate=other,  # of how loud each was nobody can tell
+                    contributions=self._contributions(powers, other, found, asked or {}),
+                )
+                for source, other in enumerate(others, 2)
+            ),
+        ], found
 
     def _others(self, found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> tuple[Estimate, ...]:
         """Further sources of the same sound: those that are places."""
@@ -710,19 +769,65 @@ class Fusion:
         places = zip(estimates, found.others, strict=True)
         return tuple(estimate for estimate, other in places if self._judge(estimate, other)[0] is Status.LOCATED)
 
-    def _other(
-        self, first: Event, source: int, estimate: Estimate, powers: Mapping[str, FloatArray], found: Localization
-    ) -> Event:
-        """The event of a further source: of what both were heard by and how loud, nobody can tell apart."""
-        return replace(
-            first,
-            id=f"{first.id}-{source}",
-            source=source,
-            status=Status.LOCATED,
-            reason=None,
-            estimate=estimate,
-            contributions=self._contributions(powers, estimate, found),
-        )
+    def _end(self, event: _OpenEvent) -> list[Output]:
+        """The sound is over: tell of it, unless somebody is to be asked first."""
+        event.ended = True
+        if self.askable:
+            event.told = self._told(event)
+            event.asked = self._whom_to_ask(event)
+            event.asked_ns = self._now_ns
+        if not event.asked:
+            return self._finish()
+        ahead = {name: self._streams[name].ahead for name in event.asked}
+        spans = {name: asked.span for name, asked in event.asked.items()}
+        return [Ask(name, span[0] + ahead[name], span[-1] + ahead[name]) for name, span in spans.items()]
+
+    def _whom_to_ask(self, event: _OpenEvent) -> dict[str, Asked]:
+        """Arrays that may help where those that heard the sound are not sure."""
+        answer = next((told for told in event.told or () if isinstance(told, Event)), None)
+        if answer is None or event.heard is None or is_sure(answer):
+            return {}
+        if not any(event.heard.sounds.onsets.values()):
+            return {}  # the estimator gives every array the same weight, whatever it heard
+        heard = [self._streams[name].spec for name in answer.heard_by]
+        silent = [
+            stream.spec
+            for name, stream in self._streams.items()
+            if name in self.askable and name not in answer.heard_by and not stream.left
+        ]
+        first = self._span_start(event.start)
+        span = range(first, min(event.last_active + 1, first + round(MOST_ASKED_S / FRAME_S)))
+        return {
+            spec.name: Asked(span)
+            for spec in (nearest(silent, heard) if silent else ())
+            if self._streams[spec.name].allowance.take(len(span), event.closed)
+        }
+
+    def _is_answered(self, event: _OpenEvent) -> bool:
+        if self._now_ns - event.asked_ns >= self._parameters.answer_s * 1e9:
+            return True
+        return all(asked.is_answered or name not in self.askable for name, asked in event.asked.items())
+
+    def _take_answer(self, stream: _Stream, frame: Frame) -> None:
+        asked = None if self._event is None else self._event.asked.get(frame.array)
+        if asked is not None and frame.raster in asked.span and len(frame.samples) == len(stream.spec.microphones_m):
+            asked.frames[frame.raster] = frame
+
+    def _reconsidered(self, event: _OpenEvent, told: list[Output]) -> list[Output]:
+        """The answer with those that were asked, where it is better with all or one of them."""
+        best: list[Event] = [output for output in told if isinstance(output, Event)]
+        if not best or event.heard is None:
+            return told
+        sounds = {name: asked.sound(self._estimator, event.start) for name, asked in event.asked.items()}
+        some = {name: sound for name, sound in sounds.items() if sound is not None}
+        tries = [some, *({name: some[name]} for name in some if len(some) > 1)] if some else []
+        for each in tries:
+            answers, found = self._answer(event, event.heard, each)
+            if better(answers[0], best[0]):
+                best = answers
+                if answers[0].status is not Status.REFUSED and found is not None:
+                    self._count_votes(event.start, found, event.heard.sounds)
+        return [*best]
 
     def _learn_clocks(self, time_ns: int, estimate: Estimate, span: range) -> None:
         clocks = self.clock_offsets
@@ -733,17 +838,7 @@ class Fusion:
         clocks.hear(time_ns, estimate.position_m, whole)
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
-        """Whether the estimate is a place, only a direction, or neither, and why."""
-        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
-        specs = [self._streams[name].spec for name in estimate.arrays]
-        nearest_m = min(_distance_m(spec, estimate) for spec in specs)
-        alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
-        if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
-        if found.signs is not None and not found.signs.tell_direction:
-            return Status.REFUSED, "nothing that was heard came from any one direction"
-        who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
-        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+        return judged(found, [self._streams[name].spec for name in estimate.arrays])
 
     def _count_votes(self, start: int, found: Localization, sounds: Iterable[str]) -> None:
         """Remember who agreed. Replaced, never changed, for other threads read it."""
@@ -754,9 +849,16 @@ class Fusion:
             self._votes[name] = (*before, (start, found.outvoted.get(name)))[-VOTES:]
 
     def _contributions(
-        self, powers: Mapping[str, FloatArray], estimate: Estimate, found: Localization
+        self,
+        powers: Mapping[str, FloatArray],
+        estimate: Estimate,
+        found: Localization,
+        asked: Collection[str] = (),
     ) -> tuple[Contribution, ...]:
-        return tuple(_contribution(self._streams[name].spec, powers[name], estimate, found) for name in powers)
+        return tuple(
+            _contribution(self._streams[name].spec, powers[name], estimate, found, asked=name in asked)
+            for name in powers
+        )
 
     def _id(self, raster: int) -> str:
         return f"{self._site}-{raster * FRAME_NS // 1_000_000}"
@@ -770,6 +872,26 @@ class Fusion:
                 del stream.frames[first]
             while stream.onsets and (first := next(iter(stream.onsets))) < oldest:
                 del stream.onsets[first]
+
+
+def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
+    """Whether what was found is a place, only a direction, or neither, and why.
+
+    Parameters
+    ----------
+    found : Localization
+    specs : sequence of ArraySpec
+        The arrays that it was found by.
+    """
+    spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
+    nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
+    alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
+    if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
+        return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
+    if found.signs is not None and not found.signs.tell_direction:
+        return Status.REFUSED, "nothing that was heard came from any one direction"
+    who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
+    return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
 
 class _Sounds(Mapping[str, Sound]):
@@ -800,24 +922,46 @@ class _Sounds(Mapping[str, Sound]):
         return len(self.pieces)
 
 
+@dataclass(slots=True)
+class _Heard:
+    """What the arrays heard of one event: their sounds, the powers of the frames in them, from when to when."""
+
+    sounds: _Sounds
+    powers: dict[str, FloatArray] = field(default_factory=dict)
+    start_ns: int = 2**63 - 1
+    end_ns: int = -(2**63)
+
+    def with_asked(self, asked: Mapping[str, AskedSound]) -> tuple[_Sounds, dict[str, FloatArray]]:
+        """These sounds and powers, and those of arrays that were asked."""
+        sounds, powers = _Sounds(self.sounds.sources, self.sounds.doubted), dict(self.powers)
+        sounds.pieces |= self.sounds.pieces
+        sounds.onsets |= self.sounds.onsets
+        for name, sound in asked.items():
+            sounds.pieces[name], sounds.onsets[name] = [sound.frames], sound.onsets
+            powers[name] = np.array([frame.power for frame in sound.frames])
+        return sounds, powers
+
+
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
     arrays = tuple(name for name in sounds if name not in (found.outvoted or ()))
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
-def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
+def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:
     """How far an array is from the place, or half its width: inside a wide one, its centre is nothing to look from."""
-    return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
+    return max(direction_deg(spec.centre_m, position_m)[2], spec.aperture_m / 2.0)
 
 
-def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate, found: Localization) -> Contribution:
+def _contribution(
+    spec: ArraySpec, power: FloatArray, estimate: Estimate, found: Localization, *, asked: bool
+) -> Contribution:
     azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
     agrees: bool | None = None
     if found.outvoted is not None and len(found.evidence) > 1:
         agrees = spec.name not in found.outvoted
     off_deg = (found.outvoted or {}).get(spec.name)
     return Contribution(
-        spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, agrees, off_deg
+        spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, agrees, off_deg, asked
     )
 
 

@@ -99,7 +99,8 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Counts the array's frames since its node started, from 1.
+        Counts the array's frames since its node started, from 1. 0 is a frame that the server asked for, and the node
+        would not have sent.
     raster : int
         Index on the site-time raster: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
@@ -310,6 +311,8 @@ class Contribution:
         nobody can tell: it was alone, or the estimator does not ask.
     off_deg : float or None
         By what angle it heard the sound elsewhere, where it does not agree.
+    asked : bool
+        It had not found the sound active by itself, and was asked for what it had.
     """
 
     array: str
@@ -320,6 +323,7 @@ class Contribution:
     distance_m: float
     agrees: bool | None = None
     off_deg: float | None = None
+    asked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,8 +440,24 @@ class Window:
     evidence: tuple[HeardBy, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A wish for an array's frames of a time at which it sent none.
+
+    Parameters
+    ----------
+    array : str
+    first, last : int
+        Raster intervals, both included, by the array's own clock.
+    """
+
+    array: str
+    first: int
+    last: int
+
+
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | Window
+Output = Update | Event | Track | Window | Ask
 """What fusion says."""

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from livessl import wire
@@ -15,7 +15,7 @@ from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, Event, Message, Output, Track, TrackState, Update
+from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -46,6 +46,9 @@ MAX_UNSAVED: Final = 10_000
 
 REPLAY_SILENT_NS: Final = 5_000_000_000
 """A replay that sends nothing for so long is over, unless its node still says that it is there."""
+
+DISABLED: Final = "disabled"
+"""The state of an array that an operator has disabled, however it is doing."""
 
 _ANSWER: Final = ("time_utc", "duration_s", "position_m", "covariance_m2", "confidence", "arrays", "status")
 """Where these are the same, an event is no news."""
@@ -103,6 +106,8 @@ class Engine:
         self.unkept = 0
         self.unsaved = 0
         """Events that wait for the store to take them."""
+        self._disabled = store.disabled(site.site)  # replaced, never changed: other threads read it
+        self._switching = threading.Lock()
         self.maps = Maps(clock)
         self.latency = Latency()
         _warm_up()
@@ -176,6 +181,21 @@ class Engine:
         """How every array is doing; from any thread, and without waiting for a localization that is going on."""
         return [self._array(status) for status in self._settling.status(self.now_ns())]
 
+    def enable(self, array: str, enabled: bool) -> None:
+        """Use an array's sound from now on, or do not; from any thread.
+
+        A disabled array is heard as ever, its sound acknowledged and its levels shown, but no event is made of it and
+        nobody waits for it. The store remembers it.
+
+        Raises
+        ------
+        StoreError
+            Where the store does not take it; all stays as it was.
+        """
+        with self._switching:
+            self._store.enable(self._site.site, array, enabled)
+            self._disabled = self._disabled - {array} if enabled else self._disabled | {array}
+
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
         return list(self._tracks.values())
@@ -187,6 +207,8 @@ class Engine:
         counters["duplicates"] = ingest.duplicates[status.name] + settling.duplicates.get(status.name, 0)
         counters["sequence_gaps"] = ingest.sequence_gaps[status.name]
         counters["backfilled"] = settling.backfilled.get(status.name, 0)
+        counters["asked"] = settling.asked.get(status.name, 0)
+        counters["helped"] = settling.helped.get(status.name, 0)
         counters["too_late"] = settling.too_late.get(status.name, 0)
         problem = ingest.problem_of(status.name)
         if problem is not None:
@@ -196,6 +218,11 @@ class Engine:
         if described["state"] == ArrayState.LOST and ingest.is_live(status.name, self._clock.monotonic_ns()):
             described["state"] = str(ArrayState.QUIET)
             described["reason"] = problem or "its node is there, but no sound comes from its device"
+        described["enabled"] = status.name not in self._disabled
+        if not described["enabled"]:
+            otherwise = f"{described['state']}: {described['reason']}" if described["reason"] else described["state"]
+            described["reason"] = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
+            described["state"] = DISABLED
         return described
 
     def _begin_live(self) -> None:
@@ -231,7 +258,7 @@ class Engine:
                 batch = []
                 self._meet(item)
             else:
-                batch.append(item)
+                batch.append(self._used(item))
         self._step(batch)
         now_ns = self._clock.monotonic_ns()
         if batch:
@@ -247,6 +274,12 @@ class Engine:
             self._watch_ns = now_ns
             self._watch_arrays(now_ns)
 
+    def _used(self, message: Message) -> Message:
+        """The message as the fusion shall have it: nothing in a disabled array's sound is active."""
+        if message.array in self._disabled and isinstance(message, Frame) and message.active:
+            return replace(message, active=False)
+        return message
+
     def _meet(self, item: Joined | Greeted | Left) -> None:
         if isinstance(item, Left):
             self._leave(item.hello)
@@ -254,7 +287,7 @@ class Engine:
         if isinstance(item, Joined):
             self._join(item.hello)
         for array in item.hello.arrays:
-            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
+            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns(), answers=item.hello.answers)
 
     def _watch_arrays(self, now_ns: int) -> None:
         arrays = self.arrays()
@@ -307,6 +340,7 @@ class Engine:
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
+        self._settling.spare(self._disabled)
         self._tell(self._settling.step(batch, self.now_ns()))
         if not self._unsaved:
             self._receiver.ingest.settled = self._settling.settled_of
@@ -321,6 +355,8 @@ class Engine:
                 self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
                 self._publish(self._messages.update(output, self._stages(output, "update")))
+            elif isinstance(output, Ask):
+                self._receiver.ask(output)
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
