@@ -1,7 +1,8 @@
 """What many WebSocket clients cost, some of them stalled: the server's memory, and how late the healthy ones hear.
 
 The server is the real one, in a process of its own; updates are put in where its engine would publish them. Clients are
-bare sockets in this process, so that reading costs little. Prints a table, or with `--json` one object.
+bare sockets in this process, so that reading costs little. Prints a table, or with `--json` one object; exits with 1
+where the healthy ones hear later than they may, or the server takes more memory.
 """
 
 from __future__ import annotations
@@ -40,6 +41,12 @@ STALLED_WINDOW_BYTES: Final = 4096
 """A stalled client's receive buffer: small, so that the server soon has to keep what is not read."""
 
 WARM_UP_S: Final = 2.0
+
+MAX_DELAY_P95_MS: Final = 100.0
+
+MAX_CLIENT_KB: Final = 200.0
+"""Of the server's memory for each client, stalled or not: 64 kB on their way out, a socket, and its queue of messages,
+which are one object for all."""
 
 
 STAMP: Final = b'"published_ns":'
@@ -188,15 +195,15 @@ async def _watch(
     )
 
 
-def open_client(host: str, port: int, window_bytes: int | None) -> socket.socket:
-    """A WebSocket for updates, opened by hand."""
+def open_client(host: str, port: int, window_bytes: int | None, kinds: str = "update") -> socket.socket:
+    """A WebSocket for messages of some kinds, opened by hand."""
     connection = socket.socket()
     if window_bytes is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window_bytes)
     connection.settimeout(10)
     connection.connect((host, port))
     lines = [
-        "GET /api/v1/live?kinds=update HTTP/1.1",
+        f"GET /api/v1/live?kinds={kinds} HTTP/1.1",
         f"Host: {host}:{port}",
         "Connection: Upgrade",
         "Upgrade: websocket",
@@ -238,13 +245,17 @@ class Listener(asyncio.Protocol):
                 break
             if data[at] & 15 == 9 and self._transport is not None:  # a ping wants its pong, masked with zeros
                 self._transport.write(bytes([0x8A, 0x80 | length, 0, 0, 0, 0]) + data[body : body + length])
-            stamp = data.rfind(STAMP, body, body + length)
-            if stamp >= 0 and self._log.open:
-                sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
-                self._log.delays_ms.append((now_ns - sent_ns) / 1e6)
-                self._log.message_bytes = length
+            self.note(data, body, length, now_ns)
             at = body + length
         self._rest = data[at:]
+
+    def note(self, data: bytes, body: int, length: int, now_ns: int) -> None:
+        """A frame's body has come."""
+        stamp = data.rfind(STAMP, body, body + length)
+        if stamp >= 0 and self._log.open:
+            sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
+            self._log.delays_ms.append((now_ns - sent_ns) / 1e6)
+            self._log.message_bytes = length
 
     def close(self) -> None:
         """Hang up."""
@@ -289,7 +300,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         for name, value in found.items():
             print(f"{name:<18} {value}")
-    return 0
+    grown_kb = 1000 * (found["rss_peak_mb"] - found["rss_before_mb"]) / asked.clients
+    return 1 if found["delay_p95_ms"] > MAX_DELAY_P95_MS or grown_kb > MAX_CLIENT_KB else 0
 
 
 if __name__ == "__main__":

@@ -25,10 +25,15 @@ from typing import Any
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "faults")]
 
+from deaths import DEATHS, make_death_recordings, play_death
+from fuzz import fuzz, lines_missed
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
-from soak import GROWTH, soak
+from soak import GROWTH, Sample, soak
+
+DEATH_SOUNDS = 30
+FUZZED_AT_A_TIME = 100_000
 
 
 def replayed(seed: int) -> list[str]:
@@ -81,6 +86,26 @@ def loss_and_jitter(site: Playing, rng: random.Random, end_s: float) -> None:
     site.sleep_until(end_s)
 
 
+def cables_pulled(site: Playing, rng: random.Random, end_s: float) -> None:
+    """A loose contact at one node for 60 s, then the other's cable out for 60 s."""
+    site.sleep_until(10.0)
+    site.cables["a"].loosen(rng, 60.0)
+    site.sleep_until(90.0)
+    site.cables["b"].pull()
+    site.sleep_until(150.0)
+    site.cables["b"].plug()
+
+
+def links_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
+    """A tenth of the bandwidth that sound needs, for half of the time."""
+    site.sleep_until(10.0)
+    for cable in site.cables.values():
+        cable.narrow(200)
+    site.sleep_until(10.0 + end_s / 2)
+    for cable in site.cables.values():
+        cable.narrow(100_000)
+
+
 def stopped(site: Playing, rng: random.Random, end_s: float) -> None:
     """Server and nodes with SIGSTOP for up to 5 s, 30 times, and torn connections."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(30)):
@@ -98,7 +123,13 @@ PROCESSES = {
     "links cut for 60 s": link_cut,
     "5 % loss, 200 ms jitter": loss_and_jitter,
     "processes stopped, connections torn": stopped,
+    "cables loose and pulled": cables_pulled,
+    "links narrow": links_narrow,
 }
+
+
+CABLED = {"cables loose and pulled", "links narrow"}
+"""Those with nodes in network namespaces instead of behind proxies."""
 
 
 def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
@@ -113,7 +144,7 @@ def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
         if not path.exists():
             directory = path.with_suffix("")  # it stays, with what the processes said, where anything goes wrong
             shutil.rmtree(directory, ignore_errors=True)
-            events = play(recordings, directory, PROCESSES[name], seed=len(name))
+            events = play(recordings, directory, PROCESSES[name], len(name), cabled=name in CABLED)
             shutil.copy(directory / "said.txt", path.with_suffix(".txt"))
             shutil.rmtree(directory)
             path.write_text(json.dumps(events), encoding="utf-8")
@@ -154,12 +185,38 @@ def damaged(count: int) -> int:
     return 0
 
 
+def deaths(folder: Path, names: list[str]) -> None:
+    """Let an array die in each way, and print how late the others' events are told."""
+    recordings = folder / "recordings"
+    if not recordings.exists():
+        make_death_recordings(recordings, DEATH_SOUNDS)
+    for name in names:
+        death = play_death(recordings, folder / name.replace(" ", "-"), name)
+        told = f"{len(death.delays_s)} events, p50 {1000 * death.p50_s:.0f} ms, p95 {1000 * death.p95_s:.0f} ms"
+        most = f"max {1000 * death.delays_s[-1]:.0f} ms"
+        print(f"{name}: {told}, {most}, shown after {death.shown_s and round(death.shown_s, 2)} s", flush=True)
+
+
+def fuzzed(seconds: float) -> int:
+    """Fuzz by coverage for so long; 1 where a line of the decoder was not reached."""
+    began_s, seed = time.monotonic(), 0
+    outcomes: Counter[str] = Counter()
+    found = fuzz(FUZZED_AT_A_TIME, seed)
+    while time.monotonic() - began_s < seconds:
+        outcomes += found.outcomes
+        seed += 1
+        found = fuzz(FUZZED_AT_A_TIME, seed)
+    print(f"{outcomes.total()} messages, {dict(outcomes)}, {seed} seeds, {time.monotonic() - began_s:.0f} s")
+    print(f"ways from line to line: {len(found.edges)}; lines of the decoder not reached: {lines_missed(found)}")
+    return 1 if lines_missed(found) else 0
+
+
 def soaked(hours: float, seed: int) -> int:
     """So many hours of four arrays; 1 where the memory has grown too much after the first, or a sound is lost."""
     logging.disable(logging.CRITICAL)
 
-    def tell(at_hours: float, resident_mb: float) -> None:
-        print(f"{at_hours:5.2f} h {resident_mb:6.1f} MB", flush=True)
+    def tell(sample: Sample) -> None:
+        print(f"{sample.hours:5.2f} h {sample.resident_mb:6.1f} MB, {sample.kept} frames kept", flush=True)
 
     with tempfile.TemporaryDirectory() as directory:
         outcome = soak(Path(directory), hours, seed=seed, tell=tell)
@@ -185,7 +242,17 @@ def main() -> int:
     sub = campaigns.add_parser("soak", help="simulated time: a day of four arrays, and the server's memory")
     sub.add_argument("--hours", type=float, default=24.0, help="how long (24)")
     sub.add_argument("--seed", type=int, default=0, help="of what goes wrong meanwhile (0)")
+    sub = campaigns.add_parser("deaths", help="real processes: how late events are told when an array dies")
+    sub.add_argument("--out", type=Path, required=True, help="folder for recordings; they stay")
+    sub.add_argument("--fault", choices=list(DEATHS), action="append", help="only these (all)")
+    sub = campaigns.add_parser("fuzz", help="fuzzing of the wire, led by coverage")
+    sub.add_argument("--seconds", type=float, default=300.0, help="how long (300)")
     arguments = parser.parse_args()
+    if arguments.campaign == "fuzz":
+        return fuzzed(arguments.seconds)
+    if arguments.campaign == "deaths":
+        deaths(arguments.out, arguments.fault or list(DEATHS))
+        return 0
     if arguments.campaign == "soak":
         return soaked(arguments.hours, arguments.seed)
     if arguments.campaign == "wire":

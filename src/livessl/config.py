@@ -339,6 +339,8 @@ class FusionConfig(_Model):
     update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1
     max_event_s: Annotated[float, Field(ge=0.5, le=60)] = 10.0
     min_arrays: Annotated[int, Field(ge=1)] = 1
+    sources: Annotated[int, Field(ge=1, le=2)] = 2
+    live_sources: Annotated[int, Field(ge=1, le=2)] = 1
 
 
 class Zone(_Model):
@@ -465,6 +467,8 @@ class Site(_Model):
             update_s=f.update_s,
             max_event_s=f.max_event_s,
             min_arrays=f.min_arrays,
+            sources=f.sources,
+            live_sources=f.live_sources,
             threshold=a.threshold,
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,

@@ -121,14 +121,25 @@ class Tokens:
         return found
 
 
-def read_tokens(path: Path) -> Tokens:
-    """The tokens of a file.
+def file_stamp(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is written anew; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ino
+
+
+def read_tokens(path: Path, *, missing_ok: bool = False) -> Tokens:
+    """The tokens of a file; with `missing_ok`, none where there is no file, for the last one was revoked.
 
     Raises
     ------
     ConfigError
         Where it cannot be read, is open to others, or holds something else.
     """
+    if missing_ok and not path.exists():
+        return Tokens({})
     text = _read_secret(path, "make a token with `livessl keys token`")
     return Tokens({bytes.fromhex(entry.sha256): _client(entry) for entry in _entries(path, text)})
 

@@ -10,9 +10,10 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +23,11 @@ from typing import Any, Self
 import numpy as np
 import soundfile
 import yaml
+from namespaces import Cable
 from proxy import Proxy
+from websockets.sync.client import connect
 
+from livessl import keys
 from livessl.clock import utc_ns, utc_text
 from livessl.config import load_site
 from livessl.simulate.export import write_scene
@@ -38,11 +42,21 @@ TAIL_S = 120.0
 
 NODES = {"a": "north", "b": "south"}
 
+WEST = {"arrays.west": {"geometry": {"tetrahedron": {"edge_m": 0.3}}, "position_m": [0.7, 2.4, 1.6]}}
+"""A third array, for what an array's death costs two others."""
 
-def make_recordings(directory: Path, count: int, gap_s: float, seed: int = 5) -> None:
-    """`north.wav` and `south.wav`: bursts of noise at random places of the small room, without reverberation."""
+
+def make_recordings(
+    directory: Path,
+    count: int,
+    gap_s: float,
+    seed: int = 5,
+    changes: Changes | None = None,
+    lead_s: float = 2.0,
+) -> None:
+    """A WAV for each array: bursts of noise at random places of the small room, without reverberation."""
     path = directory / "scene.yaml"
-    path.write_text(yaml.safe_dump(small()), encoding="utf-8")
+    path.write_text(yaml.safe_dump(small(changes)), encoding="utf-8")
     site = load_site(path)
     scene = make_scene(
         site.room.size_m,
@@ -53,11 +67,11 @@ def make_recordings(directory: Path, count: int, gap_s: float, seed: int = 5) ->
         c_m_s=site.c_m_s,
         keep_away_m=[spec.centre_m for spec in site.specs],
         seed=seed,
-        lead_s=2.0,
+        lead_s=lead_s,
         gap_s=gap_s,
     )
     write_scene(directory, site, scene, seed=seed)
-    for k, array in enumerate(NODES.values()):
+    for k, array in enumerate(site.arrays):
         samples, rate = soundfile.read(directory / f"{array}.wav", always_2d=True)
         hum = 1e-4 * np.random.default_rng(k).standard_normal((round(TAIL_S * rate), samples.shape[1]))
         soundfile.write(directory / f"{array}.wav", np.concatenate([samples, hum]), rate, subtype="PCM_16")
@@ -82,15 +96,22 @@ class Playing:
         For site file, database, spools and what the processes say.
     lead_s : float
         From now to the recordings' first sample, seconds.
+    nodes : dict of str to str
+        The nodes, and each one's array.
     changes : dict
-        Of the site file: see `small_site.small`.
+        Of the small site.
+    cables : mapping of node to Cable
+        Nodes in network namespaces: no proxy is between them and the server, and both have keys, as a server needs
+        that others can reach.
     """
 
     recordings: Path
     directory: Path
     lead_s: float = 40.0
     seed: int = 0
+    nodes: dict[str, str] = field(default_factory=lambda: dict(NODES))
     changes: Changes = field(default_factory=dict)
+    cables: Mapping[str, Cable] = field(default_factory=dict)
     proxies: dict[str, Proxy] = field(default_factory=dict)
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     start_ns: int = 0
@@ -101,18 +122,25 @@ class Playing:
         self.directory.mkdir(parents=True, exist_ok=True)
         self._log = self._open.enter_context((self.directory / "said.txt").open("ab"))
         port, self.http = free_port(), free_port()
-        for k, name in enumerate(NODES):
-            self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
-        data = small({"server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http, **self.changes})
+        for k, name in enumerate(self.nodes):
+            if name not in self.cables:
+                self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
+        data = small({**self.changes, "server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http})
+        if self.cables:
+            folder = self.directory / "keys"
+            keys.make_server_keys(folder)
+            for name in self.nodes:
+                keys.enrol(folder, name, keys.make_node_keys(folder, name))
+            data["server"]["bind"], data["keys"] = f"tcp://*:{port}", "keys"
         data["server"]["events_db"] = str(self.directory / "events.db")
         data["nodes"] = {
             name: {
-                "server": self.proxies[name].endpoint,
+                "server": f"tcp://{self.cables[name].host}:{port}" if self.cables else self.proxies[name].endpoint,
                 "device": {"type": "wav", "files": {array: f"{array}.wav"}},
                 "arrays": {array: [1, 2, 3, 4]},
                 "spool": {"directory": str(self.directory / "spool")},
             }
-            for name, array in NODES.items()
+            for name, array in self.nodes.items()
         }
         self.site = self.directory / "site.yaml"
         self.site.write_text(yaml.safe_dump(data), encoding="utf-8")
@@ -132,7 +160,7 @@ class Playing:
 
     def start_node(self, name: str) -> None:
         """Start a node; it plays what is left of its recording, for what is past nobody hears any more."""
-        array = NODES[name]
+        array = self.nodes[name]
         late_s = max(0.0, time.time() + 0.5 - self.start_ns / 1e9)
         skip = math.ceil(late_s / FRAME_S)
         path = self.directory / f"{array}-{skip}.wav"
@@ -142,8 +170,9 @@ class Playing:
         self._start(name, "capture", "--node", name, "--wav", f"{array}={path}", "--start-at", start)
 
     def _start(self, name: str, command: str, *arguments: str) -> None:
+        inside = self.cables[name].inside if name in self.cables else []
         self.processes[name] = subprocess.Popen(
-            [sys.executable, "-m", "livessl", command, "--site", str(self.site), *arguments],
+            [*inside, sys.executable, "-m", "livessl", command, "--site", str(self.site), *arguments],
             stdout=self._log,
             stderr=self._log,
         )
@@ -201,6 +230,39 @@ class Playing:
         return [{**event, "at_s": (utc_ns(event["time_utc"]) - self.start_ns) / 1e9} for event in events]
 
 
+class Hearer:
+    """Subscribes to events and notes how long after each sound's end the first word of it came.
+
+    Parameters
+    ----------
+    http : int
+        The server's port on this machine.
+    """
+
+    def __init__(self, http: int) -> None:
+        self._url = f"ws://127.0.0.1:{http}/api/v1/live?kinds=event"
+        self.delays_s: dict[str, float] = {}
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._socket = connect(self._url)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+        self._thread.join(timeout=5)
+
+    def _run(self) -> None:
+        for text in self._socket:
+            event = json.loads(text)
+            if event["kind"] == "event":
+                end_s = utc_ns(event["time_utc"]) / 1e9 + event["duration_s"]
+                self.delays_s.setdefault(event["id"], time.time() - end_s)
+
+
 def wait_for(condition: Callable[[], object], what: str, within_s: float) -> None:
     """Until it is so; fail where it does not become so in time."""
     deadline = time.monotonic() + within_s
@@ -217,17 +279,29 @@ def duration_s(recordings: Path) -> float:
 
 
 def play(
-    recordings: Path, directory: Path, disturb: Callable[[Playing, random.Random, float], None], seed: int = 0
+    recordings: Path,
+    directory: Path,
+    disturb: Callable[[Playing, random.Random, float], None],
+    seed: int = 0,
+    *,
+    cabled: bool = False,
 ) -> list[Event]:
-    """Play the recordings to their end while something disturbs them; then let everything settle."""
+    """Play the recordings to their end while something disturbs them; then let everything settle.
+
+    `cabled` puts the nodes into network namespaces instead of behind proxies.
+    """
     end_s = duration_s(recordings)
-    with Playing(recordings, directory, seed=seed) as site:
+    with ExitStack() as open_cables:
+        cables = {name: open_cables.enter_context(Cable(k)) for k, name in enumerate(NODES)} if cabled else {}
+        site = open_cables.enter_context(Playing(recordings, directory, seed=seed, cables=cables))
         site.start_server()
         for name in NODES:
             site.start_node(name)
         disturb(site, random.Random(seed), end_s)
         for proxy in site.proxies.values():
             proxy.weather.cut = False
+        for cable in cables.values():
+            cable.plug()
         if "server" not in site.processes:
             site.start_server()
         site.sleep_until(end_s)

@@ -19,9 +19,10 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 from unittest.mock import patch
 
 from mutation import mutated, originals
@@ -29,7 +30,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from world import START, Event, HandClock, Microphones, Post, World
 
-from clients import open_client
+from clients import Listener, Log, open_client
 from livessl import wire
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.line import played_messages
@@ -49,9 +50,6 @@ HOUR = 3600 * SECOND
 SLOT = 20 * SECOND
 """One sound in each, but for every eighth hour, which is quiet."""
 
-SAMPLE = 180 * SECOND
-"""Between two looks at the memory."""
-
 SOUNDS = 8
 """Different ones, each at a place of its own."""
 
@@ -65,6 +63,12 @@ PLACES = {
 
 GROWTH = 0.05
 """Of the memory after the first hour, at most."""
+
+AT_REST = 200
+"""Frames that nodes keep at most while nobody is away: of the sound that goes on, and those on their way."""
+
+READERS = 3
+"""Clients that read everything."""
 
 RETENTION_S = 3600.0
 """Of events: so that what is kept of them is as much after an hour as after a day."""
@@ -87,7 +91,20 @@ def soak_site(directory: Path) -> Site:
     return site_of(data)
 
 
-Tell = Callable[[float, float], None]
+class Sample(NamedTuple):
+    """When it was taken, what memory there was, and how many frames the nodes kept for a server that waits."""
+
+    hours: float
+    resident_mb: float
+    kept: int
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether no sound waits for an array that is away."""
+        return self.kept < AT_REST
+
+
+Tell = Callable[[Sample], None]
 
 Heard = Mapping[int, Sequence[Frame]]
 """What an array's node sends of a sound, by raster interval since the sound's recording began."""
@@ -158,6 +175,7 @@ class Player(Microphones):
         return messages
 
 
+@lru_cache(maxsize=8)
 def sound_of(slot: int, count: int) -> tuple[int, int] | None:
     """When in its slot a sound's recording begins, in intervals, and which it is."""
     if slot * SLOT // HOUR % 8 == 7:
@@ -206,20 +224,26 @@ class Soak(World):
         For the database.
     seed : int
         Of the faults.
+    sample_s : float
+        Between two looks at the memory, seconds of the site's.
     tell : callable
-        Gets the hours that have passed and the memory in MB, every three minutes.
+        Gets each of these looks.
+    absence_first : bool
+        Whether the first fault is a long absence: what that takes is then taken when memory is first held on to.
     """
 
     array_of: ClassVar = {node: array for node, (array, _) in PLACES.items()}
 
-    def __init__(self, directory: Path, seed: int = 0, tell: Tell = lambda hours, mb: None) -> None:
+    def __init__(self, directory: Path, seed: int, sample_s: float, tell: Tell, *, absence_first: bool) -> None:
+        self._absence_first = absence_first
+        self._sample = round(sample_s * SECOND)
         self._tell = tell
         self._soaked = soak_site(directory)
         self._rendered = rendered_sounds(self._soaked)
         self.faults: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.slots: set[int] = set()
-        self.memory_mb: list[tuple[float, float]] = []
+        self.memory: list[Sample] = []
         super().__init__(seed)
 
     def _make_sounds(self, count: int) -> list[tuple[str, frozenset[int]]]:
@@ -255,31 +279,44 @@ class Soak(World):
         """That have passed."""
         return (self.raster - START) / HOUR
 
+    def tick(self) -> None:
+        """One raster interval passes; with one turn of everything it takes half as long as another world's."""
+        self.clock.time_ns += FRAME_NS
+        self.raster += 1
+        for node in self.nodes.values():
+            if not node.stopped:  # else its device's buffer holds what is heard
+                first = self.raster - 1 if node.next_raster is None else node.next_raster
+                node.link.send([m for raster in range(first, self.raster) for m in node.microphones.hear(raster)])
+                node.next_raster = self.raster
+        self._serve()
+
     def run(self, ticks: int) -> None:
         for _ in range(ticks):
             self.tick()
             if self.raster % SECOND == 0:
                 self._breathe()
-            if (self.raster - START) % SAMPLE == 0:
-                self.memory_mb.append((self.hours, resident_mb()))
-                self._tell(*self.memory_mb[-1])
+            if (self.raster - START) % self._sample == 0:
+                kept = sum(node.link.kept for node in self.nodes.values())
+                self.memory.append(Sample(self.hours, resident_mb(), kept))
+                self._tell(self.memory[-1])
 
     def _breathe(self) -> None:
-        """The server's loop has told all that it was given; else it would fall behind by hours."""
+        """Wait until the server's loop has told all that it was given; else it would fall behind by hours."""
         if self.http.engine.failure is not None:
             raise RuntimeError("the server has failed") from self.http.engine.failure
         assert self.http._loop is not None
-        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result(timeout=30)
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result(timeout=60)
 
     def disturbances(self) -> Iterator[int]:
         """Do something bad, and say how many intervals shall pass before the next."""
         pool = originals()
+        kinds, weights = ["cut", "reset", "stopped", "killed", "rubbish", "away"], [4, 4, 4, 4, 4, 1]
         while True:
             yield self.rng.randint(60 * SECOND, 600 * SECOND)
             name = self.rng.choice(list(self.array_of))
-            what = self.rng.choices(
-                ["cut", "reset", "stopped", "killed", "rubbish", "away"], weights=[4, 4, 4, 4, 4, 1]
-            )[0]
+            what = self.rng.choices(kinds, weights)[0]
+            if self._absence_first and not self.faults:
+                what = "away"
             self.faults[what] += 1
             match what:
                 case "cut" | "away":
@@ -301,6 +338,18 @@ class Soak(World):
                     self.wires[name].up.extend((self.clock.time_ns, mutated(self.rng, pool)) for _ in range(100))
 
 
+class _Reader(Listener):
+    """Counts events."""
+
+    def __init__(self, heard: Counter[str]) -> None:
+        super().__init__(Log())
+        self._heard = heard
+
+    def note(self, data: bytes, body: int, length: int, now_ns: int) -> None:
+        self._heard["messages"] += 1
+        self._heard["events"] += data.startswith(b'"kind":"event"', data.find(b'"kind"', body))
+
+
 class Crowd:
     """Clients in a thread of their own: some that read, one that stalls, one that comes and goes, one that asks.
 
@@ -311,12 +360,16 @@ class Crowd:
     """
 
     def __init__(self, url: str) -> None:
+        host, port = url.removeprefix("http://").split(":")
+        self._address = host, int(port)
         self._url = url
         self._live = f"ws{url.removeprefix('http')}/api/v1"
         self.heard: Counter[str] = Counter()
         self._connections: set[ClientConnection] = set()
         self._ended = threading.Event()
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._listen, self._poll)]
+        self._failures: list[Exception] = []
+        works = (self._listen, self._poll)
+        self._threads = [threading.Thread(target=self._watched, args=[work], daemon=True) for work in works]
 
     def __enter__(self) -> Self:
         for thread in self._threads:
@@ -328,26 +381,38 @@ class Crowd:
     ) -> None:
         self._ended.set()
         for thread in self._threads:
-            thread.join(timeout=10)
+            thread.join(timeout=30)
+        if self._failures and kind is None:
+            raise ExceptionGroup("clients failed", self._failures)
+
+    def _watched(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as failure:  # noqa: BLE001 - whatever it is, the run shall fail by it
+            self._failures.append(failure)
 
     def _listen(self) -> None:
         asyncio.run(self._listen_all())
 
     async def _listen_all(self) -> None:
-        works = [self._read("live") for _ in range(3)] + [self._read("map"), self._come_and_go(), self._stall()]
-        tasks = [asyncio.create_task(work) for work in works]
+        loop = asyncio.get_running_loop()
+        readers = [open_client(*self._address, None, "update,event,track,arrays") for _ in range(READERS)]
+        listeners = [(await loop.create_connection(lambda: _Reader(self.heard), sock=each))[1] for each in readers]
+        tasks = [asyncio.create_task(work) for work in (self._watch_map(), self._come_and_go(), self._stall())]
         while not self._ended.is_set():
             await asyncio.sleep(0.1)
             for task in tasks:
                 if task.done():
                     task.result()  # nobody ends before the others
+        for listener in listeners:
+            listener.close()
         await asyncio.gather(*(each.close() for each in self._connections))
         await asyncio.gather(*tasks)
 
-    async def _read(self, what: str) -> None:
-        async with self._connected(f"{self._live}/{what}") as connection:
-            async for text in connection:
-                self.heard[what if isinstance(text, bytes) else json.loads(text)["kind"]] += 1
+    async def _watch_map(self) -> None:
+        async with self._connected(f"{self._live}/map") as connection:
+            async for _ in connection:
+                self.heard["maps"] += 1
 
     async def _come_and_go(self) -> None:
         address = f"{self._live}/live"
@@ -372,9 +437,8 @@ class Crowd:
                 self._connections.discard(connection)
 
     async def _stall(self) -> None:
-        host, port = self._url.removeprefix("http://").split(":")
         while not self._ended.is_set():
-            with await asyncio.to_thread(open_client, host, int(port), 4096) as lazy:
+            with await asyncio.to_thread(open_client, *self._address, 4096) as lazy:
                 while not (_hung_up(lazy) or self._ended.is_set()):
                     await asyncio.sleep(0.2)
             self.heard["stalled clients"] += 1
@@ -382,7 +446,7 @@ class Crowd:
     def _poll(self) -> None:
         asked = ["health", "arrays", "events?limit=200", "tracks", "map", "../../metrics", "openapi.json"]
         for k in range(10**9):
-            if self._ended.wait(0.3):
+            if self._ended.wait(1.0):
                 return
             address = f"{self._url}/api/v1/{asked[k % len(asked)]}".replace("/api/v1/../..", "")
             with urllib.request.urlopen(address, timeout=30) as answer:
@@ -409,7 +473,11 @@ def resident_mb() -> float:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it: the memory at the reference, the least and most after it, and how much was done."""
+    """What came of it, and how much was done.
+
+    `reference_mb`, `least_mb`, `most_mb` and `end_mb` are of looks after the first hour while no array was away, the
+    share `resting` of all; `peak_mb` is the most of all looks.
+    """
 
     hours: float
     sounds: int
@@ -421,6 +489,8 @@ class Outcome:
     least_mb: float
     most_mb: float
     end_mb: float
+    peak_mb: float
+    resting: float
     stored: int
     faults: dict[str, int]
     clients: dict[str, int]
@@ -437,13 +507,16 @@ def soak(
     hours: float,
     reference_hours: float = 1.0,
     seed: int = 0,
-    tell: Tell = lambda hours, mb: None,
+    sample_s: float = 600.0,
+    tell: Tell = lambda sample: None,
+    *,
+    absence_first: bool = True,
 ) -> Outcome:
     """Let so many hours pass, and hold the memory against what it was after the first of them."""
     began_s = time.monotonic()
     with (
         patch("livessl.server.app.EXPIRE_S", 2.0),
-        Soak(directory, seed, tell) as world,
+        Soak(directory, seed, sample_s, tell, absence_first=absence_first) as world,
         Crowd(world.http.url) as crowd,
     ):
         begin_mb = resident_mb()
@@ -454,7 +527,8 @@ def soak(
                 break
         world.run(SLOT)  # the last sound's end
         sounds = {slot for slot in range(round(hours * HOUR) // SLOT) if sound_of(slot, SOUNDS) is not None}
-        after = [mb for at, mb in world.memory_mb if at >= reference_hours]
+        after = [sample for sample in world.memory if sample.hours >= reference_hours]
+        resting = [sample.resident_mb for sample in after if sample.at_rest]
         return Outcome(
             hours=hours,
             sounds=len(sounds),
@@ -462,10 +536,12 @@ def soak(
             unheard=len(sounds - world.slots),
             messages=dict(world.sent),
             begin_mb=round(begin_mb, 1),
-            reference_mb=round(after[0], 1),
-            least_mb=round(min(after), 1),
-            most_mb=round(max(after), 1),
-            end_mb=round(after[-1], 1),
+            reference_mb=round(resting[0], 1),
+            least_mb=round(min(resting), 1),
+            most_mb=round(max(resting), 1),
+            end_mb=round(resting[-1], 1),
+            peak_mb=round(max(sample.resident_mb for sample in world.memory), 1),
+            resting=len(resting) / len(after),
             stored=world.http._store.count(),
             faults=dict(world.faults),
             clients=dict(crowd.heard),

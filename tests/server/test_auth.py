@@ -7,22 +7,23 @@ import logging
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from livessl.clock import SystemClock
 from livessl.config import ConfigError
-from livessl.keys import Role, add_token
-from livessl.server.app import MAX_HEAD_BYTES, Server
+from livessl.keys import Role, add_token, revoke_token
+from livessl.server.app import MAX_HEAD_BYTES, REFRESH_S, Server
 from livessl.server.auth import MAX_BODY_BYTES, needed_role
-from small_site import running_server, site_of, write_site
+from small_site import running_server, site_of, wait_until, write_site
 
 TOKENED = {"server.http.tokens": "tokens.yaml"}
 ROLES: list[Role | None] = [None, *Role]
@@ -47,7 +48,13 @@ class Secured:
     def routes(self) -> set[str]:
         """All that there is, from the server's own description, with examples for what is in braces."""
         described = self.ask("/api/v1/openapi.json", Role.VIEWER).json()
-        return {path.format(event_id="small-0") for path in described["paths"]}
+        return {path.format(event_id="small-0", name="north") for path in described["paths"]}
+
+
+def listen(live: ClientConnection) -> None:
+    """Until the server closes it."""
+    while True:
+        live.recv(timeout=5)
 
 
 def raw(url: str, data: bytes, until: bytes | None = None) -> bytes:
@@ -86,16 +93,54 @@ def test_every_route_is_for_its_roles(secured: Secured, role: Role | None) -> No
         elif path in FOR_ADMINS and role < Role.ADMIN:
             assert status == 403, path
         else:
-            assert status in (200, 204, 307, 404), path
+            assert status in (200, 204, 307, 404, 405), path
 
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "TRACE", "INVENTED"])
 def test_whoever_changes_must_be_an_operator(secured: Secured, role: Role | None, method: str) -> None:
-    """No route changes anything yet: who may ask is told that, who may not is told so before."""
+    """Who may ask is told that nothing can be changed there, who may not is told so before."""
     expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 405, Role.ADMIN: 405}[role]
     assert secured.ask("/api/v1/site", role, method).status_code == expected
     assert secured.ask("/api/v1/health", role, method).status_code == expected
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_whoever_switches_an_array_must_be_an_operator(secured: Secured, role: Role | None) -> None:
+    expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 200, Role.ADMIN: 200}[role]
+    for enabled in (False, True):
+        answer = secured.ask("/api/v1/arrays/north/enabled", role, "PUT", json={"enabled": enabled})
+        assert answer.status_code == expected
+        arrays = secured.ask("/api/v1/arrays", Role.VIEWER).json()["arrays"]
+        assert arrays[0]["enabled"] is (enabled or expected != 200)
+
+
+def test_tokens_are_made_and_revoked_while_the_server_runs(tmp_path: Path) -> None:
+    """And a WebSocket that a revoked token has opened is closed, with the reason; the others stay."""
+    path = tmp_path / "tokens.yaml"
+    tokens = {Role.VIEWER: add_token(path, "wall", "viewer"), Role.ADMIN: add_token(path, "boss", "admin")}
+    with running_server(site_of(TOKENED, tmp_path)) as server:
+        secured = Secured(server, tokens)
+        with (
+            secured.live(additional_headers=secured.headers(Role.VIEWER)) as wall,
+            secured.live(additional_headers=secured.headers(Role.ADMIN)) as boss,
+        ):
+            tokens[Role.OPERATOR] = add_token(path, "desk", "operator")
+            wait_until(lambda: secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200, "the new token")
+            revoke_token(path, "wall")
+            with pytest.raises(ConnectionClosed) as caught:
+                listen(wall)
+            assert caught.value.rcvd is not None
+            assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, "the token is not valid any more")
+            assert secured.ask("/api/v1/site", Role.VIEWER).status_code == 401
+            path.chmod(0o644)  # then it is not read: who was let in stays in
+            path.touch()
+            time.sleep(2 * REFRESH_S)
+            assert secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200
+            path.unlink()
+            wait_until(lambda: secured.ask("/api/v1/site", Role.ADMIN).status_code == 401, "the end of all tokens")
+            with pytest.raises(ConnectionClosed):
+                listen(boss)
 
 
 def test_routes_that_nobody_has_thought_of_are_guarded() -> None:
@@ -186,7 +231,8 @@ def test_description_tells_of_the_token(secured: Secured) -> None:
     assert described["security"] == [{"token": []}]
     assert described["components"]["securitySchemes"] == {"token": {"type": "http", "scheme": "bearer"}}
     for path, methods in described["paths"].items():
-        assert {"401", "403"} <= set(methods["get"]["responses"]), path
+        for described in methods.values():
+            assert {"401", "403"} <= set(described["responses"]), path
 
 
 def test_admins_see_who_may_and_who_was_refused(secured: Secured) -> None:

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from conftest import require
-from livessl.keys import add_token
+from livessl.keys import RoleName, add_token
 from small_site import Changes, running_server, site_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -68,4 +68,28 @@ def test_dashboard_of_an_open_server_asks_for_nothing() -> None:
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
         expect(page.get_by_test_id("token-dialog")).to_be_hidden()
         expect(page.get_by_test_id("privacy")).to_be_hidden()
+        browser.close()
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_operators_disable_an_array_with_one_click(tmp_path: Path, role: RoleName) -> None:
+    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
+    token = add_token(tmp_path / "tokens.yaml", "desk", role)
+    with running_server(site_of(SECURED, tmp_path)) as server, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page()
+        page.goto(server.url)
+        page.get_by_role("textbox", name="Token").fill(token)
+        page.keyboard.press("Enter")
+        card, switch = page.get_by_test_id("array-north"), page.get_by_test_id("switch-north")
+        expect(card).to_be_visible()
+        if role == "viewer":
+            expect(switch).to_be_hidden()
+        else:
+            switch.click()
+            expect(card).to_have_attribute("data-state", "disabled", timeout=10_000)
+            expect(card).to_contain_text("an operator has disabled it, and its sound is not used")
+            expect(switch).to_have_text("Enable")
+            switch.click()
+            expect(card).to_have_attribute("data-state", "starting", timeout=10_000)
         browser.close()

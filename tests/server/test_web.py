@@ -37,6 +37,7 @@ PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
 ROUTES = {
     "/api/v1/site",
     "/api/v1/arrays",
+    "/api/v1/arrays/{name}/enabled",
     "/api/v1/events",
     "/api/v1/events/{event_id}",
     "/api/v1/tracks",
@@ -94,8 +95,8 @@ def test_openapi_is_complete(client: httpx.Client) -> None:
     described = client.get("/api/v1/openapi.json").json()
     assert set(described["paths"]) == ROUTES
     for path, methods in described["paths"].items():
-        assert set(methods) == {"get"}
-        assert methods["get"]["description"] or methods["get"]["summary"], path
+        assert set(methods) == {"put" if path.endswith("/enabled") else "get"}
+        assert all(method["description"] for method in methods.values()), path
     parameters = {p["name"] for p in described["paths"]["/api/v1/events"]["get"]["parameters"]}
     assert parameters == {"since", "until", "zone", "min_confidence", "limit", "cursor"}
     assert set(described["paths"]["/api/v1/map"]["get"]["responses"]) >= {"200", "204", "422"}

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from itertools import takewhile
-from operator import add
 from typing import Final
 
 import numpy as np
@@ -81,7 +79,7 @@ class AskedSound:
     """What an array that was asked heard: its frames from the event's start on, and what they and its run-up say."""
 
     frames: list[Frame]
-    onsets: OnsetGCC
+    onsets: tuple[OnsetGCC, ...]
 
 
 @dataclass(slots=True)
@@ -106,7 +104,5 @@ class Asked:
         listener = estimator.listener(frames[0].array, frames[0].sample_rate_hz)
         if listener is None:
             return None
-        onsets = [
-            listener.push(frame.samples, quiet=raster < start) for raster, frame in zip(last_ones, frames, strict=True)
-        ]
-        return AskedSound(loud, reduce(add, onsets))
+        heard = zip(last_ones, frames, strict=True)
+        return AskedSound(loud, tuple(listener.push(frame.samples, quiet=raster < start) for raster, frame in heard))

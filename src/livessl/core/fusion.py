@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
+from livessl.core.activity import THRESHOLD, band_power, dead_channels, exact_mask, runs
 from livessl.core.asking import MOST_ASKED_S, Allowance, Asked, AskedSound, better, is_sure, nearest
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
@@ -32,6 +32,7 @@ from livessl.core.types import (
     Contribution,
     Estimate,
     Event,
+    Float32Array,
     FloatArray,
     Frame,
     Mark,
@@ -72,6 +73,13 @@ RANGE_APERTURES: Final = 2.0
 delays, which the covariance cannot know, moves the place along the line of sight by metres."""
 
 
+VOTES: Final = 10
+"""Sounds that an array's agreement with the others is told of."""
+
+LEAST_VOTES: Final = 3
+"""An array is doubted that was outvoted so often, and in more than half of the last `VOTES` sounds; until it has agreed
+so often in a row."""
+
 SHARED_FRAMES: Final = 4096
 """Frames of which a fusion and its twin share what listeners made of them: some seconds of many arrays."""
 
@@ -80,6 +88,9 @@ UNHEARD_FRAMES: Final = 600
 
 _Shared = dict[tuple[str, int], OnsetGCC]
 """By array and chain of frames."""
+
+_Votes = tuple[tuple[int, float | None], ...]
+"""Of the last sounds, by the raster interval each began at: by what angle the array was off, None where it agreed."""
 
 
 class ArrayState(StrEnum):
@@ -112,6 +123,8 @@ class FusionParameters:
         The activity rule's.
     pre_roll_s, hang_over_s : float
         As the nodes use them: an event ends after a quiet hang-over.
+    sources, live_sources : int
+        How many sources, 1 or 2, are looked for in a sound that has ended, and in the windows of one that goes on.
     """
 
     deadline_s: float = 0.5
@@ -123,6 +136,8 @@ class FusionParameters:
     threshold: float = THRESHOLD
     pre_roll_s: float = 0.4
     hang_over_s: float = 0.3
+    sources: int = 2
+    live_sources: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +156,9 @@ class ArrayStatus:
     drift_ppm: float | None
     clock: ClockState | None
     counters: Mapping[str, int]
+    agreed: int = 0
+    disagreed: int = 0
+    """In how many of the last sounds that three arrays or more heard it agreed with the others, and in how many not."""
     clock_offset: ClockOffset | None = None
     corrected_frames: int = 0
 
@@ -160,6 +178,8 @@ class _Stream:
     rate_hz: float | None = None
     dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
     dead_since_ns: int = 0
+    weak: tuple[int, ...] = ()  # channels from 1, that hear next to nothing of what the others hear
+    weak_since_ns: int = 0
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
@@ -185,6 +205,13 @@ class _Stream:
         if dead and not self.dead:
             self.dead_since_ns = now_ns
         self.dead = dead
+
+    def find_weak(self, now_ns: int, samples: Float32Array) -> None:
+        """Take note of the channels that hear nothing of a sound."""
+        weak = tuple(k for k, dead in enumerate(dead_channels([samples]).tolist(), start=1) if dead)
+        if weak and not self.weak:
+            self.weak_since_ns = now_ns
+        self.weak = weak
 
     def has_active(self, raster: int) -> bool:
         frame = self.frames.get(raster)
@@ -256,10 +283,9 @@ class _Stream:
         self.unheard.clear()
         self.onsets.clear()
 
-    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
-        """All that was listened to at `rasters` together; None for nothing."""
-        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        return reduce(add, heard) if heard else None
+    def onsets_at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
+        """What was listened to at `rasters`."""
+        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
 
 
 @dataclass(slots=True)
@@ -323,6 +349,8 @@ class Fusion:
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
         self._shared: _Shared = {}
+        self._spared: Collection[str] = ()
+        self._votes: dict[str, _Votes] = dict.fromkeys(self._streams, ())
         self.askable: set[str] = set()
         """Arrays whose nodes can be asked for what they did not send."""
         self.updates_left_out = 0
@@ -334,7 +362,7 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._shared, other.askable = self._shared, self.askable
+        other._shared, other._votes, other.askable = self._shared, self._votes, self.askable
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -410,11 +438,15 @@ class Fusion:
         if array in self._streams:
             self._streams[array].left = True
 
+    def spare(self, arrays: Collection[str]) -> None:
+        """Wait for none of these arrays, from now on, and for all others again."""
+        self._spared = arrays
+
     def status(self, now_ns: int) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         clocks = self.clock_offsets
         return [
-            _status(stream, now_ns, None if clocks is None else clocks.of(name))
+            _status(stream, now_ns, self._votes[name], None if clocks is None else clocks.of(name))
             for name, stream in self._streams.items()
         ]
 
@@ -431,6 +463,7 @@ class Fusion:
         }
         self._reached.clear()
         self._shared.clear()
+        self._votes.update(dict.fromkeys(self._votes, ()))
         self._next, self._heard_until = None, -(2**63)
         return outputs
 
@@ -484,6 +517,8 @@ class Fusion:
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
+            if frame.active:
+                stream.find_weak(self._now_ns, frame.samples)
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -527,7 +562,7 @@ class Fusion:
         return True
 
     def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
-        if stream.watermark is None or stream.heard_ns is None or stream.left:
+        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
             return False
         return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
@@ -583,11 +618,11 @@ class Fusion:
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds = _Sounds()
+        sounds = _Sounds(self._parameters.live_sources)
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
-            if pieces:
+            if pieces and not _doubts(self._votes[name]):
                 sounds.pieces[name] = pieces
                 sounds.onsets[name] = stream.onsets_at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
@@ -598,10 +633,11 @@ class Fusion:
         estimate = _estimate(found, middle_ns, sounds)
         status, _ = self._judge(estimate, found)
         loudest = max(float(power.max()) for power in powers.values())
-        contributions = self._contributions(powers, estimate)
+        contributions = self._contributions(powers, estimate, found)
         complete_ns = window.stop * FRAME_NS
-        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
-        trusted = [] if status is Status.REFUSED else [estimate]
+        others = self._others(found, middle_ns, sounds)
+        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns, others)
+        trusted = [*([] if status is Status.REFUSED else [estimate]), *others]
         tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
@@ -639,15 +675,18 @@ class Fusion:
         heard = event.heard = self._heard(event)
         if not heard.sounds:
             return []
-        answer = self._answer(event, heard)
-        if answer.status is Status.LOCATED and answer.estimate is not None and event.became_quiet:
-            self._learn_clocks(answer.end_ns, answer.estimate, self._span(event))
-        return [answer]
+        answers, found = self._answer(event, heard)
+        first = answers[0]
+        if first.status is Status.LOCATED and first.estimate is not None and event.became_quiet and len(answers) == 1:
+            self._learn_clocks(first.end_ns, first.estimate, self._span(event))
+        if first.status is not Status.REFUSED and found is not None:
+            self._count_votes(event.start, found, heard.sounds)
+        return [*answers]
 
     def _heard(self, event: _OpenEvent) -> _Heard:
         parameters = self._parameters
         span = self._span(event)
-        heard = _Heard()
+        heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)}))
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -670,19 +709,28 @@ class Fusion:
             heard.end_ns = max(heard.end_ns, (rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
         return heard
 
-    def _answer(self, event: _OpenEvent, heard: _Heard, asked: Mapping[str, AskedSound] | None = None) -> Event:
-        """What the arrays that heard a sound say of it together with some that were asked."""
+    def _answer(
+        self, event: _OpenEvent, heard: _Heard, asked: Mapping[str, AskedSound] | None = None
+    ) -> tuple[list[Event], Localization | None]:
+        """What the arrays that heard a sound say of it together with some that were asked, of each source one event."""
         sounds, powers = heard.with_asked(asked or {})
+        middle_ns = (heard.start_ns + heard.end_ns) // 2
+        found: Localization | None = None
         estimate: Estimate | None = None
         status = Status.REFUSED
+        contributions: tuple[Contribution, ...] = ()
+        others: tuple[Estimate, ...] = ()
         reason: str | None = f"heard by {len(sounds)} of at least {self._parameters.min_arrays} arrays"
         if len(sounds) >= self._parameters.min_arrays:
             found = self._estimator.locate(sounds)
-            estimate = _estimate(found, (heard.start_ns + heard.end_ns) // 2, sounds)
+            estimate = _estimate(found, middle_ns, sounds)
             status, reason = self._judge(estimate, found)
+            others = self._others(found, middle_ns, sounds)
             if status is Status.REFUSED:
                 estimate = None
-        return Event(
+            else:
+                contributions = self._contributions(powers, estimate, found, asked or {})
+        first = Event(
             id=self._id(event.start),
             start_ns=heard.start_ns,
             end_ns=heard.end_ns,
@@ -691,12 +739,35 @@ class Fusion:
             estimate=estimate,
             power=max(float(power.max()) for power in heard.powers.values()),
             method=self._estimator.name,
-            contributions=() if estimate is None else self._contributions(powers, estimate, asked or {}),
+            contributions=contributions,
             heard_by=tuple(heard.sounds),
             late_frames=event.late_frames,
             latency_s=(self._now_ns - heard.end_ns) / 1e9,
             complete_ns=(event.closed + 1) * FRAME_NS,
         )
+        if found is None:
+            return [first], None
+        return [
+            first,
+            *(
+                replace(
+                    first,
+                    id=f"{first.id}-{source}",
+                    source=source,
+                    status=Status.LOCATED,
+                    reason=None,
+                    estimate=other,  # of how loud each was nobody can tell
+                    contributions=self._contributions(powers, other, found, asked or {}),
+                )
+                for source, other in enumerate(others, 2)
+            ),
+        ], found
+
+    def _others(self, found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> tuple[Estimate, ...]:
+        """Further sources of the same sound: those that are places."""
+        estimates = (_estimate(other, time_ns, sounds) for other in found.others)
+        places = zip(estimates, found.others, strict=True)
+        return tuple(estimate for estimate, other in places if self._judge(estimate, other)[0] is Status.LOCATED)
 
     def _end(self, event: _OpenEvent) -> list[Output]:
         """The sound is over: tell of it, unless somebody is to be asked first."""
@@ -744,17 +815,19 @@ class Fusion:
 
     def _reconsidered(self, event: _OpenEvent, told: list[Output]) -> list[Output]:
         """The answer with those that were asked, where it is better with all or one of them."""
-        best = next((output for output in told if isinstance(output, Event)), None)
-        if best is None or event.heard is None:
+        best: list[Event] = [output for output in told if isinstance(output, Event)]
+        if not best or event.heard is None:
             return told
         sounds = {name: asked.sound(self._estimator, event.start) for name, asked in event.asked.items()}
         some = {name: sound for name, sound in sounds.items() if sound is not None}
         tries = [some, *({name: some[name]} for name in some if len(some) > 1)] if some else []
         for each in tries:
-            answer = self._answer(event, event.heard, each)
-            if better(answer, best):
-                best = answer
-        return [best]
+            answers, found = self._answer(event, event.heard, each)
+            if better(answers[0], best[0]):
+                best = answers
+                if answers[0].status is not Status.REFUSED and found is not None:
+                    self._count_votes(event.start, found, event.heard.sounds)
+        return [*best]
 
     def _learn_clocks(self, time_ns: int, estimate: Estimate, span: range) -> None:
         clocks = self.clock_offsets
@@ -765,22 +838,27 @@ class Fusion:
         clocks.hear(time_ns, estimate.position_m, whole)
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
-        """Whether the estimate is a place, only a direction, or neither, and why."""
-        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
-        specs = [self._streams[name].spec for name in estimate.arrays]
-        nearest_m = min(_distance_m(spec, estimate) for spec in specs)
-        alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
-        if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return (Status.LOCATED, None) if found.refused is None else (Status.REFUSED, found.refused)
-        if found.signs is not None and not found.signs.tell_direction:
-            return Status.REFUSED, "nothing that was heard came from any one direction"
-        who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
-        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+        return judged(found, [self._streams[name].spec for name in estimate.arrays])
+
+    def _count_votes(self, start: int, found: Localization, sounds: Iterable[str]) -> None:
+        """Remember who agreed. Replaced, never changed, for other threads read it."""
+        if found.outvoted is None or len(found.evidence) < LEAST_VOTES:
+            return
+        for name in sounds:
+            before = [vote for vote in self._votes[name] if vote[0] != start]
+            self._votes[name] = (*before, (start, found.outvoted.get(name)))[-VOTES:]
 
     def _contributions(
-        self, powers: Mapping[str, FloatArray], estimate: Estimate, asked: Collection[str] = ()
+        self,
+        powers: Mapping[str, FloatArray],
+        estimate: Estimate,
+        found: Localization,
+        asked: Collection[str] = (),
     ) -> tuple[Contribution, ...]:
-        return tuple(_contribution(self._streams[name].spec, powers[name], estimate, name in asked) for name in powers)
+        return tuple(
+            _contribution(self._streams[name].spec, powers[name], estimate, found, asked=name in asked)
+            for name in powers
+        )
 
     def _id(self, raster: int) -> str:
         return f"{self._site}-{raster * FRAME_NS // 1_000_000}"
@@ -796,17 +874,46 @@ class Fusion:
                 del stream.onsets[first]
 
 
+def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
+    """Whether what was found is a place, only a direction, or neither, and why.
+
+    Parameters
+    ----------
+    found : Localization
+    specs : sequence of ArraySpec
+        The arrays that it was found by.
+    """
+    spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
+    nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
+    alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
+    if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
+        return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
+    if found.signs is not None and not found.signs.tell_direction:
+        return Status.REFUSED, "nothing that was heard came from any one direction"
+    who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
+    return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+
+
 class _Sounds(Mapping[str, Sound]):
     """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, sources: int, doubted: Collection[str] = ()) -> None:
+        self.doubted = doubted
+        self.sources = sources
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
-        self.onsets: dict[str, OnsetGCC | None] = {}
+        self.onsets: dict[str, tuple[OnsetGCC, ...]] = {}
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
         segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
+        onsets = self.onsets[array]
+        return Sound(
+            segments,
+            pieces[0][0].sample_rate_hz,
+            reduce(add, onsets) if onsets else None,
+            array in self.doubted,
+            onsets if self.sources > 1 else (),
+        )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)
@@ -819,14 +926,14 @@ class _Sounds(Mapping[str, Sound]):
 class _Heard:
     """What the arrays heard of one event: their sounds, the powers of the frames in them, from when to when."""
 
-    sounds: _Sounds = field(default_factory=_Sounds)
+    sounds: _Sounds
     powers: dict[str, FloatArray] = field(default_factory=dict)
     start_ns: int = 2**63 - 1
     end_ns: int = -(2**63)
 
     def with_asked(self, asked: Mapping[str, AskedSound]) -> tuple[_Sounds, dict[str, FloatArray]]:
         """These sounds and powers, and those of arrays that were asked."""
-        sounds, powers = _Sounds(), dict(self.powers)
+        sounds, powers = _Sounds(self.sounds.sources, self.sounds.doubted), dict(self.powers)
         sounds.pieces |= self.sounds.pieces
         sounds.onsets |= self.sounds.onsets
         for name, sound in asked.items():
@@ -836,17 +943,41 @@ class _Heard:
 
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
-    return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, tuple(sounds))
+    arrays = tuple(name for name in sounds if name not in (found.outvoted or ()))
+    return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
-def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
+def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:
     """How far an array is from the place, or half its width: inside a wide one, its centre is nothing to look from."""
-    return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
+    return max(direction_deg(spec.centre_m, position_m)[2], spec.aperture_m / 2.0)
 
 
-def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate, asked: bool) -> Contribution:
+def _contribution(
+    spec: ArraySpec, power: FloatArray, estimate: Estimate, found: Localization, *, asked: bool
+) -> Contribution:
     azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
-    return Contribution(spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, asked)
+    agrees: bool | None = None
+    if found.outvoted is not None and len(found.evidence) > 1:
+        agrees = spec.name not in found.outvoted
+    off_deg = (found.outvoted or {}).get(spec.name)
+    return Contribution(
+        spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, agrees, off_deg, asked
+    )
+
+
+def _dissent(found: Localization) -> str | None:
+    """Who was outvoted, in words."""
+    if not found.outvoted:
+        return None
+    each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outvoted.items()))
+    return f"located without {each}: outvoted by the others"
+
+
+def _doubts(votes: _Votes) -> bool:
+    """Whether an array is to be doubted: see `LEAST_VOTES`."""
+    off = [vote for vote in votes if vote[1] is not None]
+    lately = any(vote[1] is not None for vote in votes[-LEAST_VOTES:])
+    return len(off) >= LEAST_VOTES and 2 * len(off) > len(votes) and lately
 
 
 def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
@@ -864,10 +995,10 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
         stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
-def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArrayStatus:
+def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | None) -> ArrayStatus:
     mark = stream.mark
     age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
-    state, reason = _state(stream, age_ns, now_ns)
+    state, reason = _state(stream, age_ns, now_ns, votes)
     if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
         state, reason = ArrayState.DEGRADED, clock_is_off(offset)
     return ArrayStatus(
@@ -883,6 +1014,8 @@ def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArraySt
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,
         counters=dict(stream.counters),
+        agreed=sum(off_deg is None for _, off_deg in votes),
+        disagreed=sum(off_deg is not None for _, off_deg in votes),
         clock_offset=offset,
         corrected_frames=stream.ahead,
     )
@@ -896,7 +1029,7 @@ def _channel_power(stream: _Stream) -> tuple[float, ...]:
     return stream.mark.channel_power if stream.mark else ()
 
 
-def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState, str | None]:
+def _state(stream: _Stream, age_ns: int | None, now_ns: int, votes: _Votes) -> tuple[ArrayState, str | None]:
     troubled = stream.trouble_ns is not None and now_ns - stream.trouble_ns < TROUBLE_NS
     if age_ns is None:
         return (ArrayState.DEGRADED, stream.trouble) if troubled else (ArrayState.STARTING, "not heard from yet")
@@ -909,6 +1042,13 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
         every = len(stream.dead) == len(stream.spec.microphones_m)
         which = "all channels are" if every else f"microphone {list(stream.dead)} is"
         return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
+    if stream.weak and now_ns - stream.weak_since_ns >= SILENT_NS:
+        which = f"microphone {list(stream.weak)} hears nothing of what the others hear, and is left out"
+        return ArrayState.DEGRADED, f"{which}; check cable, gain and channel numbers"
     if troubled:
         return ArrayState.DEGRADED, stream.trouble
+    if _doubts(votes):
+        off_deg = [off for _, off in votes if off is not None]
+        told = f"{len(off_deg)} of the last {len(votes)} sounds, by {np.median(off_deg):.0f}°"
+        return ArrayState.DEGRADED, f"disagrees with the others in {told}: is its pose right, and its channels' order?"
     return ArrayState.HEALTHY, None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -74,6 +74,7 @@ class Settling:
 
     def __init__(self, fusion: Fusion, arrays: Iterable[str], settled: int | None = None) -> None:
         self.live = fusion
+        self._spared: Collection[str] = ()
         self._sources = {name: _Source() for name in arrays}
         self.duplicates = dict.fromkeys(self._sources, 0)
         self.backfilled = dict.fromkeys(self._sources, 0)
@@ -116,6 +117,11 @@ class Settling:
         self.live.askable.discard(array)
         if array in self._sources:
             self._sources[array].left = True
+
+    def spare(self, arrays: Collection[str]) -> None:
+        """Wait for none of these arrays, from now on, and for all others again."""
+        self._spared = arrays
+        self.live.spare(arrays)
 
     def status(self, now_ns: int) -> list[ArrayStatus]:
         """How every array is doing."""
@@ -224,7 +230,9 @@ class Settling:
                 break
             excess -= size
             self._held.popleft()
-        awaited = {name: source for name, source in self._sources.items() if not source.left}
+        awaited = {
+            name: source for name, source in self._sources.items() if not source.left and name not in self._spared
+        }
         known_until = {name: source.known_until - self._ahead(name) for name, source in awaited.items()}
         there = [known_until[name] for name, source in awaited.items() if source.is_there(now_ns)]
         away = [known_until[name] for name, source in awaited.items() if not source.is_there(now_ns)]

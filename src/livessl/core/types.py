@@ -306,6 +306,11 @@ class Contribution:
         Its in-band mean power over that time, full scale squared.
     azimuth_deg, elevation_deg, distance_m : float
         Direction and distance from the array's centre to the position found; azimuth counter-clockwise from +x.
+    agrees : bool or None
+        Whether it agrees with the others; one that does not was outvoted, and has no part in the position. None where
+        nobody can tell: it was alone, or the estimator does not ask.
+    off_deg : float or None
+        By what angle it heard the sound elsewhere, where it does not agree.
     asked : bool
         It had not found the sound active by itself, and was asked for what it had.
     """
@@ -316,6 +321,8 @@ class Contribution:
     azimuth_deg: float
     elevation_deg: float
     distance_m: float
+    agrees: bool | None = None
+    off_deg: float | None = None
     asked: bool = False
 
 
@@ -329,6 +336,8 @@ class Update:
     power: float
     contributions: tuple[Contribution, ...] = ()
     complete_ns: int = 0
+    others: tuple[Estimate, ...] = ()
+    """Further sources that sound at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,6 +372,8 @@ class Event:
         Whether sound took part in it that came after its windows had closed.
     complete_ns : int
         Site time at which all had happened that the answer waits for: the sound, and the quiet that ends it.
+    source : int
+        1; or 2 for the second of two sources that sounded at the same time, of which each has an event.
     """
 
     id: str
@@ -379,6 +390,7 @@ class Event:
     latency_s: float = 0.0
     late: bool = False
     complete_ns: int = 0
+    source: int = 1
 
     @property
     def duration_s(self) -> float:

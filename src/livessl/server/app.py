@@ -18,8 +18,9 @@ from websockets.exceptions import InvalidState
 
 from livessl.clock import Clock
 from livessl.config import ConfigError, Fault, HttpConfig, Site, open_doors
-from livessl.keys import read_tokens
+from livessl.keys import file_stamp, read_tokens
 from livessl.messages import JsonObject
+from livessl.server.auth import Access
 from livessl.server.engine import Engine
 from livessl.server.hub import Hub
 from livessl.server.receiver import BindError
@@ -44,6 +45,9 @@ CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
 
 MAX_UNREAD_BYTES: Final = 131_072
 """What the system keeps for a client that does not read; left to itself it would be megabytes for each."""
+
+REFRESH_S: Final = 1.0
+"""How often the file of tokens is looked at."""
 
 EXPIRE_S: Final = 600.0
 """How often events are looked through for those that have been kept long enough."""
@@ -99,7 +103,9 @@ class Server:
         if method is not None:
             site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
         http = site.server.http
-        tokens = None if http.tokens is None else read_tokens(site.file(http.tokens))
+        self._tokens_file = None if http.tokens is None else site.file(http.tokens)
+        self._tokens_seen = None if self._tokens_file is None else file_stamp(self._tokens_file)
+        self._access = Access(None if self._tokens_file is None else read_tokens(self._tokens_file))
         certificate = _certificate(site)
         self._on_event = on_event
         self._clock = clock
@@ -115,7 +121,7 @@ class Server:
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish)
             undo.pop_all()
-        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, tokens)
+        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, self._access)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -154,7 +160,7 @@ class Server:
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
         self.engine.start()
-        tasks = [asyncio.create_task(self._watch()), asyncio.create_task(self._expire())]
+        tasks = [asyncio.create_task(work) for work in (self._watch(), self._expire(), self._refresh())]
         try:
             await self._uvicorn.serve(sockets=[self._http])
         finally:
@@ -168,6 +174,20 @@ class Server:
         while self.engine.failure is None:
             await asyncio.sleep(0.2)
         self.stop()
+
+    async def _refresh(self) -> None:
+        """Take over the file of tokens when it has changed; one that cannot be used changes nothing, and is told."""
+        while (path := self._tokens_file) is not None:
+            await asyncio.sleep(REFRESH_S)
+            stamp = await asyncio.to_thread(file_stamp, path)
+            if stamp == self._tokens_seen:
+                continue
+            self._tokens_seen = stamp
+            try:
+                self._access.replace(await asyncio.to_thread(read_tokens, path, missing_ok=True))
+                _log.info("%s has changed: %d tokens are in force", path, len(self._access.clients))
+            except ConfigError as error:
+                _log.error("%s; the tokens of before stay in force", error)
 
     async def _expire(self) -> None:
         """Forget events that are older than they may become."""

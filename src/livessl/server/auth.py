@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Final
 
 from starlette.datastructures import Headers
@@ -26,27 +29,77 @@ ACCESS: Final = "/api/v1/access"
 ANYONE: Final = Client("anyone", Role.ADMIN)
 """Where a site has no tokens: it then listens on this machine only."""
 
+SAY_S: Final = 1.0
+"""How long a client whose token is revoked has to take the reason."""
+
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+class Access:
+    """The tokens in force, and the WebSockets that were opened with them. All calls on the event loop's thread.
+
+    Parameters
+    ----------
+    tokens : Tokens or None
+        None lets everyone do everything.
+    """
+
+    def __init__(self, tokens: Tokens | None) -> None:
+        self._tokens = tokens
+        self._open: dict[asyncio.Event, tuple[str, Client]] = {}
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a token is needed."""
+        return self._tokens is not None
+
+    @property
+    def clients(self) -> tuple[Client, ...]:
+        """Everyone who has a token."""
+        return () if self._tokens is None else self._tokens.clients
+
+    def client(self, token: str | None) -> Client | None:
+        """Whom a request comes from."""
+        if self._tokens is None:
+            return ANYONE
+        return None if token is None else self._tokens.client(token)
+
+    def replace(self, tokens: Tokens) -> None:
+        """Other tokens are in force from now on; WebSockets of those that are not any more end."""
+        self._tokens = tokens
+        for revoked, (token, client) in self._open.items():
+            if tokens.client(token) != client:
+                revoked.set()
+
+    @contextmanager
+    def held(self, token: str, client: Client) -> Iterator[asyncio.Event]:
+        """While a WebSocket is open: what is set when its token is revoked, or has another role."""
+        revoked = asyncio.Event()
+        self._open[revoked] = token, client
+        try:
+            yield revoked
+        finally:
+            del self._open[revoked]
 
 
 class Gate:
     """Lets a request through, or answers it.
 
-    What the application may want to know of its client is in the scope, under `client_role`.
+    What the application may want to know of its client is in the scope, under `client_role` and `client_name`.
 
     Parameters
     ----------
     app : ASGIApp
         What it guards.
-    tokens : Tokens or None
-        None lets everyone do everything.
+    access : Access
+        Who may.
     refusals : Refusals
         Told of everyone who is turned away.
     """
 
-    def __init__(self, app: ASGIApp, tokens: Tokens | None, refusals: Refusals) -> None:
+    def __init__(self, app: ASGIApp, access: Access, refusals: Refusals) -> None:
         self._app = app
-        self._tokens = tokens
+        self._access = access
         self._refusals = refusals
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -54,7 +107,8 @@ class Gate:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        client = self._client(scope)
+        token = _token(scope)
+        client = self._access.client(token)
         refusal = _refusal(scope, client)
         if refusal is not None:
             status, reason = refusal
@@ -66,13 +120,36 @@ class Gate:
             await JSONResponse({"detail": reason}, status, headers)(scope, receive, send)
             return
         scope["client_role"] = None if client is None else client.role
-        await self._app(scope, receive, _choosing_protocol(scope, send))
+        scope["client_name"] = None if client is None else client.name
+        if scope["type"] == "websocket" and client is not None and token is not None:
+            with self._access.held(token, client) as revoked:
+                await self._app(scope, _until(revoked, receive), _choosing_protocol(scope, send))
+                if revoked.is_set():
+                    await _say_why(send)
+        else:
+            await self._app(scope, receive, _choosing_protocol(scope, send))
 
-    def _client(self, scope: Scope) -> Client | None:
-        if self._tokens is None:
-            return ANYONE
-        token = _token(scope)
-        return None if token is None else self._tokens.client(token)
+
+async def _say_why(send: Send) -> None:
+    """To a client that reads; one that does not is cut all the same."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(SAY_S):
+            await send({"type": "websocket.close", "code": 1008, "reason": "the token is not valid any more"})
+
+
+def _until(revoked: asyncio.Event, receive: Receive) -> Receive:
+    """As what the client says; but once its token is revoked, it has left."""
+
+    async def receive_or_leave() -> Message:
+        said, ended = asyncio.ensure_future(receive()), asyncio.ensure_future(revoked.wait())
+        try:
+            await asyncio.wait((said, ended), return_when=asyncio.FIRST_COMPLETED)
+            return {"type": "websocket.disconnect", "code": 1008} if ended.done() else said.result()
+        finally:
+            said.cancel()
+            ended.cancel()
+
+    return receive_or_leave
 
 
 def needed_role(method: str, path: str) -> Role | None:

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from livessl import wire
@@ -15,7 +15,7 @@ from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, Ask, Event, Message, Output, Track, TrackState, Update
+from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -46,6 +46,9 @@ MAX_UNSAVED: Final = 10_000
 
 REPLAY_SILENT_NS: Final = 5_000_000_000
 """A replay that sends nothing for so long is over, unless its node still says that it is there."""
+
+DISABLED: Final = "disabled"
+"""The state of an array that an operator has disabled, however it is doing."""
 
 _ANSWER: Final = ("time_utc", "duration_s", "position_m", "covariance_m2", "confidence", "arrays", "status")
 """Where these are the same, an event is no news."""
@@ -103,6 +106,8 @@ class Engine:
         self.unkept = 0
         self.unsaved = 0
         """Events that wait for the store to take them."""
+        self._disabled = store.disabled(site.site)  # replaced, never changed: other threads read it
+        self._switching = threading.Lock()
         self.maps = Maps(clock)
         self.latency = Latency()
         _warm_up()
@@ -176,6 +181,21 @@ class Engine:
         """How every array is doing; from any thread, and without waiting for a localization that is going on."""
         return [self._array(status) for status in self._settling.status(self.now_ns())]
 
+    def enable(self, array: str, enabled: bool) -> None:
+        """Use an array's sound from now on, or do not; from any thread.
+
+        A disabled array is heard as ever, its sound acknowledged and its levels shown, but no event is made of it and
+        nobody waits for it. The store remembers it.
+
+        Raises
+        ------
+        StoreError
+            Where the store does not take it; all stays as it was.
+        """
+        with self._switching:
+            self._store.enable(self._site.site, array, enabled)
+            self._disabled = self._disabled - {array} if enabled else self._disabled | {array}
+
     def tracks(self) -> list[JsonObject]:
         """The tracks that live now."""
         return list(self._tracks.values())
@@ -198,6 +218,11 @@ class Engine:
         if described["state"] == ArrayState.LOST and ingest.is_live(status.name, self._clock.monotonic_ns()):
             described["state"] = str(ArrayState.QUIET)
             described["reason"] = problem or "its node is there, but no sound comes from its device"
+        described["enabled"] = status.name not in self._disabled
+        if not described["enabled"]:
+            otherwise = f"{described['state']}: {described['reason']}" if described["reason"] else described["state"]
+            described["reason"] = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
+            described["state"] = DISABLED
         return described
 
     def _begin_live(self) -> None:
@@ -233,7 +258,7 @@ class Engine:
                 batch = []
                 self._meet(item)
             else:
-                batch.append(item)
+                batch.append(self._used(item))
         self._step(batch)
         now_ns = self._clock.monotonic_ns()
         if batch:
@@ -248,6 +273,12 @@ class Engine:
         if now_ns - self._watch_ns >= WATCH_NS:
             self._watch_ns = now_ns
             self._watch_arrays(now_ns)
+
+    def _used(self, message: Message) -> Message:
+        """The message as the fusion shall have it: nothing in a disabled array's sound is active."""
+        if message.array in self._disabled and isinstance(message, Frame) and message.active:
+            return replace(message, active=False)
+        return message
 
     def _meet(self, item: Joined | Greeted | Left) -> None:
         if isinstance(item, Left):
@@ -309,6 +340,7 @@ class Engine:
         if self._replay_now_ns is not None and batch:
             newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
+        self._settling.spare(self._disabled)
         self._tell(self._settling.step(batch, self.now_ns()))
         if not self._unsaved:
             self._receiver.ingest.settled = self._settling.settled_of
@@ -429,11 +461,13 @@ def _warm_up() -> None:
 
 
 def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:
-    """The event that shares some of its time with an old one."""
+    """The event that shares some of its time with an old one; of two sources of one sound, the one of its number."""
     begin_ns = utc_ns(old["time_utc"])
     end_ns = begin_ns + old["duration_s"] * 1e9
+    sharing = []
     for event in events:
         start_ns = utc_ns(event["time_utc"])
         if start_ns < end_ns and begin_ns < start_ns + event["duration_s"] * 1e9:
-            return event
-    return None
+            sharing.append(event)
+    same = (event for event in sharing if event["source"] == old.get("source", 1))
+    return next(same, sharing[0] if sharing else None)

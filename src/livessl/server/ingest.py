@@ -209,7 +209,7 @@ class Ingest:
         offer = wire.Request(hello.run_id) if unaware else None
         peer = Peer(routing_id, hello, now_ns)
         if same_run is not None:
-            moved = same_run.routing_id != routing_id or hello.backlog.keys() - same_run.hello.backlog.keys()
+            moved = same_run.routing_id != routing_id or hello.backlog.items() - same_run.hello.backlog.items()
             peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
             peer.received, peer.live = same_run.received, same_run.live
         peer.greet(hello)

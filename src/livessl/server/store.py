@@ -89,6 +89,7 @@ class Store:
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
                 db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
+                db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
                 db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
             if path is not None:
                 self._reading = _Connection(f"{path.resolve().as_uri()}?mode=ro")
@@ -147,6 +148,27 @@ class Store:
             return None, None
         raster, clocks = rows[0]
         return int(raster), None if clocks is None else json.loads(clocks)
+
+    def disabled(self, site: str) -> frozenset[str]:
+        """The arrays of the site that are not to be used."""
+        rows = self._reading.rows("SELECT array FROM disabled WHERE site = ?", (site,))
+        return frozenset(array for (array,) in rows)
+
+    def enable(self, site: str, array: str, enabled: bool) -> None:
+        """Remember whether an array is to be used.
+
+        Raises
+        ------
+        StoreError
+            Where the file is locked, or its disk is full.
+        """
+        sql = (
+            "DELETE FROM disabled WHERE site = ? AND array = ?"
+            if enabled
+            else "INSERT OR IGNORE INTO disabled VALUES (?, ?)"
+        )
+        with self._kept(f"that array {array!r} is {'enabled' if enabled else 'disabled'} was") as db:
+            db.execute(sql, (site, array))
 
     def provisional(self, raster: int) -> list[JsonObject]:
         """Events before a raster interval that may still be replaced.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -14,22 +15,22 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
+from pydantic import BaseModel, ConfigDict
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site, is_loopback
 from livessl.core.types import FRAME_S
-from livessl.keys import Tokens
 from livessl.messages import API_VERSION, JsonObject
-from livessl.server.auth import HEALTH, Gate
+from livessl.server.auth import HEALTH, Access, Gate
 from livessl.server.engine import Engine
 from livessl.server.hub import Filter, Hub, Subscription, Told
 from livessl.server.latency import Latency
 from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
 from livessl.server.png import map_png
 from livessl.server.sinks import Sinks
-from livessl.server.store import Cursor, Store
+from livessl.server.store import Cursor, Store, StoreError
 from livessl.server.store import Query as EventQuery
 
 STATIC: Final = Path(__file__).parent / "static"
@@ -46,11 +47,13 @@ _REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
     403: {"description": "a token of a lesser role"},
 }
 
+_log = logging.getLogger(__name__)
+
 _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
 
 
 def create_app(
-    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, tokens: Tokens | None = None
+    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, access: Access
 ) -> FastAPI:
     """The application around a running engine, open to anyone or to those who have a token."""
     app = FastAPI(
@@ -60,11 +63,11 @@ def create_app(
         docs_url=None,  # its page would load scripts from elsewhere
         redoc_url=None,
         openapi_url="/api/v1/openapi.json",
-        responses={} if tokens is None else _REFUSALS,
+        responses=_REFUSALS if access.wanted else {},
     )
 
-    app.add_middleware(Gate, tokens=tokens, refusals=engine.refusals)
-    if tokens is None and is_loopback(site.server.http.host):
+    app.add_middleware(Gate, access=access, refusals=engine.refusals)
+    if not access.wanted and is_loopback(site.server.http.host):
         # else a page from anywhere could have its own name point here, and read as if it were ours
         app.add_middleware(
             TrustedHostMiddleware,
@@ -80,7 +83,8 @@ def create_app(
         return response
 
     _add_state_routes(app, site, engine, hub, store, sinks)
-    _add_access_route(app, engine, tokens)
+    _add_switch_route(app, site, engine)
+    _add_access_route(app, engine, access)
     _add_event_routes(app, site, store)
     _add_map_route(app, site, engine)
     _add_live_route(app, site, clock, engine, hub)
@@ -90,7 +94,7 @@ def create_app(
         return FileResponse(STATIC / "index.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    if tokens is not None:
+    if access.wanted:
         _tell_of_tokens(app.openapi())
     return app
 
@@ -156,7 +160,7 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         """Whether the server works (503 where it does not) and how the arrays are; without a token the status only."""
         arrays = engine.arrays()
         reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
-        states = {a["state"] for a in arrays}
+        states = {a["state"] for a in arrays if a["enabled"]}  # what is disabled is so on purpose
         status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
         if engine.unkept:
             reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
@@ -196,13 +200,40 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
         return PlainTextResponse(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
-def _add_access_route(app: FastAPI, engine: Engine, tokens: Tokens | None) -> None:
+class Switch(BaseModel):
+    """Whether an array's sound is to be used."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    enabled: bool
+
+
+def _add_switch_route(app: FastAPI, site: Site, engine: Engine) -> None:
+    @app.put(
+        "/api/v1/arrays/{name}/enabled",
+        tags=["state"],
+        responses={404: {"description": "no such array"}, 503: {"description": "the event database takes nothing"}},
+    )
+    def put_enabled(name: str, switch: Switch, request: Request) -> JsonObject:
+        """Disable an array that does harm, or enable it again; for operators."""
+        if name not in _names(site):
+            raise HTTPException(404, f"no array {name!r}; there are {', '.join(_names(site))}")
+        try:
+            engine.enable(name, switch.enabled)
+        except StoreError as error:
+            raise HTTPException(503, str(error)) from error
+        done = "enabled" if switch.enabled else "disabled"
+        _log.info("%r has %s array %r", request.scope["client_name"], done, name)
+        return {"v": API_VERSION, "name": name, "enabled": switch.enabled}
+
+
+def _add_access_route(app: FastAPI, engine: Engine, access: Access) -> None:
     @app.get("/api/v1/access", tags=["state"])
     def get_access() -> JsonObject:
         """Who may ask, which nodes are enrolled, and who was refused; for admins."""
         return {
             "v": API_VERSION,
-            "clients": [{"name": c.name, "role": str(c.role)} for c in (tokens.clients if tokens else ())],
+            "clients": [{"name": c.name, "role": str(c.role)} for c in access.clients],
             "nodes": engine.enrolled,
             "refused": [
                 {"door": r.door, "who": r.who, "reason": r.reason, "count": r.count, "last_utc": utc_text(r.last_ns)}
@@ -261,9 +292,13 @@ def _cursor(text: str | None) -> Cursor | None:
         raise _unprocessable("cursor", f"cursor: {error}") from error
 
 
+def _names(site: Site) -> list[str]:
+    return [spec.name for spec in site.processed]
+
+
 def _mapped(site: Site) -> list[str]:
     """Names that a map may be asked of."""
-    return [FUSED, *(spec.name for spec in site.processed)]
+    return [FUSED, *_names(site)]
 
 
 def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
@@ -338,6 +373,7 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
             "site": site.site,
             "mode": engine.mode,
             "last_seq": hub.last_seq,
+            "role": str(socket.scope["client_role"]),
             "arrays": arrays,
         }
         try:
@@ -490,7 +526,13 @@ class _Metrics(Collector):
         yield refused
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
+        enabled = GaugeMetricFamily("livessl_array_enabled", "1 unless an operator has disabled it.", labels=["array"])
         level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])
+        agreement = GaugeMetricFamily(
+            "livessl_array_sounds",
+            "Of the last ten sounds that three arrays or more heard, in how many it agreed with the others, or not.",
+            labels=["array", "verdict"],
+        )
         off = GaugeMetricFamily(
             "livessl_array_clock_offset_seconds",
             "How far ahead of the reference its clock is, by the sounds heard.",
@@ -502,13 +544,16 @@ class _Metrics(Collector):
         counts = CounterMetricFamily("livessl_array", "Counts of an array.", labels=["array", "what"])
         for array in self._engine.arrays():
             up.add_metric([array["name"]], float(array["state"] == "healthy"))
+            enabled.add_metric([array["name"]], float(array["enabled"]))
             if array["age_s"] is not None:
                 age.add_metric([array["name"]], array["age_s"])
             if array["level_dbfs"] is not None:
                 level.add_metric([array["name"]], array["level_dbfs"])
+            for verdict, count in array["agreement"].items():
+                agreement.add_metric([array["name"], verdict], count)
             if (clock := array["clock_offset"]) is not None:
                 off.add_metric([array["name"], clock["reference"]], clock["offset_s"])
                 unsure.add_metric([array["name"], clock["reference"]], clock["std_s"])
             for what, count in array["counters"].items():
                 counts.add_metric([array["name"], what], count)
-        yield from (up, age, level, off, unsure, counts)
+        yield from (up, enabled, age, level, agreement, off, unsure, counts)

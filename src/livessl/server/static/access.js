@@ -22,10 +22,16 @@ export function protocols() {
 }
 
 /** Fetch, with the token if there is one. */
-export async function get(url) {
+export const get = (url) => ask(url, {});
+
+/** Change what is there, with the token if there is one. */
+export const put = (url, value) =>
+  ask(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+
+async function ask(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(KEY);
-  const headers = token === null ? {} : { Authorization: `Bearer ${token}` };
-  const response = await fetch(url, { cache: "no-store", headers, signal: AbortSignal.timeout(TIMEOUT_MS) });
+  const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
+  const response = await fetch(url, { ...options, cache: "no-store", headers, signal: AbortSignal.timeout(TIMEOUT_MS) });
   if (response.status === 401) whenRefused(token !== null);
   return response;
 }

@@ -1,6 +1,6 @@
 // The wiring: what the server says goes into one state, and the panels and plans are drawn from it.
 
-import { get, onRefused, useToken } from "./access.js";
+import { get, onRefused, put, useToken } from "./access.js";
 import { ArraysPanel, effectiveState } from "./arrays.js";
 import { Readout } from "./estimate.js";
 import { EventList, verdict } from "./events.js";
@@ -44,7 +44,10 @@ const state = {
 const serverClock = new ServerClock();
 const plans = [new Plan(find("floor"), "floor"), new Plan(find("side"), "side")];
 const readout = new Readout();
-const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"));
+const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name, enabled) => {
+  const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
+  put(address, { enabled }).catch((error) => console.warn(`array ${name}: ${error.message}`));
+});
 const eventList = new EventList(find("events"), {
   empty: find("events-empty"),
   count: find("events-count"),
@@ -72,6 +75,7 @@ const HEARD = {
   hello(message) {
     serverClock.reset();
     setSite(message.site, message.mode);
+    arraysPanel.mayChange = message.role !== "viewer";
     HEARD.arrays(message);
     state.tracks.clear();
     loadSite();
@@ -366,7 +370,7 @@ function readTheme() {
   const read = (name) => style.getPropertyValue(`--${name}`).trim();
   const names = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
   colours = Object.fromEntries(names.map((name) => [name, read(name)]));
-  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), quiet: read("warn"), lost: read("bad"), starting: read("muted"), unknown: read("muted") });
+  Object.assign(colours, { healthy: read("ok"), degraded: read("warn"), quiet: read("warn"), lost: read("bad"), disabled: read("muted"), starting: read("muted"), unknown: read("muted") });
   table = ramp(light.matches ? "light" : "dark");
   const g = find("ramp").getContext("2d");
   const image = g.createImageData(256, 8);

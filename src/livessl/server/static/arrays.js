@@ -24,6 +24,7 @@ const SHAPES = {
   degraded: ["path", { d: "M8 1.8L15 14H1z" }, "M8 6v4M8 11.6v.8"],
   lost: ["rect", { x: 2, y: 2, width: 12, height: 12 }, "M5.2 5.2l5.6 5.6M10.8 5.2l-5.6 5.6"],
   quiet: ["path", { d: "M8 1.8L15 14H1z" }, "M5.8 11h4.4"],
+  disabled: ["circle", { cx: 8, cy: 8, r: 6 }, "M4 12L12 4"],
   starting: ["circle", { cx: 8, cy: 8, r: 6, "stroke-dasharray": "2.5 2.2" }, ""],
   unknown: ["circle", { cx: 8, cy: 8, r: 6, "stroke-dasharray": "2.5 2.2" }, "M8 8.5v.8M6.3 6.4a1.7 1.7 0 1 1 1.7 1.7"],
 };
@@ -55,6 +56,7 @@ export function effectiveState(held, nowMs, link) {
   if (link !== "live") return "unknown";
   const age = ageS(held, nowMs);
   const { state } = held.array;
+  if (state === "disabled") return state;
   return age !== null && age > LOST_S && state !== "starting" && state !== "quiet" ? "lost" : state;
 }
 
@@ -65,7 +67,10 @@ function offset({ offset_s: off, std_s: std, sounds, reference }) {
 }
 
 export class ArraysPanel {
-  constructor(list, empty) {
+  /** `onSwitch(name, enabled)` is called when someone who `mayChange` wants an array used, or not. */
+  constructor(list, empty, onSwitch) {
+    this.mayChange = false;
+    this.onSwitch = onSwitch;
     this.list = list;
     this.empty = empty;
     this.cards = new Map();
@@ -110,6 +115,7 @@ export class ArraysPanel {
       word: el("span", { className: "word" }),
       age: el("span", { className: "age" }),
       reason: el("p", { className: "reason" }),
+      button: el("button", { className: "switch", type: "button", "data-testid": `switch-${name}` }),
       fill: el("span", { className: "fill" }),
       floor: el("span", { className: "noise" }),
       gate: el("span", { className: "gate" }),
@@ -122,12 +128,13 @@ export class ArraysPanel {
     card.bar = el("div", { className: "level", role: "meter", "aria-label": `level of ${name}`, "aria-valuemin": FLOOR_DBFS, "aria-valuemax": 0 },
       card.floor, card.fill, card.gate);
     card.root = el("li", { className: "array", "data-testid": `array-${name}` },
-      el("div", { className: "array-head" }, card.icon, el("h3", { text: name }), card.word, card.age),
+      el("div", { className: "array-head" }, card.icon, el("h3", { text: name }), card.word, card.button, card.age),
       card.reason,
       el("div", { className: "array-body" },
         el("div", { className: "gauge" }, card.bar, el("p", { className: "level-text" }, card.level, card.context)),
         card.channels),
       card.facts);
+    card.button.addEventListener("click", () => this.onSwitch(name, card.root.dataset.state === "disabled"));
     this.cards.set(name, card);
     this.list.append(card.root);
   }
@@ -136,6 +143,9 @@ export class ArraysPanel {
     card.root.classList.toggle("active", Boolean(array.active));
     write(card.reason, array.reason ?? "");
     card.reason.hidden = !array.reason;
+    write(card.button, array.enabled ? "Disable" : "Enable");
+    card.button.setAttribute("aria-label", `${array.enabled ? "Disable" : "Enable"} ${array.name}`);
+    card.button.hidden = !this.mayChange;
 
     const gate = array.threshold_dbfs ?? (Number.isFinite(array.noise_floor_dbfs) ? array.noise_floor_dbfs + GATE_ABOVE_FLOOR_DB : null);
     card.fill.style.width = `${place(array.level_dbfs)}%`;

@@ -1,0 +1,110 @@
+"""Arrays that an operator has disabled: shown, acknowledged, not used, and not waited for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import httpx
+import pytest
+from world import ARRAY_OF, World
+
+from livessl.server.store import StoreError
+from small_site import running_server, site_of
+
+
+def put(url: str, array: str, body: Any) -> httpx.Response:
+    return httpx.put(f"{url}/api/v1/arrays/{array}/enabled", json=body)
+
+
+def array(url: str, name: str) -> dict[str, Any]:
+    arrays = httpx.get(f"{url}/api/v1/arrays").json()["arrays"]
+    return next(dict(each) for each in arrays if each["name"] == name)
+
+
+def test_disabled_array_is_shown_as_such() -> None:
+    with running_server(site_of()) as server:
+        assert put(server.url, "north", {"enabled": False}).json() == {"v": 1, "name": "north", "enabled": False}
+        north = array(server.url, "north")
+        assert (north["state"], north["enabled"]) == ("disabled", False)
+        assert north["reason"] == (
+            "an operator has disabled it, and its sound is not used; otherwise starting: not heard from yet"
+        )
+        assert array(server.url, "south")["enabled"]
+        health = httpx.get(f"{server.url}/api/v1/health").json()
+        assert health["arrays"]["north"] == "disabled"
+        assert f"north: {north['reason']}" in health["reasons"]
+        assert 'livessl_array_enabled{array="north"} 0.0' in httpx.get(f"{server.url}/metrics").text
+        put(server.url, "north", {"enabled": True})
+        assert array(server.url, "north")["state"] == "starting"
+
+
+@pytest.mark.parametrize("body", [{}, {"enabled": "no"}, {"enabled": 0}, {"enabled": False, "why": "noise"}, [], None])
+def test_what_is_no_switch_is_refused(body: Any) -> None:
+    with running_server(site_of()) as server:
+        assert put(server.url, "north", body).status_code == 422
+        assert array(server.url, "north")["enabled"]
+
+
+def test_no_array_of_that_name() -> None:
+    with running_server(site_of()) as server:
+        answer = put(server.url, "east", {"enabled": False})
+        assert (answer.status_code, answer.json()["detail"]) == (404, "no array 'east'; there are north, south")
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_file_remembers_it(tmp_path: Path, kept: bool) -> None:
+    site = site_of({"server.events_db": str(tmp_path / "events.db")} if kept else {})
+    with running_server(site) as server:
+        put(server.url, "north", {"enabled": False})
+    with running_server(site) as server:
+        assert array(server.url, "north")["enabled"] is not kept
+
+
+def test_what_the_store_does_not_take_is_not_done() -> None:
+    with running_server(site_of()) as server:
+        with patch.object(server._store, "enable", side_effect=StoreError("server.events_db: disk full")):
+            answer = put(server.url, "north", {"enabled": False})
+        assert (answer.status_code, answer.json()["detail"]) == (503, "server.events_db: disk full")
+        assert array(server.url, "north")["enabled"]
+
+
+def heard(world: World) -> set[str]:
+    return {name for event in world.events() for name in event["heard_by"]}
+
+
+def test_disabled_sound_is_acknowledged_and_not_used() -> None:
+    world, as_ever = World(1), World(1)
+    assert world.server is not None
+    world.server.enable("north", False)
+    world.recover()
+    as_ever.recover()
+    assert (heard(world), heard(as_ever)) == ({"south"}, {"north", "south"})
+    assert max(node.link.kept for node in world.nodes.values()) <= 60
+
+
+def test_nobody_waits_for_a_disabled_array() -> None:
+    """Not for one that is away either: sound of the others is settled at once, and nodes forget it."""
+    for disabled in (True, False):
+        world = World(1)
+        world.run(20)
+        world.kill_node("a")
+        assert world.server is not None
+        if disabled:
+            world.server.enable(ARRAY_OF["a"], False)
+        world.run(world.end - world.raster + 50)
+        assert heard(world) == {"south"}
+        assert (world.nodes["b"].link.kept <= 60) is disabled
+
+
+def test_enabled_again_it_is_used_again() -> None:
+    world = World(1)
+    assert world.server is not None
+    world.server.enable("north", False)
+    sounds = world.groups()
+    world.run(min(sounds[4]) - world.raster - 20)
+    assert heard(world) == {"south"}
+    world.server.enable("north", True)
+    world.recover()
+    assert heard(world) == {"north", "south"}
