@@ -86,6 +86,26 @@ def loss_and_jitter(site: Playing, rng: random.Random, end_s: float) -> None:
     site.sleep_until(end_s)
 
 
+def cables_pulled(site: Playing, rng: random.Random, end_s: float) -> None:
+    """A loose contact at one node for 60 s, then the other's cable out for 60 s."""
+    site.sleep_until(10.0)
+    site.cables["a"].loosen(rng, 60.0)
+    site.sleep_until(90.0)
+    site.cables["b"].pull()
+    site.sleep_until(150.0)
+    site.cables["b"].plug()
+
+
+def links_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
+    """A tenth of the bandwidth that sound needs, for half of the time."""
+    site.sleep_until(10.0)
+    for cable in site.cables.values():
+        cable.narrow(200)
+    site.sleep_until(10.0 + end_s / 2)
+    for cable in site.cables.values():
+        cable.narrow(100_000)
+
+
 def stopped(site: Playing, rng: random.Random, end_s: float) -> None:
     """Server and nodes with SIGSTOP for up to 5 s, 30 times, and torn connections."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(30)):
@@ -103,7 +123,13 @@ PROCESSES = {
     "links cut for 60 s": link_cut,
     "5 % loss, 200 ms jitter": loss_and_jitter,
     "processes stopped, connections torn": stopped,
+    "cables loose and pulled": cables_pulled,
+    "links narrow": links_narrow,
 }
+
+
+CABLED = {"cables loose and pulled", "links narrow"}
+"""Those with nodes in network namespaces instead of behind proxies."""
 
 
 def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
@@ -118,7 +144,7 @@ def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
         if not path.exists():
             directory = path.with_suffix("")  # it stays, with what the processes said, where anything goes wrong
             shutil.rmtree(directory, ignore_errors=True)
-            events = play(recordings, directory, PROCESSES[name], seed=len(name))
+            events = play(recordings, directory, PROCESSES[name], len(name), cabled=name in CABLED)
             shutil.copy(directory / "said.txt", path.with_suffix(".txt"))
             shutil.rmtree(directory)
             path.write_text(json.dumps(events), encoding="utf-8")

@@ -99,6 +99,9 @@ def test_event_says_when_and_where() -> None:
             "azimuth_deg": 12.35,
             "elevation_deg": -6.79,
             "distance_m": 2.5,
+            "agrees": None,
+            "off_deg": None,
+            "asked": False,
         }
     ]
 
@@ -188,6 +191,7 @@ def test_array_status() -> None:
         "sample_rate_hz": 16000.0,
         "drift_ppm": 12.35,
         "clock": "locked",
+        "agreement": {"agreed": 0, "disagreed": 0},
         "clock_offset": None,
         "counters": {"frames": 3},
     }

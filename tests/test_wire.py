@@ -18,7 +18,7 @@ from numpy.testing import assert_array_equal
 
 from livessl import wire
 from livessl.core.types import MAX_SAMPLE, ClockState, Frame, Mark
-from livessl.wire import Ack, Bye, Hello, WireError, WireMessage, decode, encode
+from livessl.wire import Ack, Bye, Hello, Request, WireError, WireMessage, decode, encode
 from small_site import frame, mark
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=16)
@@ -65,6 +65,7 @@ HELLOS = st.builds(
     backlog=st.dictionaries(
         NAMES, st.lists(RASTERS, min_size=2, max_size=2, unique=True).map(lambda ends: tuple(sorted(ends))), max_size=6
     ),
+    answers=st.booleans(),
 )
 ACKS = st.builds(
     Ack,
@@ -74,6 +75,13 @@ ACKS = st.builds(
     who_are_you=st.booleans(),
     refused=TEXTS,
 )
+REQUESTS = st.builds(
+    Request,
+    run_id=NAMES,
+    wanted=st.dictionaries(
+        NAMES, st.lists(RASTERS, min_size=2, max_size=2, unique=True).map(lambda ends: tuple(sorted(ends))), max_size=6
+    ),
+)
 BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
 
 EXAMPLES: list[WireMessage] = [
@@ -82,6 +90,7 @@ EXAMPLES: list[WireMessage] = [
     Hello("lab-pc", "run", {"north": 16000.0}, problem="unplugged", backlog={"north": (7, 9)}),
     Ack("run", {"north": 7}, 5),
     Bye("lab-pc", "run"),
+    Request("run", {"north": (7, 9)}),
 ]
 
 
@@ -102,7 +111,7 @@ def refusal(data: bytes) -> str:
     return str(caught.value)
 
 
-@given(FRAMES | MARKS | HELLOS | ACKS | BYES)
+@given(FRAMES | MARKS | HELLOS | ACKS | BYES | REQUESTS)
 @settings(deadline=None)
 def test_round_trip(message: WireMessage) -> None:
     data = encode(message)
@@ -352,3 +361,12 @@ def test_samples_come_back_read_only() -> None:
     got = decode(encode(frame()))
     assert isinstance(got, Frame)
     assert not got.samples.flags.writeable
+
+
+def test_who_does_not_answer_greets_as_before_there_were_requests() -> None:
+    """An older server refuses fields that it does not know."""
+    plain = encode(Hello("lab-pc", "run", {"north": 16000.0}))
+    assert b"answers" not in plain
+    assert b'"answers":true' in encode(Hello("lab-pc", "run", {"north": 16000.0}, answers=True))
+    with pytest.raises(WireError, match="hello: field 'answers' has a wrong type"):
+        decode(encode(Hello("lab-pc", "run", {}, answers=True)).replace(b"true", b"7"))

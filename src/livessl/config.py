@@ -339,6 +339,8 @@ class FusionConfig(_Model):
     update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1
     max_event_s: Annotated[float, Field(ge=0.5, le=60)] = 10.0
     min_arrays: Annotated[int, Field(ge=1)] = 1
+    sources: Annotated[int, Field(ge=1, le=2)] = 2
+    live_sources: Annotated[int, Field(ge=1, le=2)] = 1
 
 
 class Zone(_Model):
@@ -453,16 +455,20 @@ class Site(_Model):
         `clock_offsets` is what is known already of the arrays' clocks.
         """
         from livessl.core.estimators import ESTIMATORS
-        from livessl.core.fusion import Fusion, FusionParameters
+        from livessl.core.fusion import ANSWER_S, Fusion, FusionParameters
+        from livessl.core.segmenter import RECENT_S
 
         f, a = self.fusion, self.activity
         estimator = ESTIMATORS[method or f.method](self.processed, self.search_grid(), self.c_m_s)
         parameters = FusionParameters(
             deadline_s=f.deadline_s,
+            answer_s=ANSWER_S if live else RECENT_S,
             window_s=f.window_s,
             update_s=f.update_s,
             max_event_s=f.max_event_s,
             min_arrays=f.min_arrays,
+            sources=f.sources,
+            live_sources=f.live_sources,
             threshold=a.threshold,
             pre_roll_s=a.pre_roll_s,
             hang_over_s=a.hang_over_s,

@@ -92,6 +92,7 @@ class Messages:
             "latency_stages_s": _stages(stages),
             "late": event.late,
             "replaces": [],
+            "source": event.source,
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
@@ -108,10 +109,20 @@ class Messages:
             "arrays": arrays,
             "status": str(update.status),
             "contributions": [_contribution(c) for c in update.contributions],
+            "others": [self._other(other) for other in update.others],
             "zones": self._site.zones_of(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
             "latency_stages_s": _stages(stages),
+        }
+
+    def _other(self, estimate: Estimate) -> JsonObject:
+        position, covariance, confidence, _ = self._where(estimate)
+        return {
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "zones": self._site.zones_of(position),
         }
 
     def track(self, track: Track) -> JsonObject:
@@ -158,6 +169,7 @@ def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
         "sample_rate_hz": status.sample_rate_hz,
         "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),
         "clock": None if status.clock is None else str(status.clock),
+        "agreement": {"agreed": status.agreed, "disagreed": status.disagreed},
         "clock_offset": _clock_offset(status),
         "counters": dict(status.counters),
     }
@@ -194,6 +206,9 @@ def _contribution(contribution: Contribution) -> JsonObject:
         "azimuth_deg": round(contribution.azimuth_deg, 2),
         "elevation_deg": round(contribution.elevation_deg, 2),
         "distance_m": round(contribution.distance_m, 3),
+        "agrees": contribution.agrees,
+        "off_deg": None if contribution.off_deg is None else round(contribution.off_deg, 1),
+        "asked": contribution.asked,
     }
 
 

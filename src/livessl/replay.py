@@ -9,7 +9,7 @@ from livessl.capture.line import played_messages
 from livessl.capture.recorded import Part, lines_of
 from livessl.clock import Clock
 from livessl.config import Site
-from livessl.core.types import Frame, Mark, Message, Output
+from livessl.core.types import Ask, Frame, Mark, Message, Output
 
 
 def run(
@@ -18,9 +18,12 @@ def run(
     clock: Clock,
     *,
     method: str | None = None,
+    ask: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[Output]:
     """Localize everything in the recordings, without sockets: events in order of time.
+
+    With `ask`, arrays that did not find a sound are asked for it, as live.
 
     Raises
     ------
@@ -28,9 +31,17 @@ def run(
         Where recordings of arrays that the site joins do not belong together.
     """
     fusion = site.make_fusion(method, updates=False)
+    lines, placed = lines_of(site, parts)
+    if ask:
+        fusion.askable.update(array for line in lines for array in line.arrays)
     now_ns = 0
-    for now_ns, batch in played_messages(*lines_of(site, parts), clock):
-        yield from fusion.step(_over_the_wire(batch), now_ns)
+    for now_ns, batch in played_messages(lines, placed, clock):
+        outputs = fusion.step(_over_the_wire(batch), now_ns)
+        while asks := [output for output in outputs if isinstance(output, Ask)]:
+            yield from (output for output in outputs if not isinstance(output, Ask))
+            answers = [message for ask in asks for line in lines for message in line.ask(ask)]
+            outputs = fusion.step(_over_the_wire(answers), now_ns)
+        yield from outputs
         if progress is not None:
             progress(now_ns)
     yield from fusion.flush(now_ns)

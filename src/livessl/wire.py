@@ -72,6 +72,8 @@ class Hello:
         Of the arrays that have kept frames from before this connection: their oldest raster index, and the one from
         which on frames are live. What lies between comes in order of time, as the live sound leaves room; another
         greeting says when all of it has been sent.
+    answers : bool
+        It knows requests. Said only to a server that has made one: an older one would not understand the greeting.
     """
 
     node: str
@@ -80,6 +82,7 @@ class Hello:
     replay: bool = False
     problem: str | None = None
     backlog: dict[str, tuple[int, int]] = field(default_factory=dict)
+    answers: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +112,24 @@ class Ack:
 
 
 @dataclass(frozen=True, slots=True)
+class Request:
+    """The server asks for frames that a node did not send. Their sequence number is 0.
+
+    An empty one tells a node that has greeted that requests may come. A node that does not know them leaves them be.
+
+    Parameters
+    ----------
+    run_id : str
+        Of the node's greeting.
+    wanted : dict of str to (int, int)
+        Of each array the first raster index, by its own clock, and the one after the last.
+    """
+
+    run_id: str
+    wanted: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Bye:
     """A node ends on purpose."""
 
@@ -116,8 +137,9 @@ class Bye:
     run_id: str
 
 
-WireMessage = Frame | Mark | Hello | Ack | Bye
-_JSON_KINDS: Final[dict[int, type[Hello | Ack | Bye]]] = {3: Hello, 4: Ack, 5: Bye}
+WireMessage = Frame | Mark | Hello | Ack | Bye | Request
+_Json = Hello | Ack | Bye | Request
+_JSON_KINDS: Final[dict[int, type[_Json]]] = {3: Hello, 4: Ack, 5: Bye, 6: Request}
 _FRAME_KIND: Final = 1
 _MARK_KIND: Final = 2
 
@@ -129,7 +151,10 @@ def encode(message: WireMessage) -> bytes:
     if isinstance(message, Mark):
         return _encode_mark(message)
     kind = next(number for number, type_ in _JSON_KINDS.items() if isinstance(message, type_))
-    return _head(kind) + json.dumps(asdict(message), separators=(",", ":")).encode()
+    fields = asdict(message)
+    if isinstance(message, Hello) and not message.answers:
+        del fields["answers"]
+    return _head(kind) + json.dumps(fields, separators=(",", ":")).encode()
 
 
 def decode(data: bytes) -> WireMessage:
@@ -248,7 +273,7 @@ def _decode_mark(body: bytes) -> Mark:
     return Mark(name, sequence, raster, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])
 
 
-def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
+def _decode_json(type_: type[_Json], body: bytes) -> WireMessage:
     what = type_.__name__.lower()
     if len(body) > MAX_JSON_BYTES:
         raise WireError(f"{what} of {len(body)} bytes: expected at most {MAX_JSON_BYTES}")
@@ -257,13 +282,15 @@ def _decode_json(type_: type[Hello | Ack | Bye], body: bytes) -> WireMessage:
     except (ValueError, RecursionError) as error:
         raise WireError(f"{what}: not valid JSON") from error
     checks = _FIELDS[type_]
+    if type_ is Hello and isinstance(fields, dict):
+        fields.setdefault("answers", False)
     if not isinstance(fields, dict) or set(fields) != set(checks):
         raise WireError(f"{what}: expected the fields {', '.join(checks)}")
     for name, valid in checks.items():
         if not valid(fields[name]):
             raise WireError(f"{what}: field {name!r} has a wrong type or value")
-    if type_ is Hello:
-        fields["backlog"] = {array: tuple(rasters) for array, rasters in fields["backlog"].items()}
+    for name in {"backlog", "wanted"} & fields.keys():
+        fields[name] = {array: tuple(rasters) for array, rasters in fields[name].items()}
     return type_(**fields)
 
 
@@ -305,7 +332,7 @@ def _is_map_of(valid: Any) -> Any:
     return lambda value: isinstance(value, dict) and all(_is_name(k) and valid(v) for k, v in value.items())
 
 
-_FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
+_FIELDS: Final[dict[type[_Json], dict[str, Any]]] = {
     Hello: {
         "node": _is_name,
         "run_id": _is_name,
@@ -313,6 +340,7 @@ _FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
         "replay": _is_flag,
         "problem": _is_text,
         "backlog": _is_map_of(_is_span),
+        "answers": _is_flag,
     },
     Ack: {
         "run_id": _is_name,
@@ -322,6 +350,7 @@ _FIELDS: Final[dict[type[Hello | Ack | Bye], dict[str, Any]]] = {
         "refused": _is_text,
     },
     Bye: {"node": _is_name, "run_id": _is_name},
+    Request: {"run_id": _is_name, "wanted": _is_map_of(_is_span)},
 }
 
 

@@ -18,7 +18,7 @@ from livessl import wire
 from livessl.capture.link import BACKLOG_FRAMES, SILENT_NS, Link
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
-from livessl.core.types import Frame, Mark
+from livessl.core.types import Ask, Frame, Mark, Message
 from livessl.server.receiver import Receiver
 from small_site import FIRST_RASTER, frame, mark, site_of, wait_until
 
@@ -471,3 +471,64 @@ def test_a_clock_set_back_an_hour_stops_nothing() -> None:
                 assert link._hello_ns > before
             finally:
                 link.close(bye=False)
+
+
+def remembered(ask: Ask) -> list[Message]:
+    return [frame(0, raster=raster, array=ask.array, active=False) for raster in range(ask.first, ask.last + 1)]
+
+
+def test_what_the_server_asks_for_is_sent_and_not_kept() -> None:
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, SystemClock(), recent=remembered)
+        connect(link, router)
+        assert not [m for m in router.got if isinstance(m, wire.Hello) and m.answers]  # an older server would refuse it
+        router.say(wire.encode(wire.Request("run-1")))
+        greets = [m for m in router.got if isinstance(m, wire.Hello)]
+        together(link, router, lambda: hellos(router) > len(greets), "another greeting")
+        last = [m for m in router.got if isinstance(m, wire.Hello)][-1]
+        assert last.answers
+        router.say(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
+        together(link, router, lambda: len(sounds(router)) == 3, "the answer")
+        assert [(m.array, m.raster, m.sequence) for m in sounds(router)] == [("south", k, 0) for k in (700, 701, 702)]
+        assert link.kept == link.pending == 0
+        router.say(wire.encode(wire.Request("another run", {"south": (700, 703)})))
+        router.ack()
+        link.service()
+        router.read()
+        assert len(sounds(router)) == 3
+        link.close(bye=False)
+
+
+def hellos(router: Router) -> int:
+    return sum(isinstance(message, wire.Hello) for message in router.got)
+
+
+def sounds(router: Router) -> list[Frame]:
+    return [message for message in router.got if isinstance(message, Frame)]
+
+
+def test_another_server_is_not_taken_to_ask() -> None:
+    clock = HandClock()
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, clock, recent=remembered)
+        connect(link, router)
+        before = hellos(router)
+        router.say(wire.encode(wire.Request("run-1")))
+        together(link, router, lambda: hellos(router) > before, "another greeting")
+        clock.time_ns += 2 * SILENT_NS
+        before = hellos(router)
+        together(link, router, lambda: hellos(router) > before, "a greeting after silence")
+        last = [message for message in router.got if isinstance(message, wire.Hello)][-1]
+        assert not last.answers
+        link.close(bye=False)
+
+
+def test_who_remembers_nothing_does_not_offer_it() -> None:
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, SystemClock())
+        connect(link, router)
+        router.say(wire.encode(wire.Request("run-1")))
+        router.ack()
+        together(link, router, lambda: link.connected, "an acknowledgement")
+        link.close(bye=False)
+    assert not any(message.answers for message in router.got if isinstance(message, wire.Hello))

@@ -95,7 +95,7 @@ def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any
 
 def frame(array: str, raster: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
     made = Frame(
-        array, 0, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
+        array, 1, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
     )
     return replace(made, **changes)
 
@@ -804,3 +804,135 @@ def test_microphone_that_dies_amid_sound_is_found_too() -> None:
     status = status_of(fusion, "north", 30)
     assert status.state is ArrayState.DEGRADED
     assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"
+
+
+# --- who agrees
+
+
+class Voting(Scripted):
+    """An estimator that is told who is outvoted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.outvoted: dict[str, float] = {}
+        self.doubted: list[set[str]] = []
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        self.doubted.append({name for name, sound in sounds.items() if sound.doubted})
+        found = super().locate(sounds)
+        evidence = tuple(HeardBy(spec, NOTHING) for spec in (NORTH, SOUTH, EAST) if spec.name in sounds)
+        outvoted = {name: off for name, off in self.outvoted.items() if name in sounds}
+        return replace(found, evidence=evidence, outvoted=outvoted)
+
+
+EAST = tetra("east", [3.9, 2.4, 1.9])
+
+
+def sound_at(fusion: Fusion, raster: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
+    """One short sound that these arrays hear."""
+    span = range(raster, raster + 20)
+    arrivals = [message for name in arrays for message in node(name, {raster + 5, raster + 6}, span)]
+    return [output for _, output in play(fusion, arrivals, raster + 21, raster)]
+
+
+def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
+    estimator = Voting()
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator, updates=True)
+    estimator.outvoted = {"east": 29.6}
+    for turn in range(4):
+        (event,) = (output for output in sound_at(fusion, 20 * turn) if isinstance(output, Event))
+        assert event.reason == "located without 'east' (30° off): outvoted by the others"
+        assert event.status is Status.LOCATED
+        assert event.estimate is not None
+        assert event.estimate.arrays == ("north", "south")
+        assert event.heard_by == ("north", "south", "east")
+        agrees = {c.array: (c.agrees, c.off_deg) for c in event.contributions}
+        assert agrees == {"north": (True, None), "south": (True, None), "east": (False, 29.6)}
+        status = status_of(fusion, "east", 20 * turn + 20)
+        assert (status.agreed, status.disagreed) == (0, turn + 1)
+        assert status.state is (ArrayState.HEALTHY if turn < 2 else ArrayState.DEGRADED)
+    assert status.reason is not None
+    assert "disagrees with the others in 4 of the last 4 sounds, by 30°: is its pose right" in status.reason
+    assert status_of(fusion, "north", 80).state is ArrayState.HEALTHY
+    assert estimator.doubted[-1] == {"east"}  # the fourth event
+    assert "east" not in estimator.calls[-2]  # its windows go without who is doubted, its answer does not
+    assert "east" in estimator.calls[-1]
+    estimator.outvoted = {}
+    for turn in range(4, 7):
+        assert status_of(fusion, "east", 20 * turn).state is ArrayState.DEGRADED
+        sound_at(fusion, 20 * turn)
+    assert status_of(fusion, "east", 140).state is ArrayState.HEALTHY
+    sound_at(fusion, 140)
+    assert estimator.doubted[-1] == set()
+
+
+def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:
+    estimator = Voting()
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator)
+    sound_at(fusion, 0, ("north", "south"))
+    assert (status_of(fusion, "north", 20).agreed, status_of(fusion, "north", 20).disagreed) == (0, 0)
+    twin = fusion.twin()
+    estimator.outvoted = {"south": 12.0}
+    sound_at(twin, 20)
+    sound_at(fusion, 20)  # told before and settled after: one sound
+    assert (status_of(fusion, "south", 40).agreed, status_of(fusion, "south", 40).disagreed) == (0, 1)
+
+
+def test_a_microphone_that_hears_nothing_is_told() -> None:
+    samples = np.random.default_rng(3).standard_normal((4, 800)).astype(np.float32)
+    samples[2] *= 1e-3
+    arrivals: Arrivals = [(k + 1.0, frame("north", k, samples=samples.copy())) for k in range(10)]
+    arrivals += [(k + 1.0, mark("north", k)) for k in range(10, 40)]
+    fusion = fusion_of()
+    play(fusion, arrivals, 40)
+    status = status_of(fusion, "north", 40)
+    assert status.state is ArrayState.DEGRADED
+    assert status.reason is not None
+    assert "microphone [3] hears nothing of what the others hear" in status.reason
+    again: Arrivals = [(k + 1.0, frame("north", k, samples=samples[[0, 1, 0, 1]])) for k in range(40, 44)]
+    play(fusion, again, 44, 40)
+    assert status_of(fusion, "north", 44).state is ArrayState.HEALTHY
+
+
+# --- several sources
+
+
+OTHER_M = SOURCE_M - np.array([0.0, 1.5, 0.0])
+
+
+class Duet(Scripted):
+    """An estimator that finds two places where it may."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        found = super().locate(sounds)
+        if not all(sound.moments for sound in sounds.values()):
+            return found
+        return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
+
+    def listener(self, array: str, sample_rate_hz: float) -> Any:
+        return Ear([])
+
+
+def test_each_of_two_sources_has_an_event() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), updates=True)
+    outputs = sound_at(fusion, 0, ("north", "south"))
+    one, other = (output for output in outputs if isinstance(output, Event))
+    assert (one.id, one.source) == (f"site-{(START + 5) * 50}", 1)
+    assert (other.id, other.source) == (f"{one.id}-2", 2)
+    assert other.estimate is not None
+    np.testing.assert_array_equal(other.estimate.position_m, OTHER_M)
+    assert (other.start_ns, other.end_ns, other.status) == (one.start_ns, one.end_ns, Status.LOCATED)
+    assert other.estimate.confidence == 0.7
+    assert other.contributions[0].azimuth_deg != one.contributions[0].azimuth_deg
+    assert all(output.others == () for output in outputs if isinstance(output, Update))  # unless it is asked for
+    alone = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(sources=1))
+    assert [event.source for event in sound_at(alone, 0, ("north", "south")) if isinstance(event, Event)] == [1]
+
+
+def test_windows_tell_of_a_second_where_the_site_asks() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(live_sources=2), updates=True)
+    outputs = sound_at(fusion, 0, ("north", "south"))
+    (update,) = (output for output in outputs if isinstance(output, Update))
+    (other,) = update.others
+    np.testing.assert_array_equal(other.position_m, OTHER_M)
+    assert {output.id for output in outputs if isinstance(output, Track)} == {1, 2}

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.activity import ActivityParameters
-from livessl.core.segmenter import WARM_UP_FRAMES, Segmenter
+from livessl.core.segmenter import RECENT_S, WARM_UP_FRAMES, Segmenter
 from livessl.core.timeline import Framer
 from livessl.core.types import (
     FRAME_NS,
+    FRAME_S,
     ArraySpec,
     Block,
     ClockState,
@@ -191,3 +192,37 @@ def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes
     sent = rasters(whole, Frame)
     assert all(earlier < later for earlier, later in pairwise(sent))  # no frame twice
     assert len(rasters(whole, Mark)) + len(set(sent) - set(rasters(whole, Mark))) == len(loud)
+
+
+def test_what_was_not_sent_is_remembered_for_a_while() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    samples = sound([QUIET] * 20 + [LOUD] * 2 + [QUIET] * (round(RECENT_S / FRAME_S) + 30))
+    messages: list[Message] = []
+    for k in range(samples.shape[1] // N):
+        block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        if k == 30:
+            asked = frames_of(made.ask(START + 12, START + 21))
+            assert [frame.raster - START for frame in asked] == list(range(12, 22))
+            assert {(frame.sequence, frame.active) for frame in asked} == {(0, False)}
+            sent = {frame.raster: frame for frame in frames_of(messages)}
+            for frame in asked:
+                np.testing.assert_array_equal(frame.samples, samples[CHANNELS, (frame.raster - START) * N :][:, :N])
+                assert frame.raster not in sent or sent[frame.raster].power == frame.power
+    last = messages[-1].raster
+    assert made.ask(START, START + 40) == []
+    remembered = frames_of(made.ask(START, last))
+    assert len(remembered) == round(RECENT_S / FRAME_S)
+    assert remembered[-1].raster == last
+    # asking takes nothing from what is sent by itself
+    assert [frame.sequence for frame in frames_of(messages)] == list(range(1, len(frames_of(messages)) + 1))
+
+
+def test_nothing_is_remembered_over_a_gap() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    samples = sound([QUIET] * 40)
+    for k in (*range(15), *range(18, 40)):
+        block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
+        for cut in framer.push(block):
+            made.push(cut, framer)
+    assert [frame.raster - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +23,11 @@ from typing import Any, Self
 import numpy as np
 import soundfile
 import yaml
+from namespaces import Cable
 from proxy import Proxy
 from websockets.sync.client import connect
 
+from livessl import keys
 from livessl.clock import utc_ns, utc_text
 from livessl.config import load_site
 from livessl.simulate.export import write_scene
@@ -98,6 +100,9 @@ class Playing:
         The nodes, and each one's array.
     changes : dict
         Of the small site.
+    cables : mapping of node to Cable
+        Nodes in network namespaces: no proxy is between them and the server, and both have keys, as a server needs
+        that others can reach.
     """
 
     recordings: Path
@@ -106,6 +111,7 @@ class Playing:
     seed: int = 0
     nodes: dict[str, str] = field(default_factory=lambda: dict(NODES))
     changes: Changes = field(default_factory=dict)
+    cables: Mapping[str, Cable] = field(default_factory=dict)
     proxies: dict[str, Proxy] = field(default_factory=dict)
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     start_ns: int = 0
@@ -117,12 +123,19 @@ class Playing:
         self._log = self._open.enter_context((self.directory / "said.txt").open("ab"))
         port, self.http = free_port(), free_port()
         for k, name in enumerate(self.nodes):
-            self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
+            if name not in self.cables:
+                self.proxies[name] = self._open.enter_context(Proxy(("127.0.0.1", port), self.seed + k))
         data = small({**self.changes, "server.bind": f"tcp://127.0.0.1:{port}", "server.http.port": self.http})
+        if self.cables:
+            folder = self.directory / "keys"
+            keys.make_server_keys(folder)
+            for name in self.nodes:
+                keys.enrol(folder, name, keys.make_node_keys(folder, name))
+            data["server"]["bind"], data["keys"] = f"tcp://*:{port}", "keys"
         data["server"]["events_db"] = str(self.directory / "events.db")
         data["nodes"] = {
             name: {
-                "server": self.proxies[name].endpoint,
+                "server": f"tcp://{self.cables[name].host}:{port}" if self.cables else self.proxies[name].endpoint,
                 "device": {"type": "wav", "files": {array: f"{array}.wav"}},
                 "arrays": {array: [1, 2, 3, 4]},
                 "spool": {"directory": str(self.directory / "spool")},
@@ -157,8 +170,9 @@ class Playing:
         self._start(name, "capture", "--node", name, "--wav", f"{array}={path}", "--start-at", start)
 
     def _start(self, name: str, command: str, *arguments: str) -> None:
+        inside = self.cables[name].inside if name in self.cables else []
         self.processes[name] = subprocess.Popen(
-            [sys.executable, "-m", "livessl", command, "--site", str(self.site), *arguments],
+            [*inside, sys.executable, "-m", "livessl", command, "--site", str(self.site), *arguments],
             stdout=self._log,
             stderr=self._log,
         )
@@ -265,17 +279,29 @@ def duration_s(recordings: Path) -> float:
 
 
 def play(
-    recordings: Path, directory: Path, disturb: Callable[[Playing, random.Random, float], None], seed: int = 0
+    recordings: Path,
+    directory: Path,
+    disturb: Callable[[Playing, random.Random, float], None],
+    seed: int = 0,
+    *,
+    cabled: bool = False,
 ) -> list[Event]:
-    """Play the recordings to their end while something disturbs them; then let everything settle."""
+    """Play the recordings to their end while something disturbs them; then let everything settle.
+
+    `cabled` puts the nodes into network namespaces instead of behind proxies.
+    """
     end_s = duration_s(recordings)
-    with Playing(recordings, directory, seed=seed) as site:
+    with ExitStack() as open_cables:
+        cables = {name: open_cables.enter_context(Cable(k)) for k, name in enumerate(NODES)} if cabled else {}
+        site = open_cables.enter_context(Playing(recordings, directory, seed=seed, cables=cables))
         site.start_server()
         for name in NODES:
             site.start_node(name)
         disturb(site, random.Random(seed), end_s)
         for proxy in site.proxies.values():
             proxy.weather.cut = False
+        for cable in cables.values():
+            cable.plug()
         if "server" not in site.processes:
             site.start_server()
         site.sleep_until(end_s)

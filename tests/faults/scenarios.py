@@ -46,6 +46,13 @@ def stalls(world: World) -> None:
     world.delay_ticks = (0, 20)
 
 
+def links_narrow(world: World) -> None:
+    """Room for a frame in each interval, for less, or for hardly one in a second; marks take some of it too."""
+    while world.raster < world.end:
+        world.bytes_per_tick = world.rng.choice([40, 80, 150, 300, 600])
+        world.run(world.rng.choice([20, 100, 400, 800]))
+
+
 def nodes_stopped(world: World) -> None:
     """With SIGSTOP for up to two seconds; the device's buffer holds what is heard meanwhile."""
     while world.raster < world.end:
@@ -111,6 +118,7 @@ HARMLESS: dict[str, Fault] = {
     "links cut": links_cut,
     "connections reset": connections_reset,
     "stalls": stalls,
+    "links narrow": links_narrow,
     "nodes stopped": nodes_stopped,
     "disk full": disk_full,
     "everything": everything,

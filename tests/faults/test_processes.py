@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from namespaces import why_not
 from processes import Event, Playing, make_recordings, play, wait_for
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
@@ -63,6 +64,39 @@ def test_link_cut_and_torn(recordings: Path, undisturbed: list[Event], tmp_path:
     events = play(recordings, tmp_path, cuts)
     assert_same(events, undisturbed)
     assert events[1]["late"]
+
+
+def test_cables_pulled(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
+    """Nodes with keys in network namespaces: the kernel's own TCP over a loose contact, then over nothing."""
+    reason = why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+
+    def pulls(site: Playing, rng: random.Random, end_s: float) -> None:
+        site.sleep_until(undisturbed[0]["at_s"] - 0.5)
+        site.cables["b"].loosen(rng, 3.0)
+        site.sleep_until(undisturbed[1]["at_s"] + 0.1)
+        site.cables["a"].pull()
+        site.sleep_until(undisturbed[3]["at_s"] + 0.1)
+        site.cables["a"].plug()
+
+    events = play(recordings, tmp_path, pulls, cabled=True)
+    assert_same(events, undisturbed)
+    assert events[2]["late"]
+
+
+def test_narrow_link(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
+    """A third of what the sound needs: it comes, if late."""
+    reason = why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+
+    def narrows(site: Playing, rng: random.Random, end_s: float) -> None:
+        for cable in site.cables.values():
+            cable.narrow(200)
+        site.sleep_until(end_s)
+
+    assert_same(play(recordings, tmp_path, narrows, cabled=True), undisturbed)
 
 
 def array_state(site: Playing, name: str) -> dict[str, Any]:

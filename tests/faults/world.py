@@ -10,6 +10,7 @@ import random
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any, ClassVar
 from unittest.mock import patch
@@ -34,6 +35,9 @@ START = 20 * 1_767_225_600
 """Raster index at which every world begins."""
 
 HANG_OVER, PRE_ROLL = 6, 8
+BUFFERED = 30
+"""Messages that ZeroMQ and the system take from a node before any arrives."""
+
 WORLD: dict[str, Any] = {
     "nodes": {
         "a": {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {"north": [1, 2, 3, 4]}},
@@ -263,6 +267,7 @@ class World:
         self.cut: set[str] = set()
         self.published: list[Event] = []
         self.delay_ticks = delay_ticks
+        self.bytes_per_tick = inf  # of each node's link
         self._spools = spools
         self._connections = self._runs = 0
         self.raster = START
@@ -328,7 +333,7 @@ class World:
 
     def send_up(self, node: str, data: bytes) -> bool:
         if node in self.cut:
-            if node in self.wires and len(self.wires[node].up) < 200:
+            if node in self.wires and len(self.wires[node].up) < BUFFERED:
                 self.wires[node].up.append((2**62, data))  # the system's buffers take it, and nothing arrives
                 return True
             return False
@@ -338,9 +343,9 @@ class World:
             self._connections += 1
             self.wires[node] = Wire(self._connections.to_bytes(5, "big"))
         up = self.wires[node].up
-        if len(up) >= 200:
+        if len(up) >= BUFFERED:
             return False
-        up.append((self._arrival(up), data))
+        up.append((self._arrival(up, len(data)), data))
         return True
 
     def receive_down(self, node: str) -> bytes | None:
@@ -349,9 +354,10 @@ class World:
             return None
         return connection.down.popleft()[1]
 
-    def _arrival(self, queue: deque[tuple[int, bytes]]) -> int:
+    def _arrival(self, queue: deque[tuple[int, bytes]], size: int = 0) -> int:
         delay = self.rng.uniform(*self.delay_ticks) * FRAME_NS
-        return max(self.clock.time_ns + round(delay), queue[-1][0] if queue else 0)
+        before = queue[-1][0] if queue else self.clock.time_ns
+        return max(self.clock.time_ns + round(delay), before + round(size / self.bytes_per_tick * FRAME_NS))
 
     def heal(self, node: str) -> None:
         """The link is there again; TCP may have held on to what was under way, or have given up."""
@@ -413,6 +419,7 @@ class World:
         for name in list(self.cut):
             self.heal(name)
         self.store.dies, self.store.full = None, False
+        self.bytes_per_tick = inf
         if self.server is None:
             self.start_server()
         for name in self.array_of:

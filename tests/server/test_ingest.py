@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from livessl import wire
+from livessl.core.types import Ask
 from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Arrival, Ingest
-from livessl.wire import Ack, Bye, Hello
+from livessl.wire import Ack, Bye, Hello, Request
 from small_site import frame, mark, site_of
 
 NOW = 1_767_225_600_000_000_000
@@ -43,7 +44,7 @@ def refusal(into: Ingest, hello: Hello, peer: bytes = b"p2", now_ns: int = NOW) 
 def test_greeting_is_answered_with_what_is_known() -> None:
     into = ingest()
     arrival = tell(into, HELLO)
-    assert arrival == Arrival(joined=HELLO, reply=Ack("run-1", {}))
+    assert arrival == Arrival(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
     tell(into, frame(1))
     again = tell(into, HELLO)
     assert again == Arrival(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
@@ -215,3 +216,51 @@ def test_problem_of_a_device_is_told_until_it_is_over() -> None:
     tell(into, replace(HELLO, problem="unplugged"))
     tell(into, Bye("lab-pc", "run-1"))
     assert into.problem_of("north") is None
+
+
+def test_a_node_is_told_once_that_it_may_be_asked() -> None:
+    into = ingest()
+    assert tell(into, HELLO).offer == Request("run-1")
+    assert tell(into, HELLO).offer is None  # an older one that says nothing of it
+    knows = tell(into, replace(HELLO, answers=True))
+    assert (knows.offer, knows.greeted) == (None, replace(HELLO, answers=True))
+    assert tell(into, HELLO).offer == Request("run-1")  # it has begun anew on the same connection
+    assert tell(into, HELLO, b"p9").offer == Request("run-1")
+
+
+def test_requests_go_to_nodes_that_know_them() -> None:
+    into = ingest()
+    asks = [Ask("north", 100, 110), Ask("south", 100, 104)]
+    tell(into, HELLO)
+    assert into.requests(asks) == []
+    tell(into, replace(HELLO, answers=True))
+    assert into.requests(asks[:1]) == [(b"p1", Request("run-1", {"north": (100, 111)}))]
+    tell(into, Bye("lab-pc", "run-1"))
+    assert into.requests(asks) == []
+
+
+def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
+    into = joined()
+    tell(into, frame(1))
+    asked = frame(0, raster=700, active=False)
+    assert tell(into, asked).message is not None
+    assert tell(into, asked).message is not None
+    assert (into.duplicates["north"], into.sequence_gaps["north"]) == (0, 0)
+    assert tell(into, frame(2)).message is not None
+    assert into.acknowledgements(NOW + ACK_NS)[0][1].received == {"north": 1001}
+
+
+def test_request_of_a_node_is_refused() -> None:
+    into = joined()
+    tell(into, Request("run-1"))
+    assert into.malformed == 1
+
+
+def test_settled_is_told_by_each_nodes_own_clock() -> None:
+    into = joined()
+    into.settled = {"north": 103, "south": 100}
+    (_, ack), *_ = into.acknowledgements(NOW + ACK_NS)
+    assert ack.settled == min(into.settled[array] for array in HELLO.arrays)
+    into.settled = {}
+    (_, ack), *_ = into.acknowledgements(NOW + 2 * ACK_NS)
+    assert ack.settled is None

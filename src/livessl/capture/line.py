@@ -11,7 +11,7 @@ from livessl.clock import Clock
 from livessl.config import Site
 from livessl.core.segmenter import Segmenter
 from livessl.core.timeline import Framer
-from livessl.core.types import Block, Message
+from livessl.core.types import Ask, Block, Message
 
 
 class Line:
@@ -47,6 +47,15 @@ class Line:
             for cut in self.framer.push(block)
             for segmenter in self._segmenters
             for message in segmenter.push(cut, self.framer)
+        ]
+
+    def ask(self, ask: Ask) -> list[Message]:
+        """What is remembered of an array's sound; nothing of an array that is on another line."""
+        return [
+            message
+            for segmenter in self._segmenters
+            if segmenter.array == ask.array
+            for message in segmenter.ask(ask.first, ask.last)
         ]
 
     def flush(self) -> list[Message]:

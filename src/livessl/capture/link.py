@@ -10,14 +10,14 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import zmq
 
 from livessl import wire
 from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
-from livessl.core.types import Frame, Mark, Message
+from livessl.core.types import Ask, Frame, Mark, Message
 from livessl.keys import NodeKeys
 
 BACKLOG_FRAMES: Final = 16
@@ -28,6 +28,15 @@ HELLO_NS: Final = 1_000_000_000
 
 SILENT_NS: Final = 2_000_000_000
 """The server acknowledges four times a second; so long without a word means that it is gone."""
+
+BEHIND_NS: Final = 5_000_000_000
+"""Sound that has waited so long to be sent is not live any more."""
+
+QUEUED_MESSAGES: Final = 10
+"""Of each array, handed over to ZeroMQ: they, and `QUEUED_BYTES` in the system's hands, are what a slow link delays."""
+
+QUEUED_BYTES: Final = 256 * 1024
+"""Enough for 10 Mbit/s at a round trip of 0.2 s."""
 
 ANSWER_NS: Final = 10_000_000_000
 """A replay, which somebody waits for, gives up after so long; a node never does."""
@@ -44,14 +53,17 @@ class Dealer:
         The server's ZeroMQ address.
     keys : NodeKeys or None
         Ours and the server's; None where the site uses none.
+    arrays : int
+        Whose sound goes over it.
     """
 
-    def __init__(self, endpoint: str, keys: NodeKeys | None = None) -> None:
+    def __init__(self, endpoint: str, keys: NodeKeys | None = None, arrays: int = 1) -> None:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.IMMEDIATE, 1)  # what cannot go out now waits in our spool, not in ZeroMQ's
-        self._socket.setsockopt(zmq.SNDHWM, 200)
+        self._socket.setsockopt(zmq.SNDHWM, max(BACKLOG_FRAMES, QUEUED_MESSAGES * arrays))
+        self._socket.setsockopt(zmq.SNDBUF, QUEUED_BYTES)
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 2000)
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
@@ -122,6 +134,8 @@ class Link:
         Where frames are kept; None keeps them in memory. It is closed with the link.
     dealer : Dealer or None
         The connection, instead of one of its own.
+    recent : callable or None
+        Gives what is remembered of an array's sound, whether or not it was sent; None where nothing is.
     """
 
     def __init__(
@@ -133,19 +147,21 @@ class Link:
         *,
         spool: Spool | None = None,
         dealer: Dealer | None = None,
+        recent: Callable[[Ask], list[Message]] | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._clock = clock
+        self._recent = recent
         self._spool = Spool() if spool is None else spool
         self._begun_ns = clock.monotonic_ns()
-        self._dealer = Dealer(endpoint, keys) if dealer is None else dealer
+        self._dealer = Dealer(endpoint, keys, len(hello.arrays)) if dealer is None else dealer
         self._hint = (
             ""
             if keys is None
             else " And are the keys right: is this node's enrolled there, is server.public the server's?"
         )
         self._marks: dict[str, Mark] = {}  # while the server is away
-        self._live: deque[Kept | Mark] = deque()
+        self._live: deque[tuple[int, Kept | Mark]] = deque()  # since when each waits
         self._backlog = deque(self._spool.frames())
         self._hello = replace(hello, backlog=_spans(self._backlog))
         self._backlog_sent: deque[Kept] = deque()
@@ -191,7 +207,7 @@ class Link:
             if isinstance(message, Frame):
                 self._keep(message)
             elif self._greeted:
-                self._live.append(message)
+                self._live.append((self._clock.monotonic_ns(), message))
             else:
                 self._marks[message.array] = message
         self.service()
@@ -222,10 +238,15 @@ class Link:
             self._say_hello()  # no sound for a while, but we are there
         if not self._owes_hello:
             self._send_waiting(now_ns)
+        if self._live and now_ns - self._live[0][0] >= BEHIND_NS and not self._hello.replay:
+            self._fall_behind()
 
     def _keep(self, frame: Frame) -> None:
         kept, gone = self._spool.append(frame)
-        (self._live if self._greeted else self._backlog).append(kept)
+        if self._greeted:
+            self._live.append((self._clock.monotonic_ns(), kept))
+        else:
+            self._backlog.append(kept)
         self._marks.pop(frame.array, None)  # a mark before it says how things were
         if gone:
             self._give_up(gone)
@@ -233,7 +254,8 @@ class Link:
     def _give_up(self, gone: Sequence[Kept]) -> None:
         """Count what had to go before the server got it; it must not be sent any more."""
         lost = [kept for kept in gone if not self._is_received(kept)]
-        queues: Sequence[deque[Any]] = (self._backlog, self._live, self._backlog_sent, self._live_sent)
+        queues = (self._backlog, self._backlog_sent, self._live_sent)
+        self._live = deque(waiting for waiting in self._live if waiting[1] not in lost)
         for kept in lost:
             for queue in queues:
                 if kept in queue:
@@ -244,7 +266,7 @@ class Link:
 
     def _send_waiting(self, now_ns: int) -> None:
         while self._live:
-            first = self._live[0]
+            first = self._live[0][1]
             if not self._try_send(self._data(first)):
                 return
             self._live.popleft()
@@ -284,6 +306,20 @@ class Link:
                 continue
             if isinstance(message, wire.Ack):
                 self._acknowledge(message)
+            elif isinstance(message, wire.Request) and message.run_id == self._hello.run_id:
+                self._answer(message)
+
+    def _answer(self, request: wire.Request) -> None:
+        """Send what is wanted, past the spool: an answer that is lost is not missed for long, and nobody waits."""
+        if self._recent is None:
+            return
+        if not self._hello.answers:
+            self._hello = replace(self._hello, answers=True)
+            self._say_hello()
+        for array, (first, last) in request.wanted.items():
+            for message in self._recent(Ask(array, first, last - 1)):
+                if not self._try_send(wire.encode(message)):
+                    return
 
     def _acknowledge(self, ack: wire.Ack) -> None:
         if ack.who_are_you:
@@ -318,19 +354,35 @@ class Link:
         frames = [kept for kept in self._spool.frames() if kept.array in self._hello.arrays]
         self._backlog = deque(kept for kept in frames if not self._is_received(kept))
         self._hello = replace(self._hello, backlog=_spans(self._backlog))
-        self._live.extend(self._marks.values())
+        now_ns = self._clock.monotonic_ns()
+        self._live.extend((now_ns, mark) for mark in self._marks.values())
         self._marks.clear()
+        self._say_hello()
+
+    def _fall_behind(self) -> None:
+        """What waits is sound of the past now: it follows when there is room, and what is heard next goes first."""
+        if not self._hello.backlog:
+            _log.warning(
+                "the link to the server at %s is too slow; what waits is sent when there is room", self.endpoint
+            )
+        waiting, self._live = self._live, deque()
+        self._backlog.extend(message for _, message in waiting if isinstance(message, Kept))
+        newest = {message.array: message for _, message in waiting if isinstance(message, Mark)}
+        now_ns = self._clock.monotonic_ns()
+        self._live.extend((now_ns, mark) for mark in newest.values())
+        self._hello = replace(self._hello, backlog=_spans([*self._backlog_sent, *self._backlog]))
         self._say_hello()
 
     def _lose(self) -> None:
         """The server may not have got what it has not acknowledged: it is lined up again when it answers."""
         self._greeted = False
         self._received = {}
-        self._marks.update({message.array: message for message in self._live if isinstance(message, Mark)})
+        self._marks.update({message.array: message for _, message in self._live if isinstance(message, Mark)})
         for queue in (self._live, self._live_sent, self._backlog_sent):
             queue.clear()
         self._backlog = deque(self._spool.frames())
-        self._hello = replace(self._hello, backlog=_spans(self._backlog))  # the next server may be another
+        spans = _spans(self._backlog)
+        self._hello = replace(self._hello, backlog=spans, answers=False)  # the next server may be another, and older
 
     def _say_hello(self) -> None:
         self._owes_hello = not self._try_send(wire.encode(self._hello))

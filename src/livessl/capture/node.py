@@ -14,6 +14,7 @@ from livessl.capture.recorded import Part, lines_of
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
+from livessl.core.types import Ask, Message
 from livessl.errors import RunError
 from livessl.keys import node_keys
 
@@ -136,7 +137,12 @@ def _link(
     replay: bool = False,
 ) -> Link:
     rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
-    return Link(endpoint, wire.Hello(name, run_id, rates, replay), clock, node_keys(site, name), spool=spool)
+
+    def recent(ask: Ask) -> list[Message]:
+        return [message for line in lines for message in line.ask(ask)]
+
+    hello = wire.Hello(name, run_id, rates, replay)
+    return Link(endpoint, hello, clock, node_keys(site, name), spool=spool, recent=recent)
 
 
 def _sent(link: Link, lines: Sequence[Line], placed: Sequence[Placed], pace: Clock, stop: Stop) -> Iterator[int]:

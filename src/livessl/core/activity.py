@@ -8,6 +8,7 @@ low that the background could reach a tenth of it.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,6 +19,10 @@ from livessl.core.types import FRAME_S, BoolArray, Float32Array, FloatArray
 
 THRESHOLD: Final = 0.1
 """Active at or above this share of the reference power: the paper's 10 %."""
+
+DEAD: Final = 1e-3
+"""A microphone 30 dB below the second loudest of its array hears nothing: half a metre from a source, another
+half a metre makes 6 dB."""
 
 _FLOOR_SMOOTHING: Final = 5
 """Frames averaged before the minimum is taken: a 50 ms frame of low-pitched noise alone scatters by several dB."""
@@ -53,6 +58,18 @@ def band_bins(n_fft: int, sample_rate_hz: float, band_hz: tuple[float, float]) -
     low = max(1, int(np.ceil(band_hz[0] * n_fft / sample_rate_hz)))
     high = min(n_fft // 2, int(np.floor(band_hz[1] * n_fft / sample_rate_hz)))
     return low, high + 1
+
+
+def dead_channels(segments: Sequence[Float32Array]) -> BoolArray:
+    """Which channels of an array's sound, in segments (K, n) each, are dead: (K,).
+
+    The second loudest is what the others are held against: the loudest may be a broken one that crackles. Where fewer
+    than two are left, none is called dead, for there is nothing to compare. A constant offset is no sound.
+    """
+    power = np.zeros(len(segments[0]))
+    for each in segments:
+        power += np.einsum("kn,kn->k", each, each) - each.shape[1] * each.mean(axis=1) ** 2
+    return np.asarray(power < DEAD * np.sort(power)[-2])
 
 
 def is_active(power: FloatArray, reference: float | FloatArray, threshold: float = THRESHOLD) -> BoolArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from livessl.core import peaks
 from livessl.core.geometry import Grid
-from livessl.core.srp import PairTerms, SRPFunctional
+from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
 from livessl.core.types import FloatArray, HeardBy
 
 NEAR_M: Final = 0.5
@@ -24,6 +24,12 @@ LEAST_CONFIDENCE: Final = 0.8
 
 _LOGISTIC: Final = (-3.34, 2.69, 1.03)
 """Intercept, weight of the margin and of the standing in the log-odds of a right place."""
+
+LEAST_CONFIDENCE_OF_SECOND: Final = 0.6
+"""Below it a second source is not told of."""
+
+_LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
+"""As `_LOGISTIC`, of the best place left when the first source is taken out: is there a second, and is it there?"""
 
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
@@ -51,13 +57,21 @@ class Signs:
     @property
     def confidence(self) -> float:
         """Probability that the place is right to within `NEAR_M`."""
-        intercept, of_margin, of_standing = _LOGISTIC
-        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
+        return self._probability(_LOGISTIC)
+
+    @property
+    def confidence_of_second(self) -> float:
+        """Probability that there is a second source and the place right, where the first has been taken out."""
+        return self._probability(_LOGISTIC_OF_SECOND)
 
     @property
     def tell_direction(self) -> bool:
         """Whether there is anything at the place, be it only a direction: noise alone stands as high as its rms."""
         return self.standing >= 1.0
+
+    def _probability(self, logistic: tuple[float, float, float]) -> float:
+        intercept, of_margin, of_standing = logistic
+        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +113,8 @@ def judge(
     grid : Grid
     """
     terms = functional.pair_terms(position_m)
-    standing = sum(_standing(heard, term) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(peaks.margin(power, rival_power), standing)
+    together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
+    signs = Signs(peaks.margin(power, rival_power), together)
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
     refused = None
     if signs.confidence < LEAST_CONFIDENCE:
@@ -111,7 +125,18 @@ def judge(
     return Judgement(covariance_m2, signs, refused)
 
 
-def _standing(heard: HeardBy, term: PairTerms) -> float:
-    noise = float(np.sqrt(np.square(heard.gcc.values).mean(dtype=np.float64)))
-    delays = len(heard.spec.microphones_m) - 1
-    return delays / _DELAYS * max(0.0, float(term.values.mean())) / noise if noise > 0.0 else 0.0
+def standing(heard: HeardBy, power: float) -> float:
+    """An array's share of the standing: how high its SRP, of this power, stands over what its GCCs are elsewhere.
+
+    Silent pairs, of a microphone that was left out, are no measure of what the others are.
+    """
+    values = heard.gcc.values
+    square = np.einsum("pl,pl->p", values, values)
+    live = np.count_nonzero(square)
+    noise = float(np.sqrt(square.sum(dtype=np.float64) / (live * values.shape[1]))) if live else 0.0
+    return max(0.0, power) / (_DELAYS * noise) if live else 0.0
+
+
+def array_power(heard: HeardBy, term: PairTerms) -> float:
+    """An array's SRP at a point, from its pairs' terms there."""
+    return pair_weight(len(heard.spec.microphones_m)) * float(term.values.sum())

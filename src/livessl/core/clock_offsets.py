@@ -51,6 +51,9 @@ _STANDS_OUT: Final = 0.3
 _RIVAL: Final = 0.8
 """Highest other peak, of the first: a sound that repeats itself does not tell by how many periods it is late."""
 
+_MICROPHONES: Final = 2
+"""Listened to of each array: one may be dead."""
+
 _LEAST_POWER: Final = 2.0**-30 / 12.0
 """Rounding to 16 bits, full scale squared: below it nothing is heard."""
 
@@ -68,6 +71,9 @@ _LEAST_SCATTER_S: Final = 1e-3
 
 _TUKEY: Final = 4.7
 """Scatters beyond which a sound does not count."""
+
+_ITERATIONS: Final = 6
+"""Of the weights; more change less than a sound's own scatter."""
 
 _STEP_S: Final = 0.05
 """So many last sounds as are needed to believe an offset, this far off and at one: the clock was set."""
@@ -111,6 +117,7 @@ class ClockOffsets:
             clock: deque(maxlen=MOST_SOUNDS) for clock in self._clock_of.values()
         }
         self._known: dict[str, ClockOffset] = {}
+        self._lines: dict[str, _Line] = {}  # of the clocks that have not been heard since
         self._frames: dict[str, int] = dict.fromkeys(self._heard, 0)
 
     def of(self, array: str) -> ClockOffset | None:
@@ -153,11 +160,12 @@ class ClockOffsets:
         for array, late in late_s.items():
             each.setdefault(self._clock_of[array], []).append(late)
         now = {clock: float(np.median(values)) for clock, values in each.items()}
-        expected = {clock: self._fit(clock, time_ns).offset_s for clock in now if self._heard[clock]}
+        expected = {clock: self._line(clock).at(time_ns)[0] for clock in now if self._heard[clock]}
         moment = float(np.median([now[clock] - expected.get(clock, 0.0) for clock in expected or now]))
         for clock, late in now.items():
+            self._forget_before_step(clock, time_ns, late - moment)
             self._heard[clock].append((time_ns, late - moment))
-            self._forget_before_step(clock)
+            self._lines.pop(clock, None)
         self._know(time_ns)
 
     def state(self) -> dict[str, Any]:
@@ -176,39 +184,40 @@ class ClockOffsets:
             if clock in state["known"]:
                 self._known[clock] = ClockOffset(*state["known"][clock])
 
-    def _fit(self, clock: str, time_ns: int) -> _Line:
-        times, offsets = np.array(self._heard[clock], dtype=np.float64).T
-        return _line((times - time_ns) / 1e9, offsets)
+    def _line(self, clock: str) -> _Line:
+        if clock not in self._lines:
+            self._lines[clock] = _line(*zip(*self._heard[clock], strict=True))
+        return self._lines[clock]
 
-    def _forget_before_step(self, clock: str) -> None:
+    def _forget_before_step(self, clock: str, time_ns: int, late_s: float) -> None:
+        """Forget all but the last sounds where these and the new one agree, and are far off what was before."""
         heard = self._heard[clock]
         if len(heard) < 2 * LEAST_SOUNDS:
             return
-        before = np.array(list(heard)[:-LEAST_SOUNDS], dtype=np.float64)
-        last = np.array(list(heard)[-LEAST_SOUNDS:], dtype=np.float64)
-        line = _line((before[:, 0] - last[-1, 0]) / 1e9, before[:, 1])
-        off_s = last[:, 1] - line.offset_s - line.drift * (last[:, 0] - last[-1, 0]) / 1e9
-        if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2:
-            for _ in range(len(before)):
+        line = self._line(clock)
+        last = [*list(heard)[1 - LEAST_SOUNDS :], (time_ns, late_s)]
+        off_s = np.array([late - line.at(at_ns)[0] for at_ns, late in last])
+        if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2.0:
+            while len(heard) >= LEAST_SOUNDS:
                 heard.popleft()
 
     def _know(self, time_ns: int) -> None:
-        lines = {clock: self._fit(clock, time_ns) for clock, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS}
-        known = [clock for clock in self._heard if clock in lines and lines[clock].std_s < KNOWN_S]
+        found = {c: self._line(c).at(time_ns) for c, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS}
+        known = {clock: (offset_s, std_s) for clock, (offset_s, std_s) in found.items() if std_s < KNOWN_S}
         if len(known) < 2:
             return
-        ordered = sorted(known, key=lambda clock: lines[clock].offset_s)
+        ordered = sorted(known, key=lambda clock: known[clock][0])
         middle = ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1]
-        reference = min(middle, key=known.index)
-        zero = lines[reference]
+        reference = next(clock for clock in known if clock in middle)
+        zero_s, zero_std_s = known[reference]
         self._known = {
             clock: ClockOffset(
-                lines[clock].offset_s - zero.offset_s,
-                0.0 if clock == reference else lines[clock].std_s + zero.std_s,
+                offset_s - zero_s,
+                0.0 if clock == reference else std_s + zero_std_s,
                 len(self._heard[clock]),
                 reference,
             )
-            for clock in known
+            for clock, (offset_s, std_s) in known.items()
         }
         for clock, offset in self._known.items():
             if abs(offset.offset_s - self._frames[clock] * FRAME_S) > _MUCH * FRAME_S:
@@ -226,27 +235,34 @@ def clock_is_off(offset: ClockOffset) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    offset_s: float  # at time 0
+    origin_ns: int
+    offset_s: float
     drift: float
-    std_s: float
+    covariance: FloatArray  # (2, 2) of offset and drift
+
+    def at(self, time_ns: int) -> tuple[float, float]:
+        """Offset at a time and its standard deviation, seconds."""
+        since_s = (time_ns - self.origin_ns) / 1e9
+        terms = np.array([1.0, since_s])
+        return self.offset_s + self.drift * since_s, float(np.sqrt(terms @ self.covariance @ terms))
 
 
-def _line(times_s: FloatArray, offsets_s: FloatArray) -> _Line:
-    """Line through (times, offsets), each (n,), by iterated weights (Tukey's); flat where too few tell its slope."""
-    terms = np.stack([np.ones_like(times_s), times_s], axis=1)
-    found = np.array([np.median(offsets_s), 0.0])
-    scatter = _LEAST_SCATTER_S
-    for _ in range(10):
-        off = offsets_s - terms @ found
-        scatter = max(_LEAST_SCATTER_S, 1.4826 * float(np.median(np.abs(off))))
-        weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * scatter))))
-        normal = (terms.T * weights) @ terms + np.diag([0.0, (scatter / _DRIFT) ** 2])
-        found = np.linalg.solve(normal, (terms.T * weights) @ offsets_s)
-    return _Line(float(found[0]), float(found[1]), float(scatter * np.sqrt(np.linalg.inv(normal)[0, 0])))
+def _line(times_ns: Sequence[int], offsets_s: Sequence[float]) -> _Line:
+    """Line through the offsets at some times by iterated weights (Tukey's); flat where too few tell its slope."""
+    origin_ns, late_s = times_ns[-1], np.array(offsets_s)
+    terms = np.stack([np.ones_like(late_s), (np.array(times_ns) - origin_ns) / 1e9], axis=1)
+    found = np.array([np.median(late_s), 0.0])
+    for _ in range(_ITERATIONS):
+        off_s = late_s - terms @ found
+        scatter_s = max(_LEAST_SCATTER_S, 1.4826 * float(np.median(np.abs(off_s))))
+        weights = np.square(np.maximum(0.0, 1.0 - np.square(off_s / (_TUKEY * scatter_s))))
+        normal = (terms.T * weights) @ terms + np.diag([0.0, (scatter_s / _DRIFT) ** 2])
+        found = np.linalg.solve(normal, (terms.T * weights) @ late_s)
+    return _Line(origin_ns, float(found[0]), float(found[1]), scatter_s**2 * np.linalg.inv(normal))
 
 
 def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, float]) -> dict[str, float]:
-    """How late each array heard a sound against the first one, but for the travel time; none where it is not sure.
+    """How late each array heard a sound against one that did well, but for the travel time; none where it is not sure.
 
     Parameters
     ----------
@@ -258,9 +274,9 @@ def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, flo
     rises = {array: _rises(some) for array, some in frames.items() if len(some) > 1}
     if len(rises) < 2:
         return {}
-    first, *others = rises
+    first = max(rises, key=lambda array: float(np.square(rises[array]).sum()))
     late = {first: 0.0}
-    for other in others:
+    for other in (array for array in rises if array != first):
         lag_s = _lag_s(rises[first], rises[other])
         if lag_s is not None:
             began_s = (frames[other][0].time_ns - frames[first][0].time_ns) / 1e9
@@ -271,9 +287,14 @@ def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, flo
 def _rises(frames: Sequence[Frame]) -> FloatArray:
     """By how much the power of each piece of `HOP_S` exceeds all before it, less the decay; log, (n,)."""
     frames = frames[: round(LISTENED_S / FRAME_S)]
+    samples = np.concatenate([frame.samples[:_MICROPHONES] for frame in frames], axis=1)
+    steps = np.diff(samples, axis=1, prepend=samples[:, :1])  # no rumble
     pieces = round(FRAME_S / HOP_S)
-    steps = [np.diff(frame.samples, axis=1, prepend=frame.samples[:, :1]) for frame in frames]  # no rumble
-    power = np.concatenate([_means(np.square(step).mean(axis=0), pieces) for step in steps])
+    lengths = [frame.samples.shape[1] for frame in frames]
+    begins = np.cumsum([0, *lengths[:-1]])
+    edges = np.concatenate([first + np.arange(pieces) * n // pieces for first, n in zip(begins, lengths, strict=True)])
+    energy = np.add.reduceat(np.square(steps).sum(axis=0, dtype=np.float64), edges)
+    power = energy / (len(samples) * np.maximum(1, np.diff(edges, append=samples.shape[1])))
     floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
     decay = np.log(10.0) / 10.0 * _DECAY_DB_S * HOP_S * np.arange(len(level))
@@ -299,7 +320,3 @@ def _lag_s(first: FloatArray, other: FloatArray) -> float | None:
         return None
     before, at, after = fits[top - 1 : top + 2]
     return float(lags[top] + 0.5 * (before - after) / (before - 2.0 * at + after)) * HOP_S
-
-
-def _means(values: FloatArray, pieces: int) -> FloatArray:
-    return np.array([part.mean() for part in np.array_split(values, pieces)])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
 
-from livessl.core import certainty, peaks
+from livessl.core import agreement, certainty, peaks, several
+from livessl.core.activity import dead_channels
 from livessl.core.certainty import Signs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
 from livessl.core.gcc import GCCPhat, LagSampling, microphone_pairs, require_band, uses_envelope
@@ -28,6 +29,18 @@ class Sound:
     sample_rate_hz: float
     onsets: OnsetGCC | None = None
     """What the estimator's listener made of its frames and those around them, where there is one."""
+    doubted: bool = False
+    """Whether the array has disagreed with the others lately."""
+    moments: tuple[OnsetGCC, ...] = ()
+    """The onsets frame by frame, where a second source is to be looked for."""
+
+    def live(self, gcc: GCC) -> GCC:
+        """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
+        dead = dead_channels(self.segments)
+        if not dead.any():
+            return gcc
+        values = np.where(np.any(dead[gcc.pairs], axis=1)[:, None], np.float32(0.0), gcc.values)
+        return GCC(gcc.pairs, gcc.lags_s, values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +59,11 @@ class Localization:
     """What the confidence was worked out from, where it is a probability."""
     refused: str | None = None
     """Why it should not be relied on, where it should not."""
+    outvoted: Mapping[str, float] | None = None
+    """Arrays that it was found without, for they disagree with the others, and by what angle in degrees; None where
+    nobody asked."""
+    others: tuple[Localization, ...] = ()
+    """Other sources that sounded at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +182,7 @@ class SrpPhat:
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)
         gcc, *below = correlate.below(sound.segments, cut_offs_hz)
-        return HeardBy(self._arrays[array], gcc, tuple(below))
+        return HeardBy(self._arrays[array], sound.live(gcc), tuple(map(sound.live, below)))
 
     def _correlator(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, Sequence[float]]:
         known = self._correlators.get(array)
@@ -230,7 +248,8 @@ class Averaged(SrpPhat):
 class Onset(SrpPhat):
     """The default: the directions of onsets, noise and reverberation taken for what they are (`livessl.core.onset`).
 
-    It is SRP-PHAT of another correlation. Places are searched for on nodes `SEARCH_SPACING_M` apart or nearer, whatever
+    It is SRP-PHAT of another correlation. An array that the others outvote has no part in the answer
+    (`livessl.core.agreement`). Places are searched for on nodes `SEARCH_SPACING_M` apart or nearer, whatever
     the grid of the maps, and refined below that, so that the answer does not depend on the grid. It tells how
     sure it is by probability, and refuses what is too unsure (`livessl.core.certainty`).
 
@@ -257,18 +276,72 @@ class Onset(SrpPhat):
         return OnsetFrontEnd(self._arrays[array], sample_rate_hz, self._sampling(array, sample_rate_hz))
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        """Find the highest place of the summed maps, refine it, and judge it."""
+        """Find the highest place of the summed maps, outvote who does not agree on it, and judge what is left."""
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
+        doubted = [name for name, sound in sounds.items() if sound.doubted]
+        agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
+        second = self._second(agreed.place, sounds)
+        place = agreed.place
+        others: tuple[Localization, ...] = ()
+        if second is not None:
+            place, others = second[0], (replace(second[1], outvoted=agreed.outvoted),)
+        judged = _judged(place, self._grid)
+        refused = judged.refused if second is not None else agreed.refused or judged.refused
+        if not place.proven:
+            refused = "nothing stands out: the search for the place was given up"
+        return Localization(
+            place.position_m,
+            judged.covariance_m2,
+            judged.signs.confidence,
+            evidence,
+            place.proven,
+            judged.signs,
+            refused,
+            agreed.outvoted,
+            others,
+        )
+
+    def _second(
+        self, first: agreement.Place, sounds: Mapping[str, Sound]
+    ) -> tuple[agreement.Place, Localization] | None:
+        """The first place as it is without a second source, and the second; None where there is none.
+
+        What the first explains is taken out, and the second looked for; without that the first is looked for again, and
+        then the second once more.
+        """
+        specs = [heard.spec for heard in first.evidence]
+        if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
+            return None
+        if any(uses_envelope(spec.band_hz) for spec in specs):
+            return None  # magnitudes do not add up
+        moments = [self._moments(heard, sounds[heard.spec.name]) for heard in first.evidence]
+        places = [first]
+        for _ in range(3):
+            terms = places[-1].functional.pair_terms(places[-1].position_m)
+            left = [each.without(term.lags_s) for each, term in zip(moments, terms, strict=True)]
+            places.append(self._place(left))
+        again, second = places[-2:]
+        judged = _judged(second, self._grid)
+        confidence = judged.signs.confidence_of_second
+        apart_m = float(np.linalg.norm(again.position_m - second.position_m))
+        if confidence < certainty.LEAST_CONFIDENCE_OF_SECOND or apart_m < several.APART_M or not second.proven:
+            return None
+        evidence = tuple(second.evidence)
+        return again, Localization(second.position_m, judged.covariance_m2, confidence, evidence, signs=judged.signs)
+
+    def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
+        sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
+        return several.Moments.of(heard.spec, sampling, sound.moments, np.any(heard.gcc.values, axis=1))
+
+    def _place(self, evidence: Sequence[HeardBy]) -> agreement.Place:
+        evidence = tuple(sorted(evidence, key=lambda heard: heard.spec.name))  # sums depend on the order
         find = self._search.among(evidence)
         found = find(_STARTS)
         functional = SRPFunctional(evidence, self._c_m_s)
         starts_m = np.stack([self._grid.node_m(peak.node) for peak in found])
         position, power = peaks.refine(functional, starts_m, self._grid)
         rival_power = peaks.rival_power(find, self._grid, position)
-        judged = certainty.judge(functional, evidence, position, power, rival_power, self._grid)
-        confidence, proven = judged.signs.confidence, found[0].proven
-        refused = judged.refused if proven else "nothing stands out: the search for the place was given up"
-        return Localization(position, judged.covariance_m2, confidence, evidence, proven, judged.signs, refused)
+        return agreement.Place(evidence, functional, position, power, rival_power, found[0].proven)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         onsets = sound.onsets
@@ -277,7 +350,8 @@ class Onset(SrpPhat):
         sampling = self._sampling(array, sound.sample_rate_hz)
         values = sampling.fine(onsets.lags / np.float32(max(onsets.weight, 1.0)))
         spec = self._arrays[array]
-        return HeardBy(spec, GCC(microphone_pairs(len(spec.microphones_m)), sampling.fine_lags_s, values))
+        gcc = GCC(microphone_pairs(len(spec.microphones_m)), sampling.fine_lags_s, values)
+        return HeardBy(spec, sound.live(gcc))
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
         known = self._samplings.get(array)
@@ -289,6 +363,10 @@ class Onset(SrpPhat):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
+
+
+def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
+    return certainty.judge(place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid)
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:

@@ -16,7 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.activity import THRESHOLD, band_power, exact_mask, runs
+from livessl.core.activity import THRESHOLD, band_power, dead_channels, exact_mask, runs
+from livessl.core.asking import MOST_ASKED_S, Allowance, Asked, AskedSound, better, is_sure, nearest
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
@@ -26,10 +27,12 @@ from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
     ArraySpec,
+    Ask,
     ClockState,
     Contribution,
     Estimate,
     Event,
+    Float32Array,
     FloatArray,
     Frame,
     Mark,
@@ -50,6 +53,9 @@ TROUBLE_NS: Final = 10_000_000_000
 SILENT_NS: Final = 1_000_000_000
 """All-zero samples for so long are a dead microphone: any real one has noise."""
 
+ANSWER_S: Final = 0.3
+"""Long against the way to a node and back, short for who waits for an event."""
+
 EARLIEST_NS: Final = -30_000_000_000
 LATEST_NS: Final = 500_000_000
 """Frames this far from the server's time come from a clock that is wrong: sound is never ahead of its time by more than
@@ -67,6 +73,13 @@ RANGE_APERTURES: Final = 2.0
 delays, which the covariance cannot know, moves the place along the line of sight by metres."""
 
 
+VOTES: Final = 10
+"""Sounds that an array's agreement with the others is told of."""
+
+LEAST_VOTES: Final = 3
+"""An array is doubted that was outvoted so often, and in more than half of the last `VOTES` sounds; until it has agreed
+so often in a row."""
+
 SHARED_FRAMES: Final = 4096
 """Frames of which a fusion and its twin share what listeners made of them: some seconds of many arrays."""
 
@@ -75,6 +88,9 @@ UNHEARD_FRAMES: Final = 600
 
 _Shared = dict[tuple[str, int], OnsetGCC]
 """By array and chain of frames."""
+
+_Votes = tuple[tuple[int, float | None], ...]
+"""Of the last sounds, by the raster interval each began at: by what angle the array was off, None where it agreed."""
 
 
 class ArrayState(StrEnum):
@@ -95,6 +111,8 @@ class FusionParameters:
     ----------
     deadline_s : float
         How long an interval waits for a late array.
+    answer_s : float
+        How long an event waits for what arrays were asked for.
     window_s, update_s : float
         Length of the windows that updates are made from, and the time between updates.
     max_event_s : float
@@ -105,9 +123,12 @@ class FusionParameters:
         The activity rule's.
     pre_roll_s, hang_over_s : float
         As the nodes use them: an event ends after a quiet hang-over.
+    sources, live_sources : int
+        How many sources, 1 or 2, are looked for in a sound that has ended, and in the windows of one that goes on.
     """
 
     deadline_s: float = 0.5
+    answer_s: float = ANSWER_S
     window_s: float = 0.2
     update_s: float = 0.1
     max_event_s: float = 10.0
@@ -115,6 +136,8 @@ class FusionParameters:
     threshold: float = THRESHOLD
     pre_roll_s: float = 0.4
     hang_over_s: float = 0.3
+    sources: int = 2
+    live_sources: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +156,9 @@ class ArrayStatus:
     drift_ppm: float | None
     clock: ClockState | None
     counters: Mapping[str, int]
+    agreed: int = 0
+    disagreed: int = 0
+    """In how many of the last sounds that three arrays or more heard it agreed with the others, and in how many not."""
     clock_offset: ClockOffset | None = None
     corrected_frames: int = 0
 
@@ -152,11 +178,14 @@ class _Stream:
     rate_hz: float | None = None
     dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
     dead_since_ns: int = 0
+    weak: tuple[int, ...] = ()  # channels from 1, that hear next to nothing of what the others hear
+    weak_since_ns: int = 0
     trouble_ns: int | None = None
     trouble: str = ""
     left: bool = False
     ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
     rest_ns: int = 0  # that it is ahead besides
+    allowance: Allowance = field(default_factory=Allowance)
     listener: OnsetFrontEnd | None = None
     chain: int = 0  # names the frames listened to, in their order
     unheard: deque[int] = field(
@@ -176,6 +205,13 @@ class _Stream:
         if dead and not self.dead:
             self.dead_since_ns = now_ns
         self.dead = dead
+
+    def find_weak(self, now_ns: int, samples: Float32Array) -> None:
+        """Take note of the channels that hear nothing of a sound."""
+        weak = tuple(k for k, dead in enumerate(dead_channels([samples]).tolist(), start=1) if dead)
+        if weak and not self.weak:
+            self.weak_since_ns = now_ns
+        self.weak = weak
 
     def has_active(self, raster: int) -> bool:
         frame = self.frames.get(raster)
@@ -247,10 +283,9 @@ class _Stream:
         self.unheard.clear()
         self.onsets.clear()
 
-    def onsets_at(self, rasters: Iterable[int]) -> OnsetGCC | None:
-        """All that was listened to at `rasters` together; None for nothing."""
-        heard = [self.onsets[raster] for raster in rasters if raster in self.onsets]
-        return reduce(add, heard) if heard else None
+    def onsets_at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
+        """What was listened to at `rasters`."""
+        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
 
 
 @dataclass(slots=True)
@@ -261,6 +296,10 @@ class _OpenEvent:
     late_frames: int = 0
     ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
     became_quiet: bool = False
+    heard: _Heard | None = None
+    told: list[Output] | None = None  # by those that heard it, while others are asked
+    asked: dict[str, Asked] = field(default_factory=dict)
+    asked_ns: int = 0
 
 
 class Fusion:
@@ -311,6 +350,9 @@ class Fusion:
         self._due: int | None = None
         self._shared: _Shared = {}
         self._spared: Collection[str] = ()
+        self._votes: dict[str, _Votes] = dict.fromkeys(self._streams, ())
+        self.askable: set[str] = set()
+        """Arrays whose nodes can be asked for what they did not send."""
         self.updates_left_out = 0
         self.unknown_arrays = 0
 
@@ -320,7 +362,7 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._shared = self._shared
+        other._shared, other._votes, other.askable = self._shared, self._votes, self.askable
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -404,7 +446,7 @@ class Fusion:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
         clocks = self.clock_offsets
         return [
-            _status(stream, now_ns, None if clocks is None else clocks.of(name))
+            _status(stream, now_ns, self._votes[name], None if clocks is None else clocks.of(name))
             for name, stream in self._streams.items()
         ]
 
@@ -421,6 +463,7 @@ class Fusion:
         }
         self._reached.clear()
         self._shared.clear()
+        self._votes.update(dict.fromkeys(self._votes, ()))
         self._next, self._heard_until = None, -(2**63)
         return outputs
 
@@ -431,6 +474,9 @@ class Fusion:
             return
         if stream.ahead:
             message = replace(message, raster=message.raster - stream.ahead)
+        if isinstance(message, Frame) and message.sequence == 0:
+            self._take_answer(stream, message)
+            return
         ahead_ns = message.raster * FRAME_NS - self._now_ns
         if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
             stream.counters["rejected"] += 1
@@ -471,6 +517,8 @@ class Fusion:
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
+            if frame.active:
+                stream.find_weak(self._now_ns, frame.samples)
         return True
 
     def _close_ready(self) -> list[Output]:
@@ -481,12 +529,18 @@ class Fusion:
         if newest - self._next > JUMP_FRAMES:
             outputs += self._finish() if self._event is not None else []
             self._next = newest
-        while self._next <= self._newest() and self._may_close(self._next):
+        while True:
+            if self._event is not None and self._event.asked:
+                if not self._is_answered(self._event):
+                    break
+                outputs += self._finish()
+            if self._next > self._newest() or not self._may_close(self._next):
+                break
             raster, self._next = self._next, self._next + 1
             outputs += self._close(raster)
             self._prune()
         due, self._due = self._due, None
-        if due is not None and self._event is not None and due >= self._event.start:
+        if due is not None and self._event is not None and not self._event.ended and due >= self._event.start:
             outputs += self._update(self._event, due)
         return outputs
 
@@ -529,8 +583,8 @@ class Fusion:
         if active:
             event.last_active = raster
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
-            event.ended = event.became_quiet = True
-            return self._finish()
+            event.became_quiet = True
+            return self._end(event)
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
         if self._updates and active and (raster - event.start + 1) % period == 0:
@@ -540,8 +594,7 @@ class Fusion:
             else:
                 outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
-            event.ended = True
-            outputs += self._finish()
+            outputs += self._end(event)
         return outputs
 
     def _open(self, raster: int) -> _OpenEvent:
@@ -556,17 +609,20 @@ class Fusion:
                 stream.listen(span, self._estimator, self._shared)
         return _OpenEvent(raster, raster, raster)
 
+    def _span(self, event: _OpenEvent) -> range:
+        return range(self._span_start(event.start), event.closed + 1)
+
     def _span_start(self, start: int) -> int:
         """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
         return max(start - round(self._parameters.pre_roll_s / FRAME_S), self._heard_until)
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds = _Sounds()
+        sounds = _Sounds(self._parameters.live_sources)
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
-            if pieces:
+            if pieces and not _doubts(self._votes[name]):
                 sounds.pieces[name] = pieces
                 sounds.onsets[name] = stream.onsets_at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
@@ -577,17 +633,19 @@ class Fusion:
         estimate = _estimate(found, middle_ns, sounds)
         status, _ = self._judge(estimate, found)
         loudest = max(float(power.max()) for power in powers.values())
-        contributions = self._contributions(powers, estimate)
+        contributions = self._contributions(powers, estimate, found)
         complete_ns = window.stop * FRAME_NS
-        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns)
-        trusted = [] if status is Status.REFUSED else [estimate]
+        others = self._others(found, middle_ns, sounds)
+        update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns, others)
+        trusted = [*([] if status is Status.REFUSED else [estimate]), *others]
         tracks: list[Track] = self._tracker.step(middle_ns, trusted)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
         event, self._event = self._event, None
         assert event is not None
-        told = self._told(event)
+        told = self._told(event) if event.told is None else self._reconsidered(event, event.told)
+        self._heard_until = event.last_active + 1
         if event.became_quiet:
             self._align()
         return told
@@ -611,15 +669,24 @@ class Fusion:
             self._next = max(self._next, self._heard_until)
 
     def _told(self, event: _OpenEvent) -> list[Output]:
-        parameters = self._parameters
-        span = range(self._span_start(event.start), event.closed + 1)
-        sounds = _Sounds()
-        powers: dict[str, FloatArray] = {}
-        self._heard_until = event.last_active + 1
+        """What those that heard an event say of it; nothing where another fusion tells it."""
         if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
             return []
-        starts_ns: list[int] = []
-        ends_ns: list[int] = []
+        heard = event.heard = self._heard(event)
+        if not heard.sounds:
+            return []
+        answers, found = self._answer(event, heard)
+        first = answers[0]
+        if first.status is Status.LOCATED and first.estimate is not None and event.became_quiet and len(answers) == 1:
+            self._learn_clocks(first.end_ns, first.estimate, self._span(event))
+        if first.status is not Status.REFUSED and found is not None:
+            self._count_votes(event.start, found, heard.sounds)
+        return [*answers]
+
+    def _heard(self, event: _OpenEvent) -> _Heard:
+        parameters = self._parameters
+        span = self._span(event)
+        heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)}))
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -636,41 +703,131 @@ class Fusion:
             if any(raster not in stream.onsets for raster in there):  # some came late
                 stream.forget()
                 stream.listen(span, self._estimator, self._shared)
-            sounds.pieces[name], powers[name] = pieces, power[mask]
-            sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
-            starts_ns.append(rasters[0] * FRAME_NS - stream.rest_ns)
-            ends_ns.append((rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
-        if not sounds:
-            return []
-        start_ns, end_ns = min(starts_ns), max(ends_ns)
+            heard.sounds.pieces[name], heard.powers[name] = pieces, power[mask]
+            heard.sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
+            heard.start_ns = min(heard.start_ns, rasters[0] * FRAME_NS - stream.rest_ns)
+            heard.end_ns = max(heard.end_ns, (rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
+        return heard
+
+    def _answer(
+        self, event: _OpenEvent, heard: _Heard, asked: Mapping[str, AskedSound] | None = None
+    ) -> tuple[list[Event], Localization | None]:
+        """What the arrays that heard a sound say of it together with some that were asked, of each source one event."""
+        sounds, powers = heard.with_asked(asked or {})
+        middle_ns = (heard.start_ns + heard.end_ns) // 2
+        found: Localization | None = None
         estimate: Estimate | None = None
         status = Status.REFUSED
-        reason: str | None = f"heard by {len(sounds)} of at least {parameters.min_arrays} arrays"
-        if len(sounds) >= parameters.min_arrays:
+        contributions: tuple[Contribution, ...] = ()
+        others: tuple[Estimate, ...] = ()
+        reason: str | None = f"heard by {len(sounds)} of at least {self._parameters.min_arrays} arrays"
+        if len(sounds) >= self._parameters.min_arrays:
             found = self._estimator.locate(sounds)
-            estimate = _estimate(found, (start_ns + end_ns) // 2, sounds)
+            estimate = _estimate(found, middle_ns, sounds)
             status, reason = self._judge(estimate, found)
-            if status is Status.LOCATED and event.became_quiet:
-                self._learn_clocks(end_ns, estimate, span)
-            elif status is Status.REFUSED:
+            others = self._others(found, middle_ns, sounds)
+            if status is Status.REFUSED:
                 estimate = None
+            else:
+                contributions = self._contributions(powers, estimate, found, asked or {})
+        first = Event(
+            id=self._id(event.start),
+            start_ns=heard.start_ns,
+            end_ns=heard.end_ns,
+            status=status,
+            reason=reason,
+            estimate=estimate,
+            power=max(float(power.max()) for power in heard.powers.values()),
+            method=self._estimator.name,
+            contributions=contributions,
+            heard_by=tuple(heard.sounds),
+            late_frames=event.late_frames,
+            latency_s=(self._now_ns - heard.end_ns) / 1e9,
+            complete_ns=(event.closed + 1) * FRAME_NS,
+        )
+        if found is None:
+            return [first], None
         return [
-            Event(
-                id=self._id(event.start),
-                start_ns=start_ns,
-                end_ns=end_ns,
-                status=status,
-                reason=reason,
-                estimate=estimate,
-                power=max(float(power.max()) for power in powers.values()),
-                method=self._estimator.name,
-                contributions=() if estimate is None else self._contributions(powers, estimate),
-                heard_by=tuple(sounds),
-                late_frames=event.late_frames,
-                latency_s=(self._now_ns - end_ns) / 1e9,
-                complete_ns=(event.closed + 1) * FRAME_NS,
-            )
+            first,
+            *(
+                replace(
+                    first,
+                    id=f"{first.id}-{source}",
+                    source=source,
+                    status=Status.LOCATED,
+                    reason=None,
+                    estimate=other,  # of how loud each was nobody can tell
+                    contributions=self._contributions(powers, other, found, asked or {}),
+                )
+                for source, other in enumerate(others, 2)
+            ),
+        ], found
+
+    def _others(self, found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> tuple[Estimate, ...]:
+        """Further sources of the same sound: those that are places."""
+        estimates = (_estimate(other, time_ns, sounds) for other in found.others)
+        places = zip(estimates, found.others, strict=True)
+        return tuple(estimate for estimate, other in places if self._judge(estimate, other)[0] is Status.LOCATED)
+
+    def _end(self, event: _OpenEvent) -> list[Output]:
+        """The sound is over: tell of it, unless somebody is to be asked first."""
+        event.ended = True
+        if self.askable:
+            event.told = self._told(event)
+            event.asked = self._whom_to_ask(event)
+            event.asked_ns = self._now_ns
+        if not event.asked:
+            return self._finish()
+        ahead = {name: self._streams[name].ahead for name in event.asked}
+        spans = {name: asked.span for name, asked in event.asked.items()}
+        return [Ask(name, span[0] + ahead[name], span[-1] + ahead[name]) for name, span in spans.items()]
+
+    def _whom_to_ask(self, event: _OpenEvent) -> dict[str, Asked]:
+        """Arrays that may help where those that heard the sound are not sure."""
+        answer = next((told for told in event.told or () if isinstance(told, Event)), None)
+        if answer is None or event.heard is None or is_sure(answer):
+            return {}
+        if not any(event.heard.sounds.onsets.values()):
+            return {}  # the estimator gives every array the same weight, whatever it heard
+        heard = [self._streams[name].spec for name in answer.heard_by]
+        silent = [
+            stream.spec
+            for name, stream in self._streams.items()
+            if name in self.askable and name not in answer.heard_by and not stream.left
         ]
+        first = self._span_start(event.start)
+        span = range(first, min(event.last_active + 1, first + round(MOST_ASKED_S / FRAME_S)))
+        return {
+            spec.name: Asked(span)
+            for spec in (nearest(silent, heard) if silent else ())
+            if self._streams[spec.name].allowance.take(len(span), event.closed)
+        }
+
+    def _is_answered(self, event: _OpenEvent) -> bool:
+        if self._now_ns - event.asked_ns >= self._parameters.answer_s * 1e9:
+            return True
+        return all(asked.is_answered or name not in self.askable for name, asked in event.asked.items())
+
+    def _take_answer(self, stream: _Stream, frame: Frame) -> None:
+        asked = None if self._event is None else self._event.asked.get(frame.array)
+        if asked is not None and frame.raster in asked.span and len(frame.samples) == len(stream.spec.microphones_m):
+            asked.frames[frame.raster] = frame
+
+    def _reconsidered(self, event: _OpenEvent, told: list[Output]) -> list[Output]:
+        """The answer with those that were asked, where it is better with all or one of them."""
+        best: list[Event] = [output for output in told if isinstance(output, Event)]
+        if not best or event.heard is None:
+            return told
+        sounds = {name: asked.sound(self._estimator, event.start) for name, asked in event.asked.items()}
+        some = {name: sound for name, sound in sounds.items() if sound is not None}
+        tries = [some, *({name: some[name]} for name in some if len(some) > 1)] if some else []
+        for each in tries:
+            answers, found = self._answer(event, event.heard, each)
+            if better(answers[0], best[0]):
+                best = answers
+                if answers[0].status is not Status.REFUSED and found is not None:
+                    self._count_votes(event.start, found, event.heard.sounds)
+        return [*best]
 
     def _learn_clocks(self, time_ns: int, estimate: Estimate, span: range) -> None:
         clocks = self.clock_offsets
@@ -687,14 +844,31 @@ class Fusion:
         nearest_m = min(_distance_m(spec, estimate) for spec in specs)
         alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
         if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return (Status.LOCATED, None) if found.refused is None else (Status.REFUSED, found.refused)
+            return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
         if found.signs is not None and not found.signs.tell_direction:
             return Status.REFUSED, "nothing that was heard came from any one direction"
         who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
         return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
-    def _contributions(self, powers: Mapping[str, FloatArray], estimate: Estimate) -> tuple[Contribution, ...]:
-        return tuple(_contribution(self._streams[name].spec, powers[name], estimate) for name in powers)
+    def _count_votes(self, start: int, found: Localization, sounds: Iterable[str]) -> None:
+        """Remember who agreed. Replaced, never changed, for other threads read it."""
+        if found.outvoted is None or len(found.evidence) < LEAST_VOTES:
+            return
+        for name in sounds:
+            before = [vote for vote in self._votes[name] if vote[0] != start]
+            self._votes[name] = (*before, (start, found.outvoted.get(name)))[-VOTES:]
+
+    def _contributions(
+        self,
+        powers: Mapping[str, FloatArray],
+        estimate: Estimate,
+        found: Localization,
+        asked: Collection[str] = (),
+    ) -> tuple[Contribution, ...]:
+        return tuple(
+            _contribution(self._streams[name].spec, powers[name], estimate, found, asked=name in asked)
+            for name in powers
+        )
 
     def _id(self, raster: int) -> str:
         return f"{self._site}-{raster * FRAME_NS // 1_000_000}"
@@ -713,14 +887,23 @@ class Fusion:
 class _Sounds(Mapping[str, Sound]):
     """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, sources: int, doubted: Collection[str] = ()) -> None:
+        self.doubted = doubted
+        self.sources = sources
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
-        self.onsets: dict[str, OnsetGCC | None] = {}
+        self.onsets: dict[str, tuple[OnsetGCC, ...]] = {}
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
         segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
-        return Sound(segments, pieces[0][0].sample_rate_hz, self.onsets[array])
+        onsets = self.onsets[array]
+        return Sound(
+            segments,
+            pieces[0][0].sample_rate_hz,
+            reduce(add, onsets) if onsets else None,
+            array in self.doubted,
+            onsets if self.sources > 1 else (),
+        )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.pieces)
@@ -729,8 +912,29 @@ class _Sounds(Mapping[str, Sound]):
         return len(self.pieces)
 
 
+@dataclass(slots=True)
+class _Heard:
+    """What the arrays heard of one event: their sounds, the powers of the frames in them, from when to when."""
+
+    sounds: _Sounds
+    powers: dict[str, FloatArray] = field(default_factory=dict)
+    start_ns: int = 2**63 - 1
+    end_ns: int = -(2**63)
+
+    def with_asked(self, asked: Mapping[str, AskedSound]) -> tuple[_Sounds, dict[str, FloatArray]]:
+        """These sounds and powers, and those of arrays that were asked."""
+        sounds, powers = _Sounds(self.sounds.sources, self.sounds.doubted), dict(self.powers)
+        sounds.pieces |= self.sounds.pieces
+        sounds.onsets |= self.sounds.onsets
+        for name, sound in asked.items():
+            sounds.pieces[name], sounds.onsets[name] = [sound.frames], sound.onsets
+            powers[name] = np.array([frame.power for frame in sound.frames])
+        return sounds, powers
+
+
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
-    return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, tuple(sounds))
+    arrays = tuple(name for name in sounds if name not in (found.outvoted or ()))
+    return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
 def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
@@ -738,9 +942,32 @@ def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
     return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
 
 
-def _contribution(spec: ArraySpec, power: FloatArray, estimate: Estimate) -> Contribution:
+def _contribution(
+    spec: ArraySpec, power: FloatArray, estimate: Estimate, found: Localization, *, asked: bool
+) -> Contribution:
     azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
-    return Contribution(spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance)
+    agrees: bool | None = None
+    if found.outvoted is not None and len(found.evidence) > 1:
+        agrees = spec.name not in found.outvoted
+    off_deg = (found.outvoted or {}).get(spec.name)
+    return Contribution(
+        spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, agrees, off_deg, asked
+    )
+
+
+def _dissent(found: Localization) -> str | None:
+    """Who was outvoted, in words."""
+    if not found.outvoted:
+        return None
+    each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outvoted.items()))
+    return f"located without {each}: outvoted by the others"
+
+
+def _doubts(votes: _Votes) -> bool:
+    """Whether an array is to be doubted: see `LEAST_VOTES`."""
+    off = [vote for vote in votes if vote[1] is not None]
+    lately = any(vote[1] is not None for vote in votes[-LEAST_VOTES:])
+    return len(off) >= LEAST_VOTES and 2 * len(off) > len(votes) and lately
 
 
 def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
@@ -758,10 +985,10 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
         stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
-def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArrayStatus:
+def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | None) -> ArrayStatus:
     mark = stream.mark
     age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
-    state, reason = _state(stream, age_ns, now_ns)
+    state, reason = _state(stream, age_ns, now_ns, votes)
     if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
         state, reason = ArrayState.DEGRADED, clock_is_off(offset)
     return ArrayStatus(
@@ -777,6 +1004,8 @@ def _status(stream: _Stream, now_ns: int, offset: ClockOffset | None) -> ArraySt
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,
         counters=dict(stream.counters),
+        agreed=sum(off_deg is None for _, off_deg in votes),
+        disagreed=sum(off_deg is not None for _, off_deg in votes),
         clock_offset=offset,
         corrected_frames=stream.ahead,
     )
@@ -790,7 +1019,7 @@ def _channel_power(stream: _Stream) -> tuple[float, ...]:
     return stream.mark.channel_power if stream.mark else ()
 
 
-def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState, str | None]:
+def _state(stream: _Stream, age_ns: int | None, now_ns: int, votes: _Votes) -> tuple[ArrayState, str | None]:
     troubled = stream.trouble_ns is not None and now_ns - stream.trouble_ns < TROUBLE_NS
     if age_ns is None:
         return (ArrayState.DEGRADED, stream.trouble) if troubled else (ArrayState.STARTING, "not heard from yet")
@@ -803,6 +1032,13 @@ def _state(stream: _Stream, age_ns: int | None, now_ns: int) -> tuple[ArrayState
         every = len(stream.dead) == len(stream.spec.microphones_m)
         which = "all channels are" if every else f"microphone {list(stream.dead)} is"
         return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
+    if stream.weak and now_ns - stream.weak_since_ns >= SILENT_NS:
+        which = f"microphone {list(stream.weak)} hears nothing of what the others hear, and is left out"
+        return ArrayState.DEGRADED, f"{which}; check cable, gain and channel numbers"
     if troubled:
         return ArrayState.DEGRADED, stream.trouble
+    if _doubts(votes):
+        off_deg = [off for _, off in votes if off is not None]
+        told = f"{len(off_deg)} of the last {len(votes)} sounds, by {np.median(off_deg):.0f}°"
+        return ArrayState.DEGRADED, f"disagrees with the others in {told}: is its pose right, and its channels' order?"
     return ArrayState.HEALTHY, None

@@ -11,6 +11,9 @@ from livessl.core.activity import ActivityParameters, CausalActivity, band_power
 from livessl.core.timeline import Cut, Framer
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, Frame, IntArray, Mark, Message
 
+RECENT_S: Final = 12.0
+"""How long what was not sent is remembered: longer than the longest usual event, its run-up, and the asking."""
+
 WARM_UP_FRAMES: Final = 10
 """Frames held back at the start: the quietest of them is the first guess of the background."""
 
@@ -47,6 +50,7 @@ class Segmenter:
         self._hang_over = round(parameters.hang_over_s / FRAME_S)
         self._warm_up: list[tuple[Cut, FloatArray]] | None = []
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=round(parameters.pre_roll_s / FRAME_S))
+        self._recent: deque[tuple[Cut, float]] = deque(maxlen=round(RECENT_S / FRAME_S))
         self._quiet_frames = self._hang_over + 1
         self._sequence = 0
         self._raster: int | None = None
@@ -60,6 +64,7 @@ class Segmenter:
         """Take in the next raster interval; `framer` tells how the device is doing."""
         if self._raster is not None and cut.raster != self._raster + 1:
             self._pre_roll.clear()  # what came before a gap is no run-up to what comes after it
+            self._recent.clear()
             self._quiet_frames = self._hang_over + 1
         self._raster = cut.raster
         power = band_power(self._selected(cut), self._rate_hz, self._spec.band_hz)
@@ -75,25 +80,33 @@ class Segmenter:
             self._activity.prime(min(float(power.mean()) for _, power in held))
         return [message for cut, power in held for message in self._decide(cut, power, framer)]
 
+    def ask(self, first: int, last: int) -> list[Message]:
+        """What is remembered of some raster intervals, both ends included, whether or not it was sent."""
+        return [self._frame(cut, power, 0) for cut, power in self._recent if first <= cut.raster <= last]
+
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
 
     def _decide(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> list[Message]:
         power = float(channel_power.mean())
+        self._recent.append((cut, power))
         active = self._activity.push(power)
         self._quiet_frames = 0 if active else self._quiet_frames + 1
         if self._quiet_frames > self._hang_over:
             self._pre_roll.append((cut, power))
             return [self._mark(cut, channel_power, framer)]
-        messages: list[Message] = [self._frame(earlier, level, False) for earlier, level in self._pre_roll]
+        messages: list[Message] = [self._next_frame(earlier, level, False) for earlier, level in self._pre_roll]
         self._pre_roll.clear()
-        messages.append(self._frame(cut, power, active))
+        messages.append(self._next_frame(cut, power, active))
         return messages
 
-    def _frame(self, cut: Cut, power: float, active: bool) -> Frame:
-        samples = np.ascontiguousarray(self._selected(cut))
+    def _next_frame(self, cut: Cut, power: float, active: bool) -> Frame:
         self._sequence += 1
-        return Frame(self._spec.name, self._sequence, cut.raster, cut.time_ns, self._rate_hz, samples, power, active)
+        return self._frame(cut, power, self._sequence, active)
+
+    def _frame(self, cut: Cut, power: float, sequence: int, active: bool = False) -> Frame:
+        samples = np.ascontiguousarray(self._selected(cut))
+        return Frame(self._spec.name, sequence, cut.raster, cut.time_ns, self._rate_hz, samples, power, active)
 
     def _mark(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> Mark:
         return Mark(

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 from livessl.core.fusion import EARLIEST_NS, LATEST_NS, LOST_NS, ArrayStatus, Fusion
-from livessl.core.types import FRAME_NS, FRAME_S, Event, Frame, Mark, Message, Output
+from livessl.core.types import FRAME_NS, FRAME_S, Ask, Event, Frame, Mark, Message, Output
 
 HOLD_NS: Final = 600_000_000_000
 """Sound waits so long for an array that is away: a restart, a cable, a switch. Meanwhile live events tell of it."""
@@ -79,6 +79,8 @@ class Settling:
         self.duplicates = dict.fromkeys(self._sources, 0)
         self.backfilled = dict.fromkeys(self._sources, 0)
         self.too_late = dict.fromkeys(self._sources, 0)
+        self.asked = dict.fromkeys(self._sources, 0)
+        self.helped = dict.fromkeys(self._sources, 0)
         self._begin(settled)
 
     @property
@@ -92,11 +94,15 @@ class Settling:
         settled = self.settled
         return {} if settled is None else {name: settled + self._ahead(name) for name in self._sources}
 
-    def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int) -> None:
-        """An array's node has said what it kept: raster indices of its oldest frame and of the first live one."""
+    def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int, *, answers: bool = False) -> None:
+        """An array's node has said what it kept: raster indices of its oldest frame and of the first live one.
+
+        `answers` says whether it can be asked for what it did not send.
+        """
         source = self._sources.get(array)
         if source is None:
             return
+        (self.live.askable.add if answers else self.live.askable.discard)(array)
         source.heard_ns, source.left = now_ns, False
         if backlog is not None:
             if source.backlog_at is None or source.live_from != backlog[1]:
@@ -108,6 +114,7 @@ class Settling:
     def leave(self, array: str) -> None:
         """The array's node said good-bye: nobody waits for it."""
         self.live.leave(array)
+        self.live.askable.discard(array)
         if array in self._sources:
             self._sources[array].left = True
 
@@ -125,15 +132,26 @@ class Settling:
         if self.settled is not None and self.settled * FRAME_NS - now_ns > LATEST_NS:
             self._begin(None)  # the server's clock was set back: what was settled lies in the future now
             self.live.leave_out(_NEVER, _NEVER)
-        live = [message for message in messages if self._take(message, now_ns)]
+        live: list[Message] = []
+        answers: list[Message] = []
+        for message in messages:
+            if isinstance(message, Frame) and message.sequence == 0:
+                answers.append(message)
+            elif self._take(message, now_ns):
+                live.append(message)
         frontier = self._frontier(now_ns)
-        settled = self._settle(frontier, now_ns)
+        settled = self._settle(frontier, now_ns, answers)
         self.live.leave_out(_NEVER if self.settled is None else self.settled, frontier)
-        return [*self.live.step(live, now_ns), *settled]
+        told = [*self.live.step(live + answers, now_ns), *settled]
+        for output in told:
+            if isinstance(output, Ask):
+                self.asked[output.array] += 1
+        return told
 
     def flush(self, now_ns: int) -> list[Output | Settled]:
         """End of the recording: settle everything without waiting for anyone."""
         end = self._end()
+        self.live.askable.clear()
         self.live.leave_out(end, end)
         outputs: list[Output | Settled] = [*self.live.flush(now_ns)]
         while self._newest != _NEVER and (self._position is None or self._position < end):
@@ -225,13 +243,13 @@ class Settling:
         """Where what has come so far has surely ended."""
         return self._newest + round(self.live.parameters.hang_over_s / FRAME_S) + 1
 
-    def _settle(self, frontier: int, now_ns: int) -> list[Settled]:
+    def _settle(self, frontier: int, now_ns: int, answers: Sequence[Message] = ()) -> list[Settled | Ask]:
         if self._newest == _NEVER or frontier <= _NEVER:
             return []
         if self._position is None:
             self._position = min(self._waiting[0][0] if self._waiting else frontier, frontier) - 1
-        events: list[Event] = []
-        while self._position < frontier and not events:
+        outputs = self._slow.step(answers, (self._position + 1) * FRAME_NS) if answers else []
+        while self._position < frontier and not any(isinstance(output, Event) for output in outputs):
             end = min(frontier, self._piece_end(self._position))
             batch: list[Message] = []
             while self._waiting and self._waiting[0][0] <= end:
@@ -240,14 +258,17 @@ class Settling:
                 batch.append(frame)
             ahead = {name: self._ahead(name) for name in self._sources}
             batch += [Mark(name, 0, end + frames, 0.0, 0.0, ()) for name, frames in ahead.items()]
-            outputs = self._slow.step(batch, (end + 1) * FRAME_NS)
+            outputs += self._slow.step(batch, (end + 1) * FRAME_NS)
             if any(self._ahead(name) != frames for name, frames in ahead.items()):
                 self._waiting = [(f.raster - self._ahead(f.array), f.array, f) for _, _, f in self._waiting]
                 heapq.heapify(self._waiting)
-            events += [self._dated(output, now_ns) for output in outputs if isinstance(output, Event)]
             self._position = end
+        events = tuple(self._dated(output, now_ns) for output in outputs if isinstance(output, Event))
         self._forget()
-        return [Settled(tuple(events), until)] if events and (until := self.settled) is not None else []
+        for contribution in (c for event in events for c in event.contributions):
+            self.helped[contribution.array] += contribution.asked
+        asks = [output for output in outputs if isinstance(output, Ask)]
+        return [*asks, Settled(events, until)] if events and (until := self.settled) is not None else [*asks]
 
     def _piece_end(self, position: int) -> int:
         nearest = self._waiting[0][0] if self._waiting else _ALWAYS

@@ -1,8 +1,12 @@
-"""Tracks: a constant-velocity Kalman filter for each source, fed with estimates; time is passed in."""
+"""Tracks: a constant-velocity Kalman filter for each source, fed with estimates; time is passed in.
+
+Estimates of one moment go to the tracks that make them likeliest together, so two that cross keep their names by where
+they were going. An estimate moves its track as far as its covariance lets it, least along what the arrays cannot tell.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,6 +28,9 @@ GATE_SIGMAS2: Final = 11.34
 
 SILENCE_S: Final = 3.0
 """A track without estimates for so long has ended."""
+
+_NEVER: Final = 1e9
+"""Stands for what is outside every gate, where sums must stay finite."""
 
 MIN_STD_M: Final = 0.05
 """The least believed of a single estimate's uncertainty: models of the room are not better than this."""
@@ -66,31 +73,35 @@ class Tracker:
         self._next_id = 1
 
     def step(self, time_ns: int, estimates: Iterable[Estimate] = ()) -> list[Track]:
-        """Take in the estimates of one moment; return the tracks that changed."""
+        """Take in the estimates of one moment, no two of one source; return the tracks that changed."""
         changed = self._end_silent(time_ns)
-        for estimate in estimates:
-            noise = estimate.covariance_m2 + MIN_STD_M**2 * np.eye(3)
-            nearest = self._nearest(estimate, noise)
-            if nearest is None:
+        found = [(each, each.covariance_m2 + MIN_STD_M**2 * np.eye(3)) for each in estimates]
+        for (estimate, noise), known in zip(found, self._assigned(found), strict=True):
+            if known is None:
                 changed.append(self._start(estimate, noise).track(TrackState.NEW))
             else:
-                nearest.predict(estimate.time_ns)
-                nearest.update(estimate.position_m, noise)
-                changed.append(nearest.track(TrackState.UPDATE))
+                known.predict(estimate.time_ns)
+                known.update(estimate.position_m, noise)
+                changed.append(known.track(TrackState.UPDATE))
         return changed
 
-    def _nearest(self, estimate: Estimate, noise_m2: FloatArray) -> _Filter | None:
-        best, best_distance = None, np.inf
-        for candidate in self._filters:
-            ahead = _Filter(candidate.id, candidate.time_ns, candidate.state, candidate.covariance)
-            ahead.predict(estimate.time_ns)
-            difference = estimate.position_m - ahead.state[:3]
-            spread = ahead.covariance[:3, :3] + noise_m2
-            distance = float(difference @ np.linalg.solve(spread, difference))
-            near = distance <= GATE_SIGMAS2 or float(np.linalg.norm(difference)) <= GATE_M
-            if near and distance < best_distance:
-                best, best_distance = candidate, distance
-        return best
+    def _assigned(self, found: Sequence[tuple[Estimate, FloatArray]]) -> list[_Filter | None]:
+        """The track of each estimate, no track twice: as many as can be, and of these the likeliest together."""
+        tracks: list[_Filter | None] = [*self._filters]
+        if not tracks or not found:
+            return [None] * len(found)
+        cost = np.array([[_surprise(track, *each) for track in self._filters] for each in found])
+        if len(found) == 1:
+            best = int(cost[0].argmin())
+            return [tracks[best] if np.isfinite(cost[0, best]) else None]
+        from scipy.optimize import linear_sum_assignment  # most sites never get here, and it takes long to load
+
+        finite = np.where(np.isfinite(cost), cost, _NEVER)
+        rows, columns = linear_sum_assignment(finite)
+        chosen: list[_Filter | None] = [None] * len(found)
+        for row, column in zip(rows, columns, strict=True):
+            chosen[row] = tracks[column] if np.isfinite(cost[row, column]) else None
+        return chosen
 
     def _start(self, estimate: Estimate, noise_m2: FloatArray) -> _Filter:
         covariance = np.zeros((6, 6))
@@ -106,3 +117,15 @@ class Tracker:
         silent = [f for f in self._filters if time_ns - f.time_ns > SILENCE_S * 1e9]
         self._filters = [f for f in self._filters if f not in silent]
         return [f.track(TrackState.END) for f in silent]
+
+
+def _surprise(track: _Filter, estimate: Estimate, noise_m2: FloatArray) -> float:
+    """How little an estimate was to be expected of a track, d^2 + ln det S; infinite outside its gate."""
+    ahead = _Filter(track.id, track.time_ns, track.state, track.covariance)
+    ahead.predict(estimate.time_ns)
+    difference = estimate.position_m - ahead.state[:3]
+    spread = ahead.covariance[:3, :3] + noise_m2
+    distance2 = float(difference @ np.linalg.solve(spread, difference))
+    if distance2 > GATE_SIGMAS2 and float(np.linalg.norm(difference)) > GATE_M:
+        return np.inf
+    return distance2 + float(np.linalg.slogdet(spread)[1])

@@ -99,7 +99,8 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Counts the array's frames since its node started, from 1.
+        Counts the array's frames since its node started, from 1. 0 is a frame that the server asked for, and the node
+        would not have sent.
     raster : int
         Index on the site-time raster: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
@@ -305,6 +306,13 @@ class Contribution:
         Its in-band mean power over that time, full scale squared.
     azimuth_deg, elevation_deg, distance_m : float
         Direction and distance from the array's centre to the position found; azimuth counter-clockwise from +x.
+    agrees : bool or None
+        Whether it agrees with the others; one that does not was outvoted, and has no part in the position. None where
+        nobody can tell: it was alone, or the estimator does not ask.
+    off_deg : float or None
+        By what angle it heard the sound elsewhere, where it does not agree.
+    asked : bool
+        It had not found the sound active by itself, and was asked for what it had.
     """
 
     array: str
@@ -313,6 +321,9 @@ class Contribution:
     azimuth_deg: float
     elevation_deg: float
     distance_m: float
+    agrees: bool | None = None
+    off_deg: float | None = None
+    asked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,6 +336,8 @@ class Update:
     power: float
     contributions: tuple[Contribution, ...] = ()
     complete_ns: int = 0
+    others: tuple[Estimate, ...] = ()
+    """Further sources that sound at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,6 +372,8 @@ class Event:
         Whether sound took part in it that came after its windows had closed.
     complete_ns : int
         Site time at which all had happened that the answer waits for: the sound, and the quiet that ends it.
+    source : int
+        1; or 2 for the second of two sources that sounded at the same time, of which each has an event.
     """
 
     id: str
@@ -375,6 +390,7 @@ class Event:
     latency_s: float = 0.0
     late: bool = False
     complete_ns: int = 0
+    source: int = 1
 
     @property
     def duration_s(self) -> float:
@@ -424,8 +440,24 @@ class Window:
     evidence: tuple[HeardBy, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A wish for an array's frames of a time at which it sent none.
+
+    Parameters
+    ----------
+    array : str
+    first, last : int
+        Raster intervals, both included, by the array's own clock.
+    """
+
+    array: str
+    first: int
+    last: int
+
+
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | Window
+Output = Update | Event | Track | Window | Ask
 """What fusion says."""

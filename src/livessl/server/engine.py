@@ -15,7 +15,7 @@ from livessl.config import Site
 from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, Event, Frame, Message, Output, Track, TrackState, Update
+from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -207,6 +207,8 @@ class Engine:
         counters["duplicates"] = ingest.duplicates[status.name] + settling.duplicates.get(status.name, 0)
         counters["sequence_gaps"] = ingest.sequence_gaps[status.name]
         counters["backfilled"] = settling.backfilled.get(status.name, 0)
+        counters["asked"] = settling.asked.get(status.name, 0)
+        counters["helped"] = settling.helped.get(status.name, 0)
         counters["too_late"] = settling.too_late.get(status.name, 0)
         problem = ingest.problem_of(status.name)
         if problem is not None:
@@ -285,7 +287,7 @@ class Engine:
         if isinstance(item, Joined):
             self._join(item.hello)
         for array in item.hello.arrays:
-            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns())
+            self._settling.greet(array, item.hello.backlog.get(array), self.now_ns(), answers=item.hello.answers)
 
     def _watch_arrays(self, now_ns: int) -> None:
         arrays = self.arrays()
@@ -353,6 +355,8 @@ class Engine:
                 self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
                 self._publish(self._messages.update(output, self._stages(output, "update")))
+            elif isinstance(output, Ask):
+                self._receiver.ask(output)
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
@@ -457,11 +461,13 @@ def _warm_up() -> None:
 
 
 def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:
-    """The event that shares some of its time with an old one."""
+    """The event that shares some of its time with an old one; of two sources of one sound, the one of its number."""
     begin_ns = utc_ns(old["time_utc"])
     end_ns = begin_ns + old["duration_s"] * 1e9
+    sharing = []
     for event in events:
         start_ns = utc_ns(event["time_utc"])
         if start_ns < end_ns and begin_ns < start_ns + event["duration_s"] * 1e9:
-            return event
-    return None
+            sharing.append(event)
+    same = (event for event in sharing if event["source"] == old.get("source", 1))
+    return next(same, sharing[0] if sharing else None)

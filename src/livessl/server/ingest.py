@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
 from livessl import wire
 from livessl.config import Site
-from livessl.core.types import Frame, Message
+from livessl.core.types import Ask, Frame, Mark, Message
 
 ACK_NS: Final = 250_000_000
 """Every node hears from us at least this often."""
@@ -63,13 +63,17 @@ class Peer:
 
 @dataclass(slots=True)
 class Arrival:
-    """What one piece of data brought: `joined` with a new run, `greeted` where a known one has kept other frames."""
+    """What one piece of data brought: `joined` with a new run, `greeted` where a known one has kept other frames.
+
+    `offer` is for a node that does not know yet that it may be asked; it goes out before the reply.
+    """
 
     message: Message | None = None
     joined: wire.Hello | None = None
     greeted: wire.Hello | None = None
     left: wire.Hello | None = None
     reply: wire.Ack | None = None
+    offer: wire.Request | None = None
 
 
 class Ingest:
@@ -117,8 +121,13 @@ class Ingest:
         if isinstance(message, wire.Bye):
             peer.ended = True
             return Arrival(left=peer.hello)
-        if isinstance(message, wire.Ack):
-            return self._reject(wire.WireError("a node sent an acknowledgement; only servers do"), now_ns)
+        if not isinstance(message, Frame | Mark):
+            what = "an acknowledgement" if isinstance(message, wire.Ack) else "a request"
+            return self._reject(wire.WireError(f"a node sent {what}; only servers do"), now_ns)
+        return self._take(peer, message, now_ns)
+
+    def _take(self, peer: Peer, message: Message, now_ns: int) -> Arrival:
+        """Take in sound, or word of quiet."""
         if message.array not in peer.hello.arrays:
             return self._reject(
                 wire.WireError(f"node {peer.hello.node!r} sent array {message.array!r}, which it did not announce"),
@@ -127,6 +136,8 @@ class Ingest:
         wrong = self._wrong_rate(peer, message) if isinstance(message, Frame) else None
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
+        if isinstance(message, Frame) and message.sequence == 0:
+            return Arrival(message=message)  # it was asked for, and counts for nothing else
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
             return Arrival(message=message)
@@ -173,6 +184,17 @@ class Ingest:
                 due.append((peer.routing_id, self._ack(peer)))
         return due
 
+    def requests(self, asks: Iterable[Ask]) -> list[tuple[bytes, wire.Request]]:
+        """What to send to whom; nothing to nodes that are gone, or do not know requests."""
+        found = []
+        for ask in asks:
+            peers = (p for p in self._peers.values() if ask.array in p.hello.arrays and p.hello.answers and not p.ended)
+            peer = next(peers, None)
+            if peer is not None:
+                wanted = {ask.array: (ask.first, ask.last + 1)}
+                found.append((peer.routing_id, wire.Request(peer.hello.run_id, wanted)))
+        return found
+
     def live_nodes(self, now_ns: int) -> list[wire.Hello]:
         """Nodes heard from lately."""
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.heard_ns < GONE_NS]
@@ -182,9 +204,12 @@ class Ingest:
         if refusal is not None:
             return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
+        known = self._peers.get(routing_id)
+        unaware = not hello.answers and (known is None or known.hello.answers)
+        offer = wire.Request(hello.run_id) if unaware else None
         peer = Peer(routing_id, hello, now_ns)
         if same_run is not None:
-            moved = same_run.routing_id != routing_id or hello.backlog.keys() - same_run.hello.backlog.keys()
+            moved = same_run.routing_id != routing_id or hello.backlog.items() - same_run.hello.backlog.items()
             peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
             peer.received, peer.live = same_run.received, same_run.live
         peer.greet(hello)
@@ -198,8 +223,10 @@ class Ingest:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         reply = self._ack(peer)
         if same_run is None:
-            return Arrival(joined=hello, reply=reply)
-        return Arrival(greeted=hello if hello.backlog != same_run.hello.backlog else None, reply=reply)
+            return Arrival(joined=hello, reply=reply, offer=offer)
+        before = same_run.hello
+        news = hello.backlog != before.backlog or hello.answers != before.answers
+        return Arrival(greeted=hello if news else None, reply=reply, offer=offer)
 
     def _ack(self, peer: Peer) -> wire.Ack:
         settled = [self.settled[array] for array in peer.hello.arrays if array in self.settled]

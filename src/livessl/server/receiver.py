@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import threading
+from collections import deque
 from dataclasses import dataclass
 from queue import Empty, Full, Queue
 from typing import Final
@@ -14,7 +15,7 @@ import zmq
 from livessl import wire
 from livessl.clock import Clock
 from livessl.config import Site
-from livessl.core.types import Message
+from livessl.core.types import Ask, Message
 from livessl.errors import RunError
 from livessl.keys import server_keys
 from livessl.server.guard import guard
@@ -94,6 +95,7 @@ class Receiver:
         self._guarded = keys is not None
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
+        self._asks: deque[Ask] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
         self.failure: BaseException | None = None
@@ -126,6 +128,10 @@ class Receiver:
         self._socket.close()
         self._context.term()
 
+    def ask(self, ask: Ask) -> None:
+        """Ask an array's node for frames; from any thread."""
+        self._asks.append(ask)
+
     def take(self, most: int, wait_s: float) -> list[Item]:
         """What has arrived, in order: waits for the first item, then takes what is there."""
         items: list[Item] = []
@@ -143,6 +149,7 @@ class Receiver:
                 if self._socket.poll(POLL_MS):
                     self._drain()
                 self._acknowledge()
+                self._ask()
         except BaseException as error:
             self._fail(error)
             _log.exception("the receiving thread has failed")
@@ -169,6 +176,8 @@ class Receiver:
             if arrival.message is not None:
                 self.arrivals.note(arrival.message.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
                 self._put(arrival.message)
+            if arrival.offer is not None:
+                self._reply(routing_id, arrival.offer)
             if arrival.reply is not None:
                 self._reply(routing_id, arrival.reply)
 
@@ -186,8 +195,13 @@ class Receiver:
         for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
             self._reply(routing_id, ack)
 
-    def _reply(self, routing_id: bytes, ack: wire.Ack) -> None:
+    def _ask(self) -> None:
+        asks = [self._asks.popleft() for _ in range(len(self._asks))]
+        for routing_id, request in self.ingest.requests(asks):
+            self._reply(routing_id, request)
+
+    def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request) -> None:
         try:
-            self._socket.send_multipart([routing_id, wire.encode(ack)], zmq.NOBLOCK)
+            self._socket.send_multipart([routing_id, wire.encode(reply)], zmq.NOBLOCK)
         except zmq.ZMQError as error:  # it is gone or reads nothing; it will say hello again
-            _log.debug("no acknowledgement to %r: %s", routing_id, error)
+            _log.debug("no answer to %r: %s", routing_id, error)

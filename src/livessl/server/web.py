@@ -528,6 +528,11 @@ class _Metrics(Collector):
         age = GaugeMetricFamily("livessl_array_age_seconds", "Since the last message.", labels=["array"])
         enabled = GaugeMetricFamily("livessl_array_enabled", "1 unless an operator has disabled it.", labels=["array"])
         level = GaugeMetricFamily("livessl_array_level_dbfs", "In-band level.", labels=["array"])
+        agreement = GaugeMetricFamily(
+            "livessl_array_sounds",
+            "Of the last ten sounds that three arrays or more heard, in how many it agreed with the others, or not.",
+            labels=["array", "verdict"],
+        )
         off = GaugeMetricFamily(
             "livessl_array_clock_offset_seconds",
             "How far ahead of the reference its clock is, by the sounds heard.",
@@ -544,9 +549,11 @@ class _Metrics(Collector):
                 age.add_metric([array["name"]], array["age_s"])
             if array["level_dbfs"] is not None:
                 level.add_metric([array["name"]], array["level_dbfs"])
+            for verdict, count in array["agreement"].items():
+                agreement.add_metric([array["name"], verdict], count)
             if (clock := array["clock_offset"]) is not None:
                 off.add_metric([array["name"], clock["reference"]], clock["offset_s"])
                 unsure.add_metric([array["name"], clock["reference"]], clock["std_s"])
             for what, count in array["counters"].items():
                 counts.add_metric([array["name"], what], count)
-        yield from (up, enabled, age, level, off, unsure, counts)
+        yield from (up, enabled, age, level, agreement, off, unsure, counts)

@@ -183,7 +183,7 @@ export class ArraysPanel {
   }
 
   #facts(card, array) {
-    const { frames = 0, marks = 0, backfilled = 0, ...others } = array.counters ?? {};
+    const { frames = 0, marks = 0, backfilled = 0, asked = 0, helped = 0, ...others } = array.counters ?? {};
     const facts = [];
     if (Number.isFinite(array.drift_ppm)) facts.push([`drift ${signed(array.drift_ppm, 1)} ppm`, ""]);
     if (array.clock) facts.push([`clock ${array.clock}`, array.clock === "stepped" ? "trouble" : ""]);
@@ -193,6 +193,7 @@ export class ArraysPanel {
     facts.push([`${frames.toLocaleString("en").replaceAll(",", "\u202f")} frames`, ""]);
     facts.push([`${marks.toLocaleString("en").replaceAll(",", "\u202f")} marks`, ""]);
     if (backfilled > 0) facts.push([`${backfilled} kept and sent later`, ""]);
+    if (asked > 0) facts.push([`asked for ${asked} sounds it had not found, helped with ${helped}`, ""]);
     for (const [key, count] of Object.entries(others)) {
       if (count > 0) facts.unshift([`${TROUBLES[key] ?? key.replaceAll("_", " ")} ${count}`, "trouble"]);
     }

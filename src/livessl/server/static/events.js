@@ -140,7 +140,7 @@ function summary(event, nowMs) {
   fill.style.width = `${Math.round(100 * Math.min(1, Math.max(0, event.confidence ?? 0)))}%`;
   const told = verdict(event);
   const facts = [
-    (event.arrays?.length ? event.arrays : event.heard_by ?? []).join(" + "),
+    (event.arrays?.length ? event.arrays : event.heard_by ?? []).map((name) => named(name, event)).join(" + "),
     `${number(event.duration_s, 2)} s long`,
     `${number(event.level_dbfs, 0)} dBFS`,
     `latency ${number(event.latency_s, 2)} s`,
@@ -156,6 +156,11 @@ function summary(event, nowMs) {
     ...(event.zones?.length ? [el("span", { className: "zones", text: event.zones.join(", ") })] : []),
     ...(told ? [el("span", { className: "verdict", text: told })] : []),
   ];
+}
+
+/** An array's name, and whether it took part only because it was asked. */
+function named(name, { contributions }) {
+  return contributions?.some(({ array, asked }) => asked && array === name) ? `${name} (asked)` : name;
 }
 
 /** A fraction in per cent, or a dash. */
@@ -176,7 +181,7 @@ function details(event) {
     pair("position", event.position_m && position(event.position_m), "wide"),
     pair("1 σ by axis", sigmas && `${sigmas} m`, "wide"),
     pair("heard by", event.heard_by?.join(", ")),
-    pair("used", event.arrays?.join(", ")),
+    pair("used", event.arrays?.map((name) => named(name, event)).join(", ")),
     pair("zones", event.zones?.join(", ")),
     pair("began", event.time_utc ?? `${number(event.start_s, 3)} s into the recording`, "wide"),
     pair("lasted", `${number(event.duration_s, 2)} s`),
@@ -187,7 +192,7 @@ function details(event) {
   if (!event.contributions?.length) return [list];
   const heads = ["array", "used s", "dBFS", "azimuth", "elevation", "distance"];
   const rows = event.contributions.map((c) => el("tr", {},
-    el("th", { text: c.array, scope: "row" }),
+    el("th", { text: named(c.array, event), scope: "row" }),
     ...[number(c.active_s), number(c.level_dbfs, 1), `${number(c.azimuth_deg, 1)}°`, `${number(c.elevation_deg, 1)}°`, `${number(c.distance_m)} m`].map((text) => el("td", { text }))));
   return [list, el("table", {},
     el("caption", { text: "What each array brought" }),

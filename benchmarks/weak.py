@@ -1,0 +1,85 @@
+"""What it is worth to ask arrays that did not find a sound: one scene, ever weaker at one of two arrays.
+
+`python benchmarks/weak.py --cache FOLDER` simulates development sounds in the demo's room, the south array hearing them
+so many dB lower in the same noise, and localizes them with and without asking. What came out is in
+docs/accuracy/arrays.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import soundfile
+
+from clocks import NEAR_M, RATE_HZ, START_NS, by_sound, scene_of
+from livessl import replay
+from livessl.capture.devices import Placed, WavRecording
+from livessl.capture.recorded import Part
+from livessl.clock import UnpacedClock
+from livessl.config import Site, load_site
+from livessl.core.types import Event, Status
+from livessl.demo import SITE_FILE
+from livessl.simulate.scene import Scene, render
+
+LOWER_DB: Final = (0.0, 10.0, 15.0, 20.0, 25.0, 30.0)
+
+
+def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) -> list[Part]:
+    """The arrays' recordings, the last one's sounds so much lower."""
+    cache.mkdir(parents=True, exist_ok=True)
+    paths = {}
+    for number, spec in enumerate(site.specs):
+        lower = lower_db if number == len(site.specs) - 1 else 0.0
+        path = paths[spec.name] = cache / f"weak-{name}-{spec.name}-{lower:g}.wav"
+        if not path.exists():
+            weaker = replace(scene, level_dbfs=scene.level_dbfs - lower)
+            samples = render(weaker, spec.microphones_m, seed=number + 1)
+            soundfile.write(path, samples.T, round(RATE_HZ), subtype="FLOAT")
+    return [Part(array, Placed(WavRecording(path), START_NS), tuple(range(1, 5))) for array, path in paths.items()]
+
+
+def figures(scene: Scene, events: list[Event]) -> dict[str, int]:
+    """What became of the sounds."""
+    near = wrong = alone = helped = 0
+    told = by_sound(scene, events)
+    for source, found in zip(scene.sources, told, strict=True):
+        placed = [event for event in found if event.status is Status.LOCATED and event.estimate is not None]
+        errors_m = [float(np.linalg.norm(e.estimate.position_m - source.position_m)) for e in placed if e.estimate]
+        near += bool(errors_m) and min(errors_m) <= NEAR_M
+        wrong += sum(error_m > NEAR_M for error_m in errors_m)
+        alone += any(len(event.heard_by) == 1 for event in found)
+        helped += any(contribution.asked for event in placed for contribution in event.contributions)
+    return {"sounds": len(told), "near": near, "wrong": wrong, "heard_by_one": alone, "asked_and_used": helped}
+
+
+def main() -> None:
+    """Simulate, listen, print two lines for each level."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sounds", type=int, default=36)
+    parser.add_argument("--rt60", type=float, default=0.7)
+    parser.add_argument("--noise-dbfs", type=float, default=-60.0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=(7, 8, 9))
+    parser.add_argument("--lower-db", type=float, nargs="+", default=LOWER_DB)
+    parser.add_argument("--cache", type=Path, required=True)
+    a = parser.parse_args()
+    site = load_site(SITE_FILE)
+    for lower_db in a.lower_db:
+        for ask in (False, True):
+            total: Counter[str] = Counter()
+            for seed in a.seeds:
+                scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, seed), noise_dbfs=a.noise_dbfs)
+                name = f"{a.sounds}-{a.rt60:g}-{seed}{a.noise_dbfs:g}"
+                parts = parts_of(site, scene, a.cache, name, lower_db)
+                outputs = replay.run(site, parts, UnpacedClock(), ask=ask)
+                total += Counter(figures(scene, [output for output in outputs if isinstance(output, Event)]))
+            print(json.dumps({"lower_db": lower_db, "ask": ask, **total}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,247 @@
+"""Arrays that did not find a sound are asked for it, offline and live alike; and old nodes work as ever."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from livessl import replay
+from livessl.capture.devices import ArrayRecording, Placed
+from livessl.capture.line import played_messages
+from livessl.capture.node import send_session
+from livessl.capture.recorded import Part, lines_of
+from livessl.clock import PacedClock, SystemClock, UnpacedClock
+from livessl.config import Site
+from livessl.core.asking import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
+from livessl.core.segmenter import RECENT_S
+from livessl.core.settling import Settled, Settling
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Ask, Event, Frame, Message, Output, Status
+from livessl.simulate.scene import render
+from small_site import RATE_HZ, running_server, scene, site_of
+
+START_NS = 1_767_225_600_000_000_000
+SOUNDS = 4
+WEAKER_DB = 39.0
+"""So much lower, a burst of noise lies a little above the microphones' noise, and below what is taken for sound."""
+
+NODES: dict[str, Any] = {
+    "nodes": {
+        name: {"device": {"name": "x", "sample_rate_hz": RATE_HZ}, "arrays": {array: [1, 2, 3, 4]}}
+        for name, array in (("a", "north"), ("b", "south"))
+    }
+}
+
+
+@cache
+def site() -> Site:
+    return site_of(NODES)
+
+
+@cache
+def recorded(array: str) -> Any:
+    weaker = replace(scene(SOUNDS), noise_dbfs=-55.0)
+    if array == "south":
+        weaker = replace(weaker, level_dbfs=weaker.level_dbfs - WEAKER_DB)
+    return render(weaker, site().array(array).microphones_m, seed=3 + len(array))
+
+
+def parts(start_ns: int = START_NS, ahead_ns: int = 0) -> list[Part]:
+    """North hears the scene well; south, whose clock may be ahead, faintly."""
+    begin = {"north": start_ns, "south": start_ns + ahead_ns}
+    return [
+        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), recorded(name)), begin[name]), (1, 2, 3, 4))
+        for name in begin
+    ]
+
+
+def offline(*, ask: bool = True, method: str | None = None, ahead_ns: int = 0) -> list[Event]:
+    outputs = replay.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), ask=ask, method=method)
+    return [output for output in outputs if isinstance(output, Event)]
+
+
+def error_m(event: Event) -> float:
+    assert event.estimate is not None
+    starts_ns = np.array([START_NS + round(1e9 * source.start_s) for source in scene(SOUNDS).sources])
+    source = scene(SOUNDS).sources[int(np.searchsorted(starts_ns, event.end_ns)) - 1]
+    return float(np.linalg.norm(event.estimate.position_m - source.position_m))
+
+
+def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
+    places = [None if event.estimate is None else event.estimate.position_m.tolist() for event in events]
+    return [
+        (e.id, e.start_ns, e.end_ns, e.status, e.heard_by, e.contributions, at)
+        for e, at in zip(events, places, strict=True)
+    ]
+
+
+def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
+    without = offline(ask=False)
+    assert [event.heard_by for event in without] == [("north",)] * SOUNDS
+    assert {event.status for event in without} == {Status.DIRECTION_ONLY}
+    events = offline()
+    assert [event.id for event in events] == [event.id for event in without]
+    for event in events:
+        assert event.status is Status.LOCATED
+        assert event.heard_by == ("north",)
+        assert event.estimate is not None
+        assert event.estimate.arrays == ("north", "south")
+        assert [contribution.asked for contribution in event.contributions] == [False, True]
+        assert error_m(event) < 0.5
+
+
+def test_methods_that_cannot_weigh_an_array_ask_nobody() -> None:
+    assert told(offline(method="srp-phat")) == told(offline(method="srp-phat", ask=False))
+
+
+class Live:
+    """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
+
+    def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
+        self.lines, self.placed = lines_of(site(), parts(ahead_ns=ahead_ns))
+        self.settling = Settling(site().make_fusion(live=True), ("north", "south"))
+        for name in ("north", "south"):
+            self.settling.greet(name, None, START_NS, answers=answers)
+        self.way, self.deaf = way, deaf
+        self.asks: list[Ask] = []
+
+    def run(self) -> list[Output | Settled]:
+        outputs: list[Output | Settled] = []
+        coming: list[tuple[int, list[Message]]] = []
+        for k, (now_ns, batch) in enumerate(played_messages(self.lines, self.placed, UnpacedClock())):
+            answers = [message for due, messages in coming if due <= k for message in messages]
+            coming = [entry for entry in coming if entry[0] > k]
+            new = self.settling.step([*batch, *answers], now_ns)
+            for ask in (output for output in new if isinstance(output, Ask)):
+                self.asks.append(ask)
+                if not self.deaf:
+                    coming.append((k + self.way, self.answer(ask)))
+            outputs += new
+        return outputs + self.settling.flush(now_ns)
+
+    def answer(self, ask: Ask) -> list[Message]:
+        return [message for line in self.lines for message in line.ask(ask)]
+
+
+def settled(outputs: Sequence[Output | Settled]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+
+
+@pytest.mark.parametrize("way", [1, 4, 8])
+def test_live_answers_are_those_offline(way: int) -> None:
+    """Blocks of 20 ms from each node: eight batches are 80 ms."""
+    live = Live(way)
+    outputs = live.run()
+    assert told(settled(outputs)) == told(offline())
+    assert not [output for output in outputs if isinstance(output, Event)]  # none before it was settled
+    assert len(live.asks) == SOUNDS  # one for each array and event
+    assert {ask.array for ask in live.asks} == {"south"}
+    assert live.settling.asked == {"north": 0, "south": SOUNDS}
+    assert live.settling.helped == {"north": 0, "south": SOUNDS}
+    assert all((ask.last - ask.first + 1) * FRAME_S <= 0.4 + 0.5 for ask in live.asks)  # run-up and burst
+
+
+def test_old_nodes_are_asked_nothing() -> None:
+    live = Live(1, answers=False)
+    assert told(settled(live.run())) == told(offline(ask=False))
+    assert live.asks == []
+
+
+def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
+    live = Live(1, deaf=True)
+    events = settled(live.run())
+    assert told(events) == told(offline(ask=False))
+    assert len(live.asks) == SOUNDS
+    for event in events:
+        assert 0.3 + 0.3 - 0.11 < event.latency_s < 0.3 + 0.3 + 0.11  # the hang-over, and as long again
+
+
+def test_arrays_are_asked_by_their_own_clocks() -> None:
+    """Nobody can know the offset before three sounds that both heard; here it is known already."""
+    ahead_ns = 150_000_000
+    live = Live(1, ahead_ns=ahead_ns)
+    clocks = live.settling.live.clock_offsets
+    assert clocks is not None
+    for k in range(3):
+        clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
+    live.settling = Settling(live.settling.live, ("north", "south"))
+    live.settling.greet("south", None, START_NS, answers=True)
+    events = settled(live.run())
+    expected = offline()
+    assert [event.estimate and event.estimate.arrays for event in events] == [("north", "south")] * SOUNDS
+    for event, other in zip(events, expected, strict=True):
+        assert abs(error_m(event) - error_m(other)) < 0.02
+
+
+def test_nobody_is_asked_where_the_answer_is_sure() -> None:
+    loud = [
+        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        for part in parts()
+    ]
+    fusion = site().make_fusion(updates=False)
+    fusion.askable = {"north", "south"}
+    outputs: list[Output] = []
+    for now_ns, batch in played_messages(*lines_of(site(), loud), UnpacedClock()):
+        outputs += fusion.step(batch, now_ns)
+    events = [output for output in outputs if isinstance(output, Event)]
+    assert events
+    assert all(event.estimate is not None and event.estimate.confidence >= SURE for event in events)
+    assert not [output for output in outputs if isinstance(output, Ask)]
+
+
+@cache
+def recorded_loud(array: str) -> Any:
+    return render(scene(SOUNDS), site().array(array).microphones_m, seed=3 + len(array))
+
+
+def test_asking_is_bounded() -> None:
+    allowance = Allowance()
+    burst = round(RECENT_S / FRAME_S)
+    assert allowance.take(burst, 0)
+    assert not allowance.take(1, 0)
+    assert allowance.take(round(100 * SHARE), 100)
+    assert not allowance.take(round(100 * SHARE), 150)
+    assert allowance.refused == 2
+    assert allowance.take(burst, 10**6)
+    assert not allowance.take(burst, 10**6 + 1)
+
+
+def test_the_nearest_are_asked() -> None:
+    def at(x_m: float) -> ArraySpec:
+        return ArraySpec(f"{x_m:g}", np.array([[x_m, 0.0, 0.0], [x_m + 0.1, 0.0, 0.0]]), (100.0, 6000.0))
+
+    silent = [at(x_m) for x_m in (30.0, 5.0, 9.0, 1.0, 2.0, 40.0)]
+    assert [spec.name for spec in nearest(silent, [at(0.0), at(29.0)])] == ["30", "1", "2", "5"]
+    assert MOST_ARRAYS == 4
+
+
+def test_frames_that_nobody_asked_for_change_nothing() -> None:
+    fusion = site().make_fusion(updates=False)
+    samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
+    raster = START_NS // FRAME_NS
+    stray = Frame("south", 0, raster, START_NS, float(RATE_HZ), samples, 0.01, True)
+    assert fusion.step([stray], START_NS) == []
+    assert fusion.closed is None
+    assert fusion.status(START_NS)[1].counters["frames"] == 0
+
+
+@pytest.mark.parametrize("speed", [4.0, 20.0])
+def test_a_session_played_to_a_server_gives_the_same_answers(speed: float) -> None:
+    expected = offline()
+    with running_server(site_of({**NODES, "server.bind": "tcp://127.0.0.1:*"})) as server:
+        pace = PacedClock(START_NS, speed)
+        send_session(site(), server.engine.endpoint, parts(), pace, SystemClock(), "run-1", lambda: False)
+        server.engine.wait_idle()
+        with urllib.request.urlopen(f"{server.url}/api/v1/events") as answer:
+            found = json.load(answer)["events"][::-1]
+    assert [event["id"] for event in found] == [event.id for event in expected]
+    for event, other in zip(found, expected, strict=True):
+        assert other.estimate is not None
+        assert event["arrays"] == ["north", "south"]
+        np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)
