@@ -35,7 +35,7 @@ def judged(*evidence: HeardBy, rival_share: float = 0.3) -> Judgement:
     return judge(functional, evidence, SOURCE_M, power, rival_share * power, GRID)
 
 
-@given(margin=st.floats(0.0, 0.9), standing=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
+@given(margin=st.floats(0.0, 0.3), standing=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
 def test_more_evidence_is_more_confidence(margin: float, standing: float, more: float) -> None:
     confidence = Signs(margin, standing).confidence
     assert 0.0 < confidence < 1.0

@@ -22,20 +22,28 @@ NEAR_M: Final = 0.5
 LEAST_CONFIDENCE: Final = 0.8
 """Below it a place is refused."""
 
-_LOGISTIC: Final = (-3.34, 2.69, 1.03)
-"""Intercept, weight of the margin and of the standing in the log-odds of a right place."""
+_HEARD: Final = (-3.34, 2.69, 1.03)
+"""Intercept, weights of margin and standing in the log-odds of a right place, of arrays that tell distance."""
+
+_NOWHERE_ELSE: Final = (-0.04, 62.2)
+"""Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
+side by side, many are."""
 
 LEAST_CONFIDENCE_OF_SECOND: Final = 0.6
 """Below it a second source is not told of."""
 
 _LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
-"""As `_LOGISTIC`, of the best place left when the first source is taken out: is there a second, and is it there?"""
+"""As `_HEARD`, of the best place left when the first source is taken out: is there a second, and is it there?"""
 
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
 
 _INFLATION: Final = 1.6
 """What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
+
+_FINEST_M: Final = 0.01
+"""Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
+of which the lag axis tells nothing, move several arrays' places by as much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +64,14 @@ class Signs:
 
     @property
     def confidence(self) -> float:
-        """Probability that the place is right to within `NEAR_M`."""
-        return self._probability(_LOGISTIC)
+        """Probability that the place is right to within `NEAR_M`: heard, and nowhere else."""
+        intercept, of_margin = _NOWHERE_ELSE
+        return self.heard * _likely(intercept + of_margin * self.margin)
+
+    @property
+    def heard(self) -> float:
+        """The same, where the arrays tell distance."""
+        return self._probability(_HEARD)
 
     @property
     def confidence_of_second(self) -> float:
@@ -71,7 +85,7 @@ class Signs:
 
     def _probability(self, logistic: tuple[float, float, float]) -> float:
         intercept, of_margin, of_standing = logistic
-        return float(1.0 / (1.0 + np.exp(-(intercept + of_margin * self.margin + of_standing * self.standing))))
+        return _likely(intercept + of_margin * self.margin + of_standing * self.standing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +130,8 @@ def judge(
     together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
     signs = Signs(peaks.margin(power, rival_power), together)
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    for axis in grid.free_axes:
+        covariance_m2[axis, axis] += _FINEST_M**2
     refused = None
     if signs.confidence < LEAST_CONFIDENCE:
         refused = (
@@ -123,6 +139,10 @@ def judge(
             f"{LEAST_CONFIDENCE:g} wanted"
         )
     return Judgement(covariance_m2, signs, refused)
+
+
+def _likely(log_odds: float) -> float:
+    return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
 def standing(heard: HeardBy, power: float) -> float:

@@ -1,6 +1,7 @@
-"""The searching and mapping kernels, compiled by numba: what `livessl.core.vectorised` does, faster.
+"""The kernels, compiled by numba: what `livessl.core.vectorised` does, faster.
 
-Each function has its twin there, which says what it does: the same arguments, the same answers to the last bit.
+Each function has its twin there, which says what it does: the same arguments, the same answers; of the searching and
+mapping ones to the last bit.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.jit import jit
-from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT
+from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT, SILENT_POWER
 
 NAME: Final = "numba"
 
@@ -43,6 +44,80 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
                         least, most = min(least, lag), max(most, lag)
                     low[p, first + cell] = min(low[p, first + cell], np.uint16(least))
                     high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
+
+
+@_compiled
+def cross_spectra(spectra, low, pairs, weights, whitened):  # type: ignore[no-untyped-def]
+    """Cross spectra of phases alone, weighed and summed over frames."""
+    microphones, bins = spectra.shape[1], whitened.shape[1]
+    real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
+    power, summed = np.empty(bins, np.float32), np.zeros((2, len(pairs), bins), np.float32)
+    for t in range(len(spectra)):
+        weight = weights[t]
+        if not weight.any():
+            continue
+        for m in range(microphones):
+            spectrum, u, v = spectra[t, m, low : low + bins], real[m], imaginary[m]
+            for b in range(bins):
+                u[b], v[b] = spectrum[b].real, spectrum[b].imag
+                power[b] = u[b] * u[b] + v[b] * v[b]
+            floor = SILENT_POWER * power.max()
+            for b in range(bins):
+                over = np.float32(1.0) / np.sqrt(power[b])
+                over = over if power[b] > floor else np.float32(0.0)
+                u[b] *= over
+                v[b] *= over
+        for p in range(len(pairs)):
+            u_i, v_i, u_k, v_k = real[pairs[p, 0]], imaginary[pairs[p, 0]], real[pairs[p, 1]], imaginary[pairs[p, 1]]
+            of_real, of_imaginary = summed[0, p], summed[1, p]
+            for b in range(bins):
+                of_real[b] += weight[b] * (u_i[b] * u_k[b] + v_i[b] * v_k[b])
+                of_imaginary[b] += weight[b] * (u_i[b] * v_k[b] - v_i[b] * u_k[b])
+    for p in range(len(pairs)):
+        for b in range(bins):
+            whitened[p, b] = complex(summed[0, p, b], summed[1, p, b])
+
+
+@_compiled
+def onset_weights(  # type: ignore[no-untyped-def]
+    spectra, low, quiet, heard, least, decay, warm_up, noise_hops, loud, strongest, noise, past, weights,
+):  # fmt: skip
+    """Weights of the next windows by how direct they are."""
+    microphones, bins = spectra.shape[1], len(noise)
+    one, zero, two, every = np.float32(1.0), np.float32(0.0), np.float32(2.0), np.float32(noise_hops)
+    power = np.empty(bins + 2, np.float32)
+    smooth = np.empty(bins, np.float32)
+    for t in range(len(spectra)):
+        weight = weights[t]
+        power[:] = zero
+        for m in range(microphones):
+            spectrum = spectra[t, m, low : low + bins]
+            for b in range(bins):
+                power[b + 1] += spectrum[b].real * spectrum[b].real + spectrum[b].imag * spectrum[b].imag
+        power[0], power[bins + 1] = power[1], power[bins]
+        for b in range(bins):
+            smooth[b] = (power[b] + power[b + 1] + power[b + 2]) / np.float32(3 * microphones)
+        if heard[0] == 0:
+            noise[:], past[:] = smooth, smooth
+        if heard[1] >= warm_up or heard[0] >= noise_hops:
+            for b in range(bins):
+                interference = max(max(noise[b], past[b]), least)
+                direct = max(smooth[b] - interference, zero)
+                weight[b] = min(direct * direct / (interference * (interference + two * direct)), strongest)
+        else:
+            weight[:] = zero
+        heard[0] += 1
+        heard[1] += quiet
+        share = one / np.float32(min(heard[1], noise_hops)) if quiet else one / every
+        settled = quiet and heard[1] > warm_up
+        for b in range(bins):
+            now = smooth[b]
+            past[b] = max(past[b] * decay, now)
+            if settled:
+                now = min(now, loud * max(noise[b], least))
+            elif not quiet:
+                now = min(now, noise[b])
+            noise[b] += (now - noise[b]) * share
 
 
 def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin

@@ -838,17 +838,7 @@ class Fusion:
         clocks.hear(time_ns, estimate.position_m, whole)
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
-        """Whether the estimate is a place, only a direction, or neither, and why."""
-        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
-        specs = [self._streams[name].spec for name in estimate.arrays]
-        nearest_m = min(_distance_m(spec, estimate) for spec in specs)
-        alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
-        if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-            return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
-        if found.signs is not None and not found.signs.tell_direction:
-            return Status.REFUSED, "nothing that was heard came from any one direction"
-        who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
-        return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+        return judged(found, [self._streams[name].spec for name in estimate.arrays])
 
     def _count_votes(self, start: int, found: Localization, sounds: Iterable[str]) -> None:
         """Remember who agreed. Replaced, never changed, for other threads read it."""
@@ -882,6 +872,26 @@ class Fusion:
                 del stream.frames[first]
             while stream.onsets and (first := next(iter(stream.onsets))) < oldest:
                 del stream.onsets[first]
+
+
+def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
+    """Whether what was found is a place, only a direction, or neither, and why.
+
+    Parameters
+    ----------
+    found : Localization
+    specs : sequence of ArraySpec
+        The arrays that it was found by.
+    """
+    spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
+    nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
+    alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
+    if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
+        return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
+    if found.signs is not None and not found.signs.tell_direction:
+        return Status.REFUSED, "nothing that was heard came from any one direction"
+    who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
+    return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
 
 class _Sounds(Mapping[str, Sound]):
@@ -937,9 +947,9 @@ def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) ->
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
-def _distance_m(spec: ArraySpec, estimate: Estimate) -> float:
+def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:
     """How far an array is from the place, or half its width: inside a wide one, its centre is nothing to look from."""
-    return max(direction_deg(spec.centre_m, estimate.position_m)[2], spec.aperture_m / 2.0)
+    return max(direction_deg(spec.centre_m, position_m)[2], spec.aperture_m / 2.0)
 
 
 def _contribution(

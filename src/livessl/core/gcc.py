@@ -14,6 +14,7 @@ import scipy.fft
 
 from livessl.core.activity import band_bins
 from livessl.core.frontends import FFT_FACTOR, FrontEnd, Spectra, whole_segment
+from livessl.core.kernels import kernels
 from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
@@ -21,9 +22,6 @@ OVERSAMPLING: Final = 8
 
 ENVELOPE_ABOVE: Final = 0.25
 """Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
-
-_SILENT: Final = 1e-6
-"""A channel's bins 120 dB below its loudest in the band carry no phase worth whitening: they are rounding."""
 
 _NYQUIST_MARGIN: Final = 1.25
 """Near-Nyquist lags are so much denser than the band's upper edge asks for; the interpolation needs the room."""
@@ -137,13 +135,13 @@ class CrossSpectra:
         self.n_fft = spectra.n_fft
         self.sample_rate_hz = sample_rate_hz
         self.low, high = band_bins(spectra.n_fft, sample_rate_hz, band_hz)
-        inside = _phase_only(spectra.values[:, :, self.low : high])
-        first, second = pairs.T
-        self.whitened = np.zeros((len(pairs), high - self.low), dtype=np.complex64)
-        for index, frame in enumerate(inside):
-            conjugate = np.conj(frame) if weights is None else np.conj(frame) * weights[index]
-            self.whitened += conjugate[first] * frame[second]
-        self.share = max(1, high - self.low) * max(1, len(inside)) if weights is None else 1
+        frames, bins = len(spectra.values), max(0, high - self.low)
+        self.whitened = np.empty((len(pairs), bins), dtype=np.complex64)
+        self.share = 1
+        if weights is None:
+            self.share = max(1, bins) * max(1, frames)
+            weights = np.ones((frames, bins), dtype=np.float32)
+        kernels.cross_spectra(spectra.values, self.low, pairs, weights, self.whitened)
 
     def bins_below(self, cut_off_hz: float) -> int:
         """How many of the band's bins lie at or below a cut-off."""
@@ -266,10 +264,3 @@ def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:
     """Curvature of an ideal band-limited GCC at its peak: (2 pi)^2 (f2^3 - f1^3) / (3 (f2 - f1)), 1/s^2."""
     low, high = band_hz
     return float(4.0 * np.pi**2 * (high**3 - low**3) / (3.0 * (high - low)))
-
-
-def _phase_only(spectra: ComplexArray) -> ComplexArray:
-    """Each bin over its magnitude, (L, K, B); zero where a channel is silent."""
-    magnitude = np.abs(spectra)
-    floor = _SILENT * magnitude.max(axis=2, initial=0.0, keepdims=True)
-    return np.divide(spectra, magnitude, out=np.zeros_like(spectra), where=magnitude > floor)

@@ -25,6 +25,7 @@ import scipy.fft
 from livessl.core.activity import band_bins
 from livessl.core.frontends import Spectra, fast_length
 from livessl.core.gcc import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
+from livessl.core.kernels import kernels
 from livessl.core.types import ArraySpec, ComplexArray, Float32Array
 
 WINDOW_S: Final = 0.032
@@ -39,7 +40,7 @@ PAST_S: Final = 0.1
 _WINDOW_LAGS: Final = 8
 """A window is at least so many times as long as the array's largest delay, which would else move sound out of it."""
 
-_STRONGEST: Final = 10.0
+_STRONGEST: Final = np.float32(10.0)
 """Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
 
 _WARM_UP_S: Final = 0.1
@@ -48,7 +49,7 @@ _WARM_UP_S: Final = 0.1
 _NOISE_S: Final = 1.0
 """Time over which the noise is averaged; after so long a sound without any quiet its least power must do."""
 
-_LOUD: Final = 3.0
+_LOUD: Final = np.float32(3.0)
 """Power above so many times the noise is no noise, quiet though the frame be called: an onset's foot."""
 
 _LEAST_POWER: Final = 2.0**-30 / 12.0
@@ -103,9 +104,9 @@ class OnsetFrontEnd:
         self._warm_up = round(_WARM_UP_S / hop_s)
         self._noise_hops = round(_NOISE_S / hop_s)
         self._tail: Float32Array = np.zeros((len(spec.microphones_m), 0), dtype=np.float32)
-        self._noise: Float32Array | None = None
-        self._past: Float32Array = np.zeros(0, dtype=np.float32)
-        self._quiet_hops = self._hops = 0
+        bins = self._band.stop - self._band.start
+        self._noise, self._past = np.zeros(bins, dtype=np.float32), np.zeros(bins, dtype=np.float32)
+        self._hops = np.zeros(2, dtype=np.int64)  # heard so far, and those of them that were quiet
 
     @property
     def nothing(self) -> OnsetGCC:
@@ -116,8 +117,7 @@ class OnsetFrontEnd:
     def reset(self) -> None:
         """Forget all: samples are missing, and what comes does not continue what was."""
         self._tail = self._tail[:, :0]
-        self._noise = None
-        self._quiet_hops = self._hops = 0
+        self._hops[:] = 0
 
     def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
         """Take the next frame and give what its windows say; a window that it does not complete waits for the next.
@@ -136,9 +136,14 @@ class OnsetFrontEnd:
         if hops == 0:
             return self.nothing
         cut = np.lib.stride_tricks.sliding_window_view(heard, length, axis=1)[:, :: self._hop][:, :hops]
-        spectra = scipy.fft.rfft(cut.swapaxes(0, 1) * self._window, self._n_fft, axis=2)
-        inside = spectra[:, :, self._band]
-        weights = self._weights((inside.real**2 + inside.imag**2).mean(axis=1), quiet=quiet)
+        windows = np.zeros((hops, len(samples), self._n_fft), dtype=np.float32)
+        np.multiply(cut.swapaxes(0, 1), self._window, out=windows[:, :, :length])
+        spectra = scipy.fft.rfft(windows, axis=2)
+        weights = np.empty((hops, len(self._noise)), dtype=np.float32)
+        kernels.onset_weights(
+            spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,
+            _LOUD, _STRONGEST, self._noise, self._past, weights,
+        )  # fmt: skip
         cross = CrossSpectra(Spectra(spectra, self._n_fft), self._pairs, self.sample_rate_hz, self._band_hz, weights)
         return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), float(weights.sum()))
 
@@ -151,35 +156,3 @@ class OnsetFrontEnd:
             self.push(silence, quiet=True)
             total += self.push(piece, quiet=False)
         return total
-
-    def _weights(self, powers: Float32Array, *, quiet: bool) -> Float32Array:
-        """Weights (T, B) of the next windows from their power spectra (T, B), means over the microphones."""
-        powers = _smoothed(powers)
-        weights = np.zeros_like(powers)
-        for power, weight in zip(powers, weights, strict=True):
-            if self._noise is None:
-                self._noise, self._past = power.copy(), power.copy()
-            interference = np.maximum(np.maximum(self._noise, self._past), self._least)
-            if self._quiet_hops >= self._warm_up or self._hops >= self._noise_hops:
-                direct = np.maximum(power - interference, 0.0)
-                weight[:] = np.minimum(direct**2 / (interference * (interference + 2.0 * direct)), _STRONGEST)
-            self._past = np.maximum(self._past * self._decay, power)
-            self._hops += 1
-            self._learn(power, quiet=quiet)
-        return weights
-
-    def _learn(self, power: Float32Array, *, quiet: bool) -> None:
-        assert self._noise is not None
-        if not quiet:
-            self._noise += (np.minimum(power, self._noise) - self._noise) / np.float32(self._noise_hops)
-            return
-        self._quiet_hops += 1
-        if self._quiet_hops > self._warm_up:
-            power = np.minimum(power, _LOUD * np.maximum(self._noise, self._least))
-        self._noise += (power - self._noise) / np.float32(min(self._quiet_hops, self._noise_hops))
-
-
-def _smoothed(powers: Float32Array) -> Float32Array:
-    """Mean over three bins, the transform's resolution before its zero padding."""
-    padded = np.pad(powers, ((0, 0), (1, 1)), mode="edge")
-    return np.asarray((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / np.float32(3.0))

@@ -1,4 +1,4 @@
-"""The searching and mapping kernels on NumPy alone: what always works, and what the compiled ones are held against.
+"""The kernels on NumPy alone: what always works, and what the compiled ones are held against.
 
 Sums run in one order everywhere, over the pairs of an array and then over the arrays. Rounding to float32 keeps the
 order of numbers, so a sum of maxima is never below the sum of any of the numbers that they are maxima of, rounding
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from livessl.core.types import Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
+from livessl.core.types import ComplexArray, Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -29,11 +29,94 @@ MINIMUM: Final = 2
 NO_LAG: Final = 65535
 """Above every lag: what a cell without nodes begins with."""
 
+SILENT_POWER: Final = np.float32(1e-12)
+"""A channel's bins 120 dB below its loudest in the band carry no phase worth whitening: they are rounding."""
+
 _SLAB_NODES: Final = 1 << 15
 """Nodes whose distances are worked out at once: what fits the second-level cache."""
 
 _CELLS_AT_ONCE: Final = 64
 """Most cells whose nodes are looked at together; it begins with few, for mostly few are needed."""
+
+
+def cross_spectra(
+    spectra: ComplexArray, low: int, pairs: IntArray, weights: Float32Array, whitened: ComplexArray
+) -> None:
+    """Cross spectra of phases alone, sum_t w conj(U_i) U_k with U = X/|X|.
+
+    Parameters
+    ----------
+    spectra : (T, K, F) complex64
+        Of T frames and K microphones.
+    low : int
+        The first of the band's bins.
+    pairs : (P, 2) int64
+        Microphones (i, k).
+    weights : (T, B) float32
+        Of each frame's bins in the band.
+    whitened : (P, B) complex64
+        The answer.
+    """
+    whitened[:] = 0.0
+    first, second = pairs.T
+    for spectrum, weight in zip(spectra[:, :, low : low + whitened.shape[1]], weights, strict=True):
+        power = spectrum.real**2 + spectrum.imag**2
+        heard = power > SILENT_POWER * power.max(axis=1, initial=0.0, keepdims=True)
+        unit = np.divide(spectrum, np.sqrt(power), out=np.zeros_like(spectrum), where=heard)
+        whitened += (np.conj(unit) * weight)[first] * unit[second]
+
+
+def onset_weights(
+    spectra: ComplexArray, low: int, quiet: bool, heard: IntArray, least: np.float32, decay: np.float32,
+    warm_up: int, noise_hops: int, loud: np.float32, strongest: np.float32, noise: Float32Array, past: Float32Array,
+    weights: Float32Array,
+) -> None:  # fmt: skip
+    """Weights of the next windows of one array by how direct they are: `livessl.core.onset` says why.
+
+    Parameters
+    ----------
+    spectra : (T, K, F) complex64
+        Of T windows and K microphones.
+    low : int
+        The first of the band's bins.
+    quiet : bool
+        Whether the noise is learned from them.
+    heard : (2,) int64
+        Windows so far, and those of them that were quiet; moves on.
+    least, decay, loud, strongest : float32
+        Power below which nothing is heard; of the past, from one window to the next; of noise, above which there is
+        sound; greatest weight.
+    warm_up, noise_hops : int
+        Quiet windows, and any windows, after which weights are given; the noise is a mean over `noise_hops`.
+    noise, past : (B,) float32
+        What is known of the array; changed.
+    weights : (T, B) float32
+        The answer.
+    """
+    inside = spectra[:, :, low : low + len(noise)]
+    powers = _smoothed((inside.real**2 + inside.imag**2).mean(axis=1))
+    weights[:] = 0.0
+    for power, weight in zip(powers, weights, strict=True):
+        if heard[0] == 0:
+            noise[:], past[:] = power, power
+        if heard[1] >= warm_up or heard[0] >= noise_hops:
+            interference = np.maximum(np.maximum(noise, past), least)
+            direct = np.maximum(power - interference, 0.0)
+            weight[:] = np.minimum(direct**2 / (interference * (interference + 2.0 * direct)), strongest)
+        past[:] = np.maximum(past * decay, power)
+        heard += (1, quiet)
+        if not quiet:
+            noise += (np.minimum(power, noise) - noise) / np.float32(noise_hops)
+            continue
+        if heard[1] > warm_up:
+            power = np.minimum(power, loud * np.maximum(noise, least))
+        noise += (power - noise) / np.float32(min(int(heard[1]), noise_hops))
+
+
+def _smoothed(powers: Float32Array) -> Float32Array:
+    """Mean over three bins, the transform's resolution before its zero padding."""
+    padded = np.pad(powers, ((0, 0), (1, 1)), mode="edge")
+    return np.asarray((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / np.float32(3.0))
 
 
 def lag_places(

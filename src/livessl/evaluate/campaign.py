@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +26,9 @@ from threadpoolctl import threadpool_limits
 from livessl.evaluate.localizer import SCHEMA as LOCALIZER_SCHEMA
 from livessl.evaluate.localizer import LocalizerPosition, LocalizerSettings
 from livessl.evaluate.paper import Settings
-from livessl.evaluate.unit import Clips, Position
+from livessl.evaluate.sessions import SCHEMA as SESSIONS_SCHEMA
+from livessl.evaluate.sessions import SessionPosition, SessionSettings
+from livessl.evaluate.unit import Clips, Position, Row
 from livessl.simulate.scene import read_sounds
 
 HIGH_PASS_HZ: Final = 100.0
@@ -52,23 +54,41 @@ SCHEMA: Final = pa.schema(
 """One row per event, condition and method: truth, estimate, error and its parts, seen from the system's centre."""
 
 
+class Unit(Protocol):
+    """What turns the number of a position into its rows."""
+
+    def rows(self, number: int) -> list[Row]:
+        """All rows of a position."""
+        ...
+
+
 @dataclass(frozen=True)
 class Job:
     """What a worker needs: small enough to be sent to each once."""
 
-    settings: Settings | LocalizerSettings
+    settings: Settings | LocalizerSettings | SessionSettings
     clips: Clips
 
     @property
     def schema(self) -> pa.Schema:
         """Of the rows that `unit` makes."""
-        return SCHEMA if isinstance(self.settings, Settings) else LOCALIZER_SCHEMA
+        match self.settings:
+            case Settings():
+                return SCHEMA
+            case LocalizerSettings():
+                return LOCALIZER_SCHEMA
+            case SessionSettings():
+                return SESSIONS_SCHEMA
 
-    def unit(self) -> Position | LocalizerPosition:
-        """What turns the number of a position into its rows."""
-        if isinstance(self.settings, Settings):
-            return Position(self.settings, self.clips)
-        return LocalizerPosition(self.settings, self.clips)
+    def unit(self) -> Unit:
+        """Make what turns the number of a position into its rows."""
+        match self.settings:
+            case Settings() as settings:
+                return Position(settings, self.clips)
+            case LocalizerSettings() as settings:
+                return LocalizerPosition(settings, self.clips)
+            case SessionSettings() as settings:
+                return SessionPosition(settings, self.clips)
 
     @property
     def digest(self) -> str:
@@ -194,12 +214,12 @@ def compute(job: Job, number: int) -> Done:
     return Done(number, buffer.getvalue(), cpu_s, peak_mib)
 
 
-_kept: dict[str, Position | LocalizerPosition] = {}
+_kept: dict[str, Unit] = {}
 _keeping = threading.Lock()
 _sent: list[Job] = []
 
 
-def _worker(job: Job) -> Position | LocalizerPosition:
+def _worker(job: Job) -> Unit:
     """Give what this process has made for a job, or make it: matrices that every position needs."""
     with _keeping:
         key = job.digest

@@ -11,6 +11,7 @@ from typing import Any, Final
 from livessl.config import load_site
 from livessl.evaluate.layout import layout_of
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
+from livessl.evaluate.scenarios import ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
 
 HALVES: Final = ("development", "test")
 LOCALIZER: Final = "localizer"
@@ -47,14 +48,21 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
     parser.add_argument(
         "--snr",
-        type=float,
-        metavar="DB",
-        help="white sensor noise, so far below each recording's mean power (default: none)",
+        metavar="DB[,DB…]",
+        help=f"white sensor noise, so far below each recording's mean power, inf for none (default: none); {LOCALIZER} "
+        "takes several",
     )
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
     parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
     parser.add_argument("--half", choices=HALVES, default="test", help=f"{LOCALIZER}: half of the clips (default test)")
+    parser.add_argument(
+        "--scenario",
+        default=ROOMS,
+        metavar="NAME[,NAME…]",
+        help=f"{LOCALIZER}: some of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); or one of "
+        f"{', '.join(SESSIONS)}",
+    )
     parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
 
@@ -89,7 +97,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
         seed=arguments.seed,
         sample_rate_hz=float(arguments.sample_rate),
         spacing_m=arguments.grid or experiment.spacing_m,
-        snr_db=arguments.snr,
+        snr_db=_one_level_db(arguments.snr),
         segment=arguments.segment,
         band_limit=not arguments.no_band_limit,
         layout=layout,
@@ -135,23 +143,43 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
     from livessl.evaluate.campaign import Job, read_clips, run_campaign
-    from livessl.evaluate.localizer import POSITIONS, RT60S_S, SNRS_DB, SPACING_M, LocalizerSettings
     from livessl.evaluate.localizer_report import write_localizer_report
+    from livessl.evaluate.sessions import SessionSettings
+    from livessl.evaluate.sessions_report import write_sessions_report
 
-    settings = LocalizerSettings(
-        positions=arguments.positions or POSITIONS,
-        rt60s_s=RT60S_S if arguments.rt is None else reverberation_times_s(arguments.rt),
-        snrs_db=SNRS_DB if arguments.snr is None else (arguments.snr,),
-        seed=arguments.seed,
-        sample_rate_hz=float(arguments.sample_rate),
-        spacing_m=arguments.grid or SPACING_M,
-        half=arguments.half,
-    )
+    settings = _localizer_settings(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     job = Job(settings, clips)
     results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress)
-    return [results, *write_localizer_report(arguments.out)]
+    write = write_sessions_report if isinstance(settings, SessionSettings) else write_localizer_report
+    return [results, *write(arguments.out)]
+
+
+def _localizer_settings(arguments: argparse.Namespace) -> Any:
+    """What was asked for: `SessionSettings` of a session's scenario, else `LocalizerSettings`."""
+    from livessl.evaluate import localizer, sessions
+
+    names = _scenarios(arguments.scenario)
+    rt60s_s = None if arguments.rt is None else reverberation_times_s(arguments.rt)
+    snrs_db = None if arguments.snr is None else levels_db(arguments.snr)
+    common = {"seed": arguments.seed, "sample_rate_hz": float(arguments.sample_rate), "half": arguments.half}
+    if names[0] in SESSIONS:
+        return sessions.SessionSettings(
+            positions=arguments.positions or sessions.POSITIONS,
+            scenario=names[0],
+            rt60s_s=rt60s_s or (SESSIONS[names[0]].rt60_s,),
+            snrs_db=snrs_db or (SESSION_SNR_DB,),
+            **common,
+        )
+    return localizer.LocalizerSettings(
+        positions=arguments.positions or localizer.POSITIONS,
+        rt60s_s=rt60s_s or localizer.RT60S_S,
+        snrs_db=snrs_db or localizer.SNRS_DB,
+        spacing_m=arguments.grid or localizer.SPACING_M,
+        scenarios=names,
+        **common,
+    )
 
 
 def reverberation_times_s(text: str) -> tuple[float, ...]:
@@ -174,6 +202,44 @@ def reverberation_times_s(text: str) -> tuple[float, ...]:
     except (ValueError, ZeroDivisionError, OverflowError):
         raise ValueError(f"--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got {text!r}") from None
     return tuple(sorted(set(times)))
+
+
+def levels_db(text: str) -> tuple[float, ...]:
+    """Levels from `inf,20,10`, dB.
+
+    Raises
+    ------
+    ValueError
+        Where the text is none.
+    """
+    try:
+        levels = tuple(dict.fromkeys(float(part) for part in text.split(",")))
+        if not all(level > -math.inf for level in levels):  # nor NaN
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"--snr: expected decibels such as 20 or inf,20,10, got {text!r}") from None
+    return levels
+
+
+def _one_level_db(text: str | None) -> float | None:
+    if text is None:
+        return None
+    level, *more = levels_db(text)
+    if more:
+        raise ValueError(f"--snr: expected one level, for only {LOCALIZER} takes several, got {text}")
+    return None if level == math.inf else level
+
+
+def _scenarios(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    unknown = [name for name in names if name not in SCENARIOS and name not in SESSIONS]
+    if unknown:
+        known = ", ".join([*SCENARIOS, *SESSIONS])
+        raise ValueError(f"--scenario: expected some of {known}, got {', '.join(unknown)}")
+    if len(names) > 1 and any(name in SESSIONS for name in names):
+        alone = " and ".join(name for name in names if name in SESSIONS)
+        raise ValueError(f"--scenario: {alone}: each of {', '.join(SESSIONS)} is run alone, got {', '.join(names)}")
+    return names
 
 
 def _whole(text: str) -> int:

@@ -123,6 +123,83 @@ def draw_localizer(directory: Path, curves: Sequence[LocalizerCurve]) -> None:
     figure.savefig(directory / "localizer.svg", metadata={"Date": None})
 
 
+@dataclass(frozen=True, slots=True)
+class ScenarioPoint:
+    """One case of a scenario in one condition.
+
+    Parameters
+    ----------
+    case, panel, label : str
+        Place along the axis, panel, and curve.
+    filled : bool
+    median_m : (float, float, float)
+        Median error and its interval; NaN where nothing was located.
+    lost : float
+        Share of events.
+    """
+
+    case: str
+    panel: str
+    label: str
+    filled: bool
+    median_m: tuple[float, float, float]
+    lost: float
+
+
+def draw_scenario(directory: Path, name: str, points: Sequence[ScenarioPoint]) -> None:
+    """Draw median errors and shares lost by case, a panel for each of the points' panels."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mpl.rcParams["svg.hashsalt"] = "livessl"
+    cases, panels = (list(dict.fromkeys(texts)) for texts in zip(*((p.case, p.panel) for p in points), strict=True))
+    labels = {filled: list(dict.fromkeys(p.label for p in points if p.filled == filled)) for filled in (False, True)}
+    figure, axes = _figure(2, len(panels), (max(5.0, 0.9 * len(cases)) * len(panels), 7.5))
+    for column, panel in enumerate(panels):
+        medians, lost = axes[0, column], axes[1, column]
+        for filled, texts in labels.items():
+            for index, (colour, label) in enumerate(zip(COLOURS, texts, strict=False)):
+                curve = [p for p in points if (p.panel, p.label) == (panel, label)]
+                at = np.array([cases.index(p.case) for p in curve]) + 0.12 * (index + 0.5 * filled) - 0.2
+                median_m, low_m, high_m = np.array([p.median_m for p in curve]).T
+                look: dict[str, Any] = {
+                    "color": colour,
+                    "markerfacecolor": colour if filled else "white",
+                    "label": label,
+                }
+                medians.errorbar(at, median_m, (median_m - low_m, high_m - median_m), fmt="o", markersize=4, **look)
+                lost.plot(at, [100.0 * p.lost for p in curve], "o", markersize=4, **look)
+        medians.set(title=panel, ylabel="median error (m)", yscale="log")
+        lost.set(ylabel="lost (%)", ylim=(0.0, None))
+        for axis in (medians, lost):
+            axis.set_xticks(range(len(cases)), cases, rotation=20, ha="right")
+            axis.grid(visible=True, axis="y", alpha=0.3)
+        medians.legend(fontsize=7)
+    figure.savefig(directory / f"{name}.png", dpi=130, metadata={"Software": None})
+    figure.savefig(directory / f"{name}.svg", metadata={"Date": None})
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """Where a talker was, (T, 3), and the places of each track, (S, 3), in metres."""
+
+    way_m: FloatArray
+    tracks_m: Sequence[FloatArray]
+
+
+def draw_walks(directory: Path, walks: Sequence[Walk]) -> None:
+    """Draw walks and their tracks from above."""
+    directory.mkdir(parents=True, exist_ok=True)
+    mpl.rcParams["svg.hashsalt"] = "livessl"
+    columns = min(3, len(walks))
+    figure, axes = _figure(-(-len(walks) // columns), columns, (4.0 * columns, 5.0 * -(-len(walks) // columns)))
+    for axis, walk in zip(axes.flat, walks, strict=False):
+        axis.plot(*walk.way_m[:, :2].T, ".", color="0.75", markersize=6)
+        for index, places_m in enumerate(walk.tracks_m):
+            axis.plot(*places_m[:, :2].T, ".-", color=COLOURS[index % len(COLOURS)], markersize=3, linewidth=0.8)
+        axis.set(xlim=(0, ROOM_M[0]), ylim=(0, ROOM_M[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    figure.savefig(directory / "walks.png", dpi=110, metadata={"Software": None})
+    figure.savefig(directory / "walks.svg", metadata={"Date": None})
+
+
 def sigma_theta_deg(theta_deg: FloatArray, spacing_m: FloatArray | float, sample_rate_hz: float) -> FloatArray:
     """Angular error of a delay rounded to samples: arcsin(sin theta + c/(fs d sqrt 12)) - theta, from broadside.
 
