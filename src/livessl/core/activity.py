@@ -66,9 +66,8 @@ def dead_channels(segments: Sequence[Float32Array]) -> BoolArray:
     The second loudest is what the others are held against: the loudest may be a broken one that crackles. Where fewer
     than two are left, none is called dead, for there is nothing to compare. A constant offset is no sound.
     """
-    power = np.zeros(len(segments[0]))
-    for each in segments:
-        power += np.einsum("kn,kn->k", each, each) - each.shape[1] * each.mean(axis=1) ** 2
+    powers = [np.einsum("kn,kn->k", each, each) - each.shape[1] * each.mean(axis=1) ** 2 for each in segments]
+    power = np.sum(powers, axis=0, dtype=np.float64)
     return np.asarray(power < DEAD * np.sort(power)[-2])
 
 
