@@ -25,7 +25,7 @@ from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 class Sound:
     """What one array heard: segments, each (K, n) samples without gaps, at its sampling rate."""
 
-    segments: tuple[Float32Array, ...]
+    segments: Sequence[Float32Array]
     sample_rate_hz: float
     onsets: OnsetGCC | None = None
     """What the estimator's listener made of its frames and those around them, where there is one."""
@@ -359,7 +359,7 @@ class Onset(SrpPhat):
             return known[1]
         spec = self._arrays[array]
         require_band(spec, sample_rate_hz)
-        sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
+        sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
