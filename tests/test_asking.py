@@ -153,6 +153,13 @@ def test_old_nodes_are_asked_nothing() -> None:
     assert live.asks == []
 
 
+def test_disabled_arrays_are_asked_nothing() -> None:
+    live = Live(1)
+    live.settling.spare({"south"})
+    live.run()
+    assert live.asks == []
+
+
 def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
     live = Live(1, deaf=True)
     events = settled(live.run())

@@ -389,7 +389,7 @@ class Fusion:
             self._streams[array].left = True
 
     def spare(self, arrays: Collection[str]) -> None:
-        """Wait for none of these arrays, from now on, and for all others again."""
+        """Wait for none of these arrays and ask none of them, from now on, and all others again."""
         self._spared = arrays
 
     def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
@@ -777,7 +777,7 @@ class Fusion:
         silent = [
             stream.spec
             for name, stream in self._streams.items()
-            if name in self.askable and name not in answer.heard_by and not stream.left
+            if name in self.askable - set(self._spared) and name not in answer.heard_by and not stream.left
         ]
         first = self._span_start(event.start)
         span = range(first, min(event.last_active + 1, first + round(MOST_ASKED_S / FRAME_S)))

@@ -119,9 +119,10 @@ class Settling:
             self._sources[array].left = True
 
     def spare(self, arrays: Collection[str]) -> None:
-        """Wait for none of these arrays, from now on, and for all others again."""
+        """Wait for none of these arrays and ask none of them, from now on, and all others again."""
         self._spared = arrays
         self.live.spare(arrays)
+        self._slow.spare(arrays)
 
     def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
         """How every array is doing: see `Fusion.status`."""
