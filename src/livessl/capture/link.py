@@ -41,6 +41,9 @@ QUEUED_BYTES: Final = 256 * 1024
 MOST_ANSWERS: Final = 500
 """Frames asked for that wait to be sent, a quarter of a minute of two arrays; older ones are not worth it any more."""
 
+_BYE_TRIES: Final = 25
+_BYE_WAIT_MS: Final = 20
+
 ANSWER_NS: Final = 10_000_000_000
 """A replay, which somebody waits for, gives up after so long; a node never does."""
 
@@ -301,9 +304,21 @@ class Link:
 
     def close(self, *, bye: bool) -> None:
         """End the connection; with `bye` the server knows that it is on purpose."""
-        said = bye and self._try_send(wire.encode(wire.Bye(self._hello.node, self._hello.run_id)))
+        said = bye and self._say_bye()
         self._dealer.close(500 if said else 0)
         self._spool.close()
+
+    def _say_bye(self) -> bool:
+        """After the last live sound, for which there may be no room at once; it waits for half a second at most."""
+        farewell = wire.encode(wire.Bye(self._hello.node, self._hello.run_id))
+        for _ in range(_BYE_TRIES):
+            if not self._live and self._try_send(farewell):
+                return True
+            if not self.connected:
+                break
+            self._dealer.wait(_BYE_WAIT_MS)
+            self.service()
+        return self._try_send(farewell)
 
     def _receive(self) -> None:
         while (data := self._dealer.receive()) is not None:
