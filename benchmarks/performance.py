@@ -32,7 +32,8 @@ DOCS: Final = HERE.parent / "docs"
 OURS: Final = "livessl, map, compiled"
 
 LIVE: Final = (
-    (4, 1, False), (4, 20, False), (4, 100, False), (8, 20, False), (16, 20, False), (32, 20, False), (16, 20, True)
+    (4, 1, False), (4, 20, False), (4, 100, False), (8, 20, False), (16, 20, False), (32, 20, False), (64, 20, False),
+    (16, 20, True), (64, 20, True),
 )  # fmt: skip
 """Arrays and clients of each run of the service, and whether a foreign process spins on each core meanwhile."""
 

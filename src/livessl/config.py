@@ -16,8 +16,17 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from livessl.core.activity import ActivityParameters
-from livessl.core.gcc import microphone_pairs, uses_envelope
-from livessl.core.geometry import Grid, as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
+from livessl.core.bands import uses_envelope
+from livessl.core.geometry import (
+    Grid,
+    as_positions_m,
+    circle,
+    line,
+    microphone_pairs,
+    posed,
+    speed_of_sound_m_s,
+    tetrahedron,
+)
 from livessl.core.joint import joined
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
@@ -26,6 +35,7 @@ from livessl.errors import UseError
 if TYPE_CHECKING:
     from livessl.core.clock_offsets import ClockOffsets
     from livessl.core.fusion import Fusion
+    from livessl.core.listening import Each
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
@@ -449,10 +459,11 @@ class Site(_Model):
         updates: bool = True,
         live: bool = False,
         clock_offsets: ClockOffsets | None = None,
+        each: Each | None = None,
     ) -> Fusion:
         """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
 
-        `clock_offsets` is what is known already of the arrays' clocks.
+        `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
         """
         from livessl.core.estimators import ESTIMATORS
         from livessl.core.fusion import ANSWER_S, Fusion, FusionParameters
@@ -481,6 +492,7 @@ class Site(_Model):
             updates=updates,
             newest_only=live,
             clock_offsets=self.make_clock_offsets() if clock_offsets is None else clock_offsets,
+            each=each,
         )
 
     def node_of(self, array: str) -> str | None:

@@ -154,7 +154,7 @@ def test_recordings_arrive_whole() -> None:
         assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
         for array in ARRAYS:
             frames = [m.raster - first for m in there.messages(array) if isinstance(m, Frame)]
-            assert frames == list(range(12, 30))
+            assert sorted(frames) == list(range(12, 30))  # live ones overtake what was cut before the connection
 
 
 def test_nobody_there_is_told_at_the_end() -> None:

@@ -147,7 +147,7 @@ def test_preparing_changes_nothing() -> None:
 
 def test_several_segments_are_one_sound(estimator: SrpPhat) -> None:
     one, other = sounds_from(SOURCE_M, seed=1), sounds_from(SOURCE_M, seed=2)
-    both = {name: Sound(one[name].segments + other[name].segments, RATE_HZ) for name in one}
+    both = {name: Sound((*one[name].segments, *other[name].segments), RATE_HZ) for name in one}
     assert error_m(estimator.locate(both)) < NEAR_M
 
 

@@ -79,7 +79,7 @@ def test_peak_is_the_whole_maps(kernels: ModuleType, count: int, kind: str) -> N
     for seed in range(6):
         specs = arrays(count, seed)
         evidence = sounds(specs, kind, seed)
-        grid = Grid(ROOM, [0.1, 0.07, 0.23][seed % 3])
+        grid = Grid(ROOM, [0.1, 0.06, 0.23][seed % 3])
         searched = searching(evidence, grid)
         for rule in Rule:
             power = fused_map(evidence, grid, rule)
@@ -99,7 +99,7 @@ def test_both_kernels_say_the_same() -> None:
             box = np.array([[3, 20], [5, 30], [0, 24]])
             peaks_by_rule = [searched.among(evidence, rule)(6, 2, [box]) for rule in Rule]
             numbers = [np.array([(peak.node, peak.power) for peak in found]) for found in peaks_by_rule]
-            said.append([searched._low, searched._high, searched._top_low, searched._top_high, *numbers])
+            said.append([searched._cell_places, searched._leaf_places, searched._top_places, *numbers])
     for one, other in zip(*said, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -180,9 +180,9 @@ def test_a_search_that_costs_too_much_is_given_up_and_says_so(kernels: ModuleTyp
 def test_memory_does_not_grow_with_the_grid() -> None:
     specs = arrays(2, 2)
     coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.1, 0.02))
-    assert coarse._low.nbytes == fine._low.nbytes
+    assert coarse._cell_places.nbytes == fine._cell_places.nbytes
     hall = PeakSearch(specs, Grid(((0.0, 60.0), (0.0, 80.0), (0.0, 20.0)), 0.5), C_M_S)
-    assert hall._low.shape[1] < 2 * search.MOST_CELLS
+    assert hall._cell_places[:, 0].size < 2 * search.MOST_CELLS
 
 
 def test_lags_that_sixteen_bits_cannot_count_are_refused() -> None:
@@ -191,16 +191,30 @@ def test_lags_that_sixteen_bits_cannot_count_are_refused() -> None:
         searched.prepare("a0", np.arange(70_000) / 1e6)
 
 
-def test_one_lag_that_is_not_looked_at_is_noticed(kernels: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The comparison above has teeth: intervals one lag too short lose the peak of some map."""
+def test_lags_that_are_not_looked_at_are_noticed(kernels: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison above has teeth: runs half as long lose the peak of some map."""
+    exact = search._run_places
+    monkeypatch.setattr(search, "_run_places", lambda low, high, block: exact(low, (low + high) // 2, block))
     grid = Grid(ROOM, 0.1)
     lost = 0
     for seed in range(20):
         evidence = sounds(arrays(2, seed), "noise", seed)
         searched = searching(evidence, grid)
-        for table in (searched._high, searched._top_high):
-            table[:] = np.maximum(table.astype(np.int64) - 8, np.minimum(table, searched._low.min()))
-        for low, high in ((searched._low, searched._high), (searched._top_low, searched._top_high)):
-            np.minimum(low, high, out=low)
         lost += searched.among(evidence)(1)[0].node != fused_map(evidence, grid, Rule.SUM).argmax()
     assert lost > 0
+
+
+@pytest.mark.parametrize("width", [90, 256, 1063, 5000])
+def test_maxima_are_those_of_all_lags_between(kernels: ModuleType, width: int) -> None:
+    rng = np.random.default_rng(width)
+    values = rng.standard_normal((2, width)).astype(np.float32)
+    block = np.repeat(search._block(width), 2)
+    maxima = np.zeros((2, len(vectorised.RUNS) * vectorised.BLOCKS), np.float32)
+    kernels.running_maxima(values, block, maxima)
+    ends = np.sort(rng.integers(0, width, (2, 500)), axis=0).astype(np.uint16)
+    for low, high, place in zip(*ends, search._run_places(ends[0], ends[1], int(block[0])), strict=True):
+        run = vectorised.RUNS[place // vectorised.BLOCKS] * block[0]
+        first = place % vectorised.BLOCKS * block[0]
+        assert first <= low <= high < first + run
+        assert run <= max(1.25 * (high - low + 2 * block[0]), block[0])
+        np.testing.assert_array_equal(maxima[:, place], values[:, first : first + run].max(axis=1))

@@ -84,15 +84,18 @@ def test_two_sources_are_two_tracks() -> None:
         assert np.linalg.norm(track.position_m - paths[k][-1]) < 4 * STD_M
     # in turn, as the windows of a live server bring them, it is the same
     tracker = Tracker()
-    ids = [tracker.step(at_ns(k * STEP_S), [estimate(k * STEP_S, paths[k % 2][k])])[0].id for k in range(60)]
-    assert ids == [1, 2] * 30
+    told = [tracker.step(at_ns(k * STEP_S), [estimate(k * STEP_S, paths[k % 2][k])]) for k in range(60)]
+    assert told[1] == []  # beside one that is followed the other is told of from its second estimate on
+    assert [tracks[0].id for tracks in told[2:]] == [1, 2] * 29
 
 
 def test_jump_beyond_the_gate_is_another_source() -> None:
     for far_m, known in ((0.9 * GATE_M, True), (1.5 * GATE_M, False)):
         tracker = Tracker()
         follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
-        (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.0 + far_m, 1.0, 1.0])])
+        first = tracker.step(at_ns(3.0), [estimate(3.0, [1.0 + far_m, 1.0, 1.0])])
+        (track,) = first if known else tracker.step(at_ns(3.1), [estimate(3.1, [1.0 + far_m, 1.0, 1.0])])
+        assert bool(first) == known  # a single estimate beside a followed source is told of nobody
         assert (track.id == 1) == known
         assert track.state is (TrackState.UPDATE if known else TrackState.NEW)
 
@@ -161,8 +164,9 @@ def test_fixed_axis_is_no_singularity() -> None:
 def test_two_estimates_of_one_moment_are_never_one_track() -> None:
     tracker = Tracker()
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
-    told = tracker.step(at_ns(3.0), [estimate(3.0, [1.3, 1.0, 1.0]), estimate(3.0, [1.05, 1.0, 1.0])])
-    assert [(track.id, track.state) for track in told] == [(2, TrackState.NEW), (1, TrackState.UPDATE)]
+    for time_s, ids in ((3.0, [1]), (3.1, [2, 1]), (3.2, [2, 1])):
+        both = [estimate(time_s, [1.4, 1.0, 1.0]), estimate(time_s, [1.05, 1.0, 1.0])]
+        assert [track.id for track in tracker.step(at_ns(time_s), both)] == ids
 
 
 def test_walkers_that_cross_keep_their_names() -> None:
@@ -192,3 +196,13 @@ def test_together_counts_not_who_comes_first() -> None:
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1)), np.tile([2.0, 1.0, 1.0], (30, 1))])
     told = tracker.step(at_ns(3.0), [estimate(3.0, [1.4, 1.0, 1.0]), estimate(3.0, [0.8, 1.0, 1.0])])
     assert [track.id for track in told] == [2, 1]
+
+
+def test_a_stray_estimate_is_told_of_nobody() -> None:
+    tracker = Tracker()
+    for k in range(60):
+        time_s = k * STEP_S
+        at_m = [5.0, 1.0, 1.0] if k in (20, 40) else [1.0, 1.0, 1.0]  # 2 s apart: twice a stray, and no source
+        assert {track.id for track in tracker.step(at_ns(time_s), [estimate(time_s, at_m)])} <= {1}
+    (ended,) = tracker.step(at_ns(20.0))
+    assert ended.id == 1

@@ -28,8 +28,8 @@ from livessl.processes import NotStartedError
 READY_NS: Final = 120_000_000_000
 """For a server to work out its tables and hear every array."""
 
-SETTLE_NS: Final = 3_000_000_000
-"""From then on: until what has piled up is worked off."""
+SETTLE_NS: Final = 8_000_000_000
+"""From then on: until what has piled up while tables were worked out is worked off."""
 
 SAMPLE_NS: Final = 1_000_000_000
 PERCENTILES: Final = (50, 95, 99, 100)

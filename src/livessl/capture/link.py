@@ -38,6 +38,9 @@ QUEUED_MESSAGES: Final = 10
 QUEUED_BYTES: Final = 256 * 1024
 """Enough for 10 Mbit/s at a round trip of 0.2 s."""
 
+MOST_ANSWERS: Final = 500
+"""Frames asked for that wait to be sent, a quarter of a minute of two arrays; older ones are not worth it any more."""
+
 ANSWER_NS: Final = 10_000_000_000
 """A replay, which somebody waits for, gives up after so long; a node never does."""
 
@@ -165,6 +168,7 @@ class Link:
         self._backlog = deque(self._spool.frames())
         self._hello = replace(hello, backlog=_spans(self._backlog))
         self._backlog_sent: deque[Kept] = deque()
+        self._answers: deque[Message] = deque(maxlen=MOST_ANSWERS)
         self._live_sent: deque[Kept] = deque()
         self._received: dict[str, int] = {}
         self._backlog_ns = 0
@@ -272,6 +276,10 @@ class Link:
             self._live.popleft()
             if isinstance(first, Kept):
                 self._live_sent.append(first)
+        while self._answers:
+            if not self._try_send(wire.encode(self._answers[0])):
+                return
+            self._answers.popleft()
         if self._backlog_sent and now_ns - self._backlog_ns >= SILENT_NS:
             self._backlog_sent.clear()  # the server has them, or does not want them
         while self._backlog and len(self._backlog_sent) < BACKLOG_FRAMES:
@@ -317,9 +325,7 @@ class Link:
             self._hello = replace(self._hello, answers=True)
             self._say_hello()
         for array, (first, last) in request.wanted.items():
-            for message in self._recent(Ask(array, first, last - 1)):
-                if not self._try_send(wire.encode(message)):
-                    return
+            self._answers.extend(self._recent(Ask(array, first, last - 1)))
 
     def _acknowledge(self, ack: wire.Ack) -> None:
         if ack.who_are_you:
@@ -378,6 +384,7 @@ class Link:
         self._greeted = False
         self._received = {}
         self._marks.update({message.array: message for _, message in self._live if isinstance(message, Mark)})
+        self._answers.clear()
         for queue in (self._live, self._live_sent, self._backlog_sent):
             queue.clear()
         self._backlog = deque(self._spool.frames())

@@ -60,6 +60,13 @@ class Place:
     rival_power: float
     proven: bool
 
+    @property
+    def is_heard_by_all(self) -> bool:
+        """Whether each of the arrays hears something there: noise alone stands as high as its rms."""
+        terms = self.functional.pair_terms(self.position_m)
+        each = (standing(heard, array_power(heard, term)) for heard, term in zip(self.evidence, terms, strict=True))
+        return min(each) >= 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Agreed:

@@ -29,7 +29,7 @@ _NOWHERE_ELSE: Final = (-0.04, 62.2)
 """Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
 side by side, many are."""
 
-LEAST_CONFIDENCE_OF_SECOND: Final = 0.6
+LEAST_CONFIDENCE_OF_SECOND: Final = 0.5
 """Below it a second source is not told of."""
 
 _LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)

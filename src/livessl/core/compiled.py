@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.jit import jit
-from livessl.core.vectorised import MINIMUM, NO_LAG, PRODUCT, SILENT_POWER
+from livessl.core.vectorised import BLOCKS, MINIMUM, NO_LAG, PRODUCT, RUNS, SILENT_POWER
 
 NAME: Final = "numba"
 
@@ -44,6 +44,18 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
                         least, most = min(least, lag), max(most, lag)
                     low[p, first + cell] = min(low[p, first + cell], np.uint16(least))
                     high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
+
+
+@_compiled
+def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
+    """Windows of sound, weighed, and zeros after them."""
+    length = len(window)
+    for t in range(len(windows)):
+        for m in range(len(samples)):
+            cut, out = samples[m, t * hop : t * hop + length], windows[t, m]
+            for n in range(length):
+                out[n] = cut[n] * window[n]
+            out[length:] = np.float32(0.0)
 
 
 @_compiled
@@ -143,6 +155,20 @@ def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
+    """Mean square of a GCC, further than something from one lag of each pair."""
+    total, count = 0.0, 0
+    for p in range(len(values)):
+        row, square = values[p], np.float32(0.0)
+        for lag in range(len(lags_s)):
+            if abs(lags_s[lag] - but_s[p]) > apart_s:
+                square += row[lag] * row[lag]
+                count += 1
+        total += float(square)
+    return total / count if count else 0.0
+
+
+@_compiled
 def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
     """Summed power at points off the grid."""
     power = np.zeros(len(points_m))
@@ -167,18 +193,24 @@ def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, 
 
 
 @_compiled
-def running_maxima(values, maxima):  # type: ignore[no-untyped-def]
-    """Maxima over 1, 2, 4, ... lags from each lag on."""
-    maxima[0] = values
-    for level in range(1, len(maxima)):
-        half = 1 << (level - 1)
-        length = values.shape[1] - half
-        for row in range(len(values)):
-            before, now = maxima[level - 1, row], maxima[level, row]
-            for lag in range(length):
-                now[lag] = max(before[lag], before[lag + half])
-            for lag in range(length, values.shape[1]):
-                now[lag] = before[lag]
+def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
+    """Maxima over runs of blocks of lags."""
+    length = values.shape[1]
+    for r in range(len(values)):
+        row, of_blocks, size = values[r], maxima[r], block[r]
+        of_blocks[:BLOCKS] = -np.inf
+        for b in range(min(BLOCKS, -(-length // size))):
+            most = row[b * size]
+            for lag in range(b * size + 1, min((b + 1) * size, length)):
+                most = max(most, row[lag])
+            of_blocks[b] = most
+        for level in range(1, maxima.shape[1] // BLOCKS):
+            further = RUNS[level] - RUNS[level - 1]
+            before, now = of_blocks[(level - 1) * BLOCKS : level * BLOCKS], of_blocks[level * BLOCKS :]
+            for b in range(BLOCKS - further):
+                now[b] = max(before[b], before[b + further])
+            for b in range(BLOCKS - further, BLOCKS):
+                now[b] = before[b]
 
 
 @_compiled
@@ -198,25 +230,17 @@ def _start(rule):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _bounds(first, count, low, high, rows, first_row, weight, rule, maxima, level_of, bound):  # type: ignore[no-untyped-def]
+def bounds(maxima, places, rows, first_row, weight, rule, bound):  # type: ignore[no-untyped-def]
     """What no node of each of some cells exceeds."""
-    flat = maxima.reshape(maxima.size)
-    length = np.uint32(maxima.shape[2])
-    level_step = np.uint32(maxima.shape[1]) * length
-    bound[:count] = _start(rule)
-    total = np.empty(count, np.float32)
+    bound[:] = _start(rule)
+    total = np.empty(len(bound), np.float32)
     for a in range(len(weight)):
         total[:] = np.float32(0.0)
         for r in range(first_row[a], first_row[a + 1]):
-            lows, highs = low[rows[r], first : first + count], high[rows[r], first : first + count]
-            start = np.uint32(r) * length
-            for c in range(count):  # unsigned all along: signed indices would be asked whether they count from the end
-                lowest, highest = np.uint32(lows[c]), np.uint32(highs[c])
-                level = np.uint32(level_of[highest - lowest])
-                at = start + level * level_step
-                second = highest + np.uint32(1) - (np.uint32(1) << level)
-                total[c] += max(flat[at + lowest], flat[at + second])
-        for c in range(count):
+            row, of_cells = maxima[r], places[rows[r]]
+            for c in range(len(bound)):
+                total[c] += row[of_cells[c]]
+        for c in range(len(bound)):
             bound[c] = _joined(rule, bound[c], weight[a] * total[c])
 
 
@@ -276,39 +300,45 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    values, maxima, level_of, rows, first_row, weight, rule, low, high, top_low, top_high,
+    values, maxima, rows, first_row, weight, rule, places, leaf_places, top_bound, cell_bound, bounded,
     x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
 ):  # fmt: skip
     """The highest node outside some boxes, by branch and bound."""
     shape = (len(x_m), len(y_m), len(z_m))
     top_edge = edge * per_top
     tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
-    count, children = top_low.shape[1], per_top**3
-    top_bound, child_bound = np.empty(count, np.float32), np.empty(children, np.float32)
+    children = per_top**3
+    child_bound = np.empty(children, np.float32)
+    leaf_edge = edge // 2 if leaf_places.shape[2] else edge
+    leaf_bound = np.empty(max(1, leaf_places.shape[2]), np.float32)
     distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
     total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
-    _bounds(0, count, top_low, top_high, rows, first_row, weight, rule, maxima, level_of, top_bound)
-    spent = 2 * count * len(rows)
+    spent = 0
     best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
-    order = np.array([np.argmax(top_bound)])
+    first_top = np.argmax(top_bound)
+    order = np.array([first_top])
     for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
         if turn == 1:
-            top_bound[order[0]] = -np.inf
             left = np.flatnonzero(top_bound >= best)
             order = left[np.argsort(-top_bound[left])]
         for top in order:
-            if top_bound[top] < best or top_bound[top] == -np.inf:
+            if top_bound[top] < best:
                 break
+            if turn == 1 and top == first_top:
+                continue
             t_x, t_y, t_z = top // (tops_y * tops_z), top // tops_z % tops_y, top % tops_z
             t_x, t_y, t_z = t_x * top_edge, t_y * top_edge, t_z * top_edge
             if top_bound[top] == best and (t_x * shape[1] + t_y) * shape[2] + t_z > best_node:
                 continue
             if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
                 continue
-            if spent > most and best > -np.inf:
-                return best_node, best, False
-            spent += 2 * children * len(rows)
-            _bounds(top * children, children, low, high, rows, first_row, weight, rule, maxima, level_of, child_bound)
+            if not bounded[top]:
+                if spent > most and best > -np.inf:
+                    return best_node, best, False
+                spent += children * len(rows)
+                bounds(maxima, places[top], rows, first_row, weight, rule, cell_bound[top])
+                bounded[top] = True
+            child_bound[:] = cell_bound[top]
             while True:
                 child = np.argmax(child_bound)
                 bound = child_bound[child]
@@ -321,12 +351,30 @@ def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
                     continue  # a cube at the volume's edge has cells outside it
                 if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
                     continue
-                if not _covered(first, edge, shape, boxes):
+                if _covered(first, edge, shape, boxes):
+                    continue
+                if leaf_places.shape[2] == 0:
+                    leaf_bound[0] = bound
+                else:
+                    spent += len(leaf_bound) * len(rows)
+                    bounds(maxima, leaf_places[top * children + child], rows, first_row, weight, rule, leaf_bound)
+                while True:
+                    leaf = np.argmax(leaf_bound)
+                    if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
+                        break
+                    leaf_bound[leaf] = -np.inf
+                    at = (
+                        first[0] + leaf // 4 * leaf_edge,
+                        first[1] + leaf // 2 % 2 * leaf_edge,
+                        first[2] + leaf % 2 * leaf_edge,
+                    )
+                    if at[0] >= shape[0] or at[1] >= shape[1] or at[2] >= shape[2]:
+                        continue
                     if spent > most and best > -np.inf:
                         return best_node, best, False
-                    spent += edge**3 * len(rows)
+                    spent += leaf_edge**3 * len(rows)
                     best, best_node = _best_of_cell(
-                        first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
+                        at, leaf_edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
                         weight, rule, values, boxes, best, best_node, distance, total, fused,
                     )  # fmt: skip
     return best_node, best, True

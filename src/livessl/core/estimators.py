@@ -25,7 +25,7 @@ from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
 class Sound:
     """What one array heard: segments, each (K, n) samples without gaps, at its sampling rate."""
 
-    segments: tuple[Float32Array, ...]
+    segments: Sequence[Float32Array]
     sample_rate_hz: float
     onsets: OnsetGCC | None = None
     """What the estimator's listener made of its frames and those around them, where there is one."""
@@ -280,11 +280,10 @@ class Onset(SrpPhat):
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
         doubted = [name for name, sound in sounds.items() if sound.doubted]
         agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
-        second = self._second(agreed.place, sounds)
-        place = agreed.place
-        others: tuple[Localization, ...] = ()
-        if second is not None:
-            place, others = second[0], (replace(second[1], outvoted=agreed.outvoted),)
+        second = self._second(agreed, evidence, sounds)
+        outvoted = agreed.outvoted if second is None else second[1].outvoted
+        place = agreed.place if second is None else second[0]
+        others = () if second is None else (second[1],)
         judged = _judged(place, self._grid)
         refused = judged.refused if second is not None else agreed.refused or judged.refused
         if not place.proven:
@@ -297,37 +296,50 @@ class Onset(SrpPhat):
             place.proven,
             judged.signs,
             refused,
-            agreed.outvoted,
+            outvoted,
             others,
         )
 
     def _second(
-        self, first: agreement.Place, sounds: Mapping[str, Sound]
+        self, agreed: agreement.Agreed, everyone: tuple[HeardBy, ...], sounds: Mapping[str, Sound]
     ) -> tuple[agreement.Place, Localization] | None:
         """The first place as it is without a second source, and the second; None where there is none.
 
         What the first explains is taken out, and the second looked for; without that the first is looked for again, and
-        then the second once more.
+        then the second once more. Arrays may disagree because one hears another source best: where each of them hears
+        something at both places, none is outvoted.
         """
-        specs = [heard.spec for heard in first.evidence]
-        if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
-            return None
-        if any(uses_envelope(spec.band_hz) for spec in specs):
-            return None  # magnitudes do not add up
-        moments = [self._moments(heard, sounds[heard.spec.name]) for heard in first.evidence]
-        places = [first]
-        for _ in range(3):
-            terms = places[-1].functional.pair_terms(places[-1].position_m)
-            left = [each.without(term.lags_s) for each, term in zip(moments, terms, strict=True)]
-            places.append(self._place(left))
-        again, second = places[-2:]
-        judged = _judged(second, self._grid)
-        confidence = judged.signs.confidence_of_second
-        apart_m = float(np.linalg.norm(again.position_m - second.position_m))
-        if confidence < certainty.LEAST_CONFIDENCE_OF_SECOND or apart_m < several.APART_M or not second.proven:
-            return None
-        evidence = tuple(second.evidence)
-        return again, Localization(second.position_m, judged.covariance_m2, confidence, evidence, signs=judged.signs)
+        divided = bool(agreed.outvoted) or agreed.refused is not None
+        for evidence in (everyone, agreed.place.evidence) if divided else (everyone,):
+            specs = [heard.spec for heard in evidence]
+            if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
+                return None
+            if any(uses_envelope(spec.band_hz) for spec in specs):
+                return None  # magnitudes do not add up
+            moments = [self._moments(heard, sounds[heard.spec.name]) for heard in evidence]
+            places = [replace(agreed.place, evidence=evidence, functional=SRPFunctional(evidence, self._c_m_s))]
+            for _ in range(3):
+                terms = places[-1].functional.pair_terms(places[-1].position_m)
+                left = [each.without(term.lags_s) for each, term in zip(moments, terms, strict=True)]
+                places.append(self._place(left))
+            again, second = places[-2:]
+            judged = _judged(second, self._grid)
+            confidence = judged.signs.confidence_of_second
+            apart_m = float(np.linalg.norm(again.position_m - second.position_m))
+            if confidence < certainty.LEAST_CONFIDENCE_OF_SECOND or apart_m < several.APART_M or not second.proven:
+                continue
+            if divided and not (again.is_heard_by_all and second.is_heard_by_all):
+                continue
+            outvoted = {name: off for name, off in agreed.outvoted.items() if name not in {s.name for s in specs}}
+            return again, Localization(
+                second.position_m,
+                judged.covariance_m2,
+                confidence,
+                second.evidence,
+                signs=judged.signs,
+                outvoted=outvoted,
+            )
+        return None
 
     def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
@@ -359,7 +371,7 @@ class Onset(SrpPhat):
             return known[1]
         spec = self._arrays[array]
         require_band(spec, sample_rate_hz)
-        sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
+        sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / self._c_m_s)
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling

@@ -10,9 +10,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import reduce
-from operator import add
-from typing import Final
+from typing import Final, overload
 
 import numpy as np
 
@@ -21,7 +19,8 @@ from livessl.core.asking import MOST_ASKED_S, Allowance, Asked, AskedSound, bett
 from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.onset import OnsetFrontEnd, OnsetGCC
+from livessl.core.listening import Each, Ear, Listening, together
+from livessl.core.onset import OnsetGCC
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
@@ -79,15 +78,6 @@ VOTES: Final = 10
 LEAST_VOTES: Final = 3
 """An array is doubted that was outvoted so often, and in more than half of the last `VOTES` sounds; until it has agreed
 so often in a row."""
-
-SHARED_FRAMES: Final = 4096
-"""Frames of which a fusion and its twin share what listeners made of them: some seconds of many arrays."""
-
-UNHEARD_FRAMES: Final = 600
-"""Half a minute, longer than an event: no more can be heard after all."""
-
-_Shared = dict[tuple[str, int], OnsetGCC]
-"""By array and chain of frames."""
 
 _Votes = tuple[tuple[int, float | None], ...]
 """Of the last sounds, by the raster interval each began at: by what angle the array was off, None where it agreed."""
@@ -186,12 +176,8 @@ class _Stream:
     ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
     rest_ns: int = 0  # that it is ahead besides
     allowance: Allowance = field(default_factory=Allowance)
-    listener: OnsetFrontEnd | None = None
-    chain: int = 0  # names the frames listened to, in their order
-    unheard: deque[int] = field(
-        default_factory=lambda: deque(maxlen=UNHEARD_FRAMES)
-    )  # those another fusion's heard for it
-    onsets: dict[int, OnsetGCC] = field(default_factory=dict)
+    ear: Ear = field(default_factory=Ear)
+    next_ear: Ear = field(default_factory=Ear)  # for the sound that may come after this one
     counters: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
     )
@@ -231,44 +217,6 @@ class _Stream:
             there.append(raster)
         return pieces, there
 
-    def listen(self, rasters: Iterable[int], estimator: Estimator, shared: _Shared) -> None:
-        """Let the estimator's listener, where it has one, hear the frames at `rasters`, which follow those before."""
-        for raster in rasters:
-            frame = self.frames.get(raster)
-            if frame is None:
-                if self.listener is not None:
-                    self.listener.reset()
-                self.chain = 0
-                self.unheard.clear()
-                continue
-            self.chain = hash((self.chain, raster, frame.time_ns, frame.active, frame.sample_rate_hz))
-            onsets = shared.get((self.spec.name, self.chain))
-            if onsets is None:
-                onsets = self._push(frame, estimator)
-                if onsets is None:
-                    continue
-                shared[self.spec.name, self.chain] = onsets
-                if len(shared) > SHARED_FRAMES:
-                    del shared[next(iter(shared))]
-            else:
-                self.unheard.append(raster)
-            self.onsets[raster] = onsets
-
-    def _push(self, frame: Frame, estimator: Estimator) -> OnsetGCC | None:
-        """Let the listener hear a frame, after those that another one has heard for it."""
-        if self.listener is None or self.listener.sample_rate_hz != frame.sample_rate_hz:
-            self.listener = estimator.listener(self.spec.name, frame.sample_rate_hz)
-            if self.listener is None:
-                return None
-        missed = [self.frames[raster] for raster in self.unheard if raster in self.frames]
-        if len(missed) < len(self.unheard) or len(missed) == UNHEARD_FRAMES:
-            self.listener.reset()
-        self.unheard.clear()
-        for one in missed:
-            if one.sample_rate_hz == frame.sample_rate_hz:
-                self.listener.push(one.samples, quiet=not one.active)
-        return self.listener.push(frame.samples, quiet=not frame.active)
-
     def move(self, frames: int) -> None:
         """Take it that its clock is ahead by so many frames more."""
         self.ahead += frames
@@ -279,13 +227,7 @@ class _Stream:
 
     def forget(self) -> None:
         """Forget what was listened to."""
-        self.listener, self.chain = None, 0
-        self.unheard.clear()
-        self.onsets.clear()
-
-    def onsets_at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
-        """What was listened to at `rasters`."""
-        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
+        self.ear, self.next_ear = Ear(), Ear()
 
 
 @dataclass(slots=True)
@@ -319,6 +261,8 @@ class Fusion:
         further behind. `updates_left_out` counts the others.
     clock_offsets : ClockOffsets or None
         What is known of the arrays' clocks, learned from the events told; None takes them all to agree.
+    each : callable or None
+        What arrays are listened to by, several at once perhaps: see `Listening`.
     """
 
     def __init__(
@@ -331,6 +275,7 @@ class Fusion:
         updates: bool = True,
         newest_only: bool = False,
         clock_offsets: ClockOffsets | None = None,
+        each: Each | None = None,
     ) -> None:
         self._site = site
         self._estimator = estimator
@@ -348,7 +293,8 @@ class Fusion:
         self._now_ns = 0
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
-        self._shared: _Shared = {}
+        self._listening = Listening(estimator, each)
+        self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
         self._spared: Collection[str] = ()
         self._votes: dict[str, _Votes] = dict.fromkeys(self._streams, ())
         self.askable: set[str] = set()
@@ -362,7 +308,7 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._shared, other._votes, other.askable = self._shared, self._votes, self.askable
+        other._listening, other._votes, other.askable = self._listening, self._votes, self.askable
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -411,6 +357,10 @@ class Fusion:
         self._now_ns = now_ns
         for message in messages:
             self._accept(message)
+        if self._event is not None and self._next is not None:  # while others' frames are on their way
+            at = self._next
+            here = [s for s in self._streams.values() if at in s.frames and at not in s.ear.onsets]
+            self._hear(here, [self._next])
         outputs += self._close_ready()
         if self._event is not None and self._everyone_silent():
             outputs += self._finish()
@@ -442,11 +392,14 @@ class Fusion:
         """Wait for none of these arrays and ask none of them, from now on, and all others again."""
         self._spared = arrays
 
-    def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size."""
+    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+        """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size.
+
+        Without `levels` nothing is said of the channels' power, which costs a transform for each array.
+        """
         clocks = self.clock_offsets
         return [
-            _status(stream, now_ns, self._votes[name], None if clocks is None else clocks.of(name))
+            _status(stream, now_ns, self._votes[name], None if clocks is None else clocks.of(name), levels=levels)
             for name, stream in self._streams.items()
         ]
 
@@ -462,7 +415,8 @@ class Fusion:
             for name, old in self._streams.items()
         }
         self._reached.clear()
-        self._shared.clear()
+        self._listening.clear()
+        self._ahead = None
         self._votes.update(dict.fromkeys(self._votes, ()))
         self._next, self._heard_until = None, -(2**63)
         return outputs
@@ -576,12 +530,14 @@ class Fusion:
             self._event = self._open(raster)
         event = self._event
         if event is None:
+            self._listen_ahead(raster, self._heard_until)
             return []
         event.closed = raster
-        for stream in self._streams.values():
-            stream.listen([raster], self._estimator, self._shared)
+        self._hear(self._streams.values(), [raster])
         if active:
-            event.last_active = raster
+            event.last_active, self._ahead = raster, None
+        else:
+            self._listen_ahead(raster, event.last_active + 1)
         if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
             event.became_quiet = True
             return self._end(event)
@@ -604,10 +560,38 @@ class Fusion:
         """
         span = range(self._span_start(raster), raster)
         if raster != self._heard_until:
+            ready = self._ahead == (span.start, span.stop - 1)
             for stream in self._streams.values():
-                stream.forget()
-                stream.listen(span, self._estimator, self._shared)
+                ready = ready and stream.next_ear.has(r for r in span if r in stream.frames)
+            for stream in self._streams.values():
+                stream.ear = stream.next_ear if ready else Ear()
+            if not ready:
+                self._hear(self._streams.values(), span)
+        self._ahead = None
         return _OpenEvent(raster, raster, raster)
+
+    def _hear(self, streams: Iterable[_Stream], rasters: Sequence[int]) -> None:
+        self._listening.hear(((stream.spec.name, stream.ear, stream.frames) for stream in streams), rasters)
+
+    def _hear_anew(self, stream: _Stream, rasters: Sequence[int]) -> None:
+        stream.ear = Ear()
+        self._hear([stream], rasters)
+
+    def _listen_ahead(self, raster: int, begin: int) -> None:
+        """In quiet, listen to what a sound that comes soon will begin with: from `begin` on, where the last one ended.
+
+        That is as far as its pre-roll reaches back. With many arrays there is no time for it when the sound is there.
+        """
+        if not self._newest_only or raster - begin >= round(self._parameters.pre_roll_s / FRAME_S):
+            return
+        if raster != begin and self._ahead != (begin, raster - 1):
+            return
+        if raster == begin:
+            for stream in self._streams.values():
+                stream.next_ear = Ear()
+        streams = self._streams.values()
+        self._listening.hear(((stream.spec.name, stream.next_ear, stream.frames) for stream in streams), [raster])
+        self._ahead = begin, raster
 
     def _span(self, event: _OpenEvent) -> range:
         return range(self._span_start(event.start), event.closed + 1)
@@ -624,7 +608,7 @@ class Fusion:
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
             if pieces and not _doubts(self._votes[name]):
                 sounds.pieces[name] = pieces
-                sounds.onsets[name] = stream.onsets_at(window)
+                sounds.onsets[name] = stream.ear.at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
         if len(sounds) < self._parameters.min_arrays:
             return []
@@ -662,6 +646,7 @@ class Fusion:
             by = self.clock_offsets.frames_ahead(name) - stream.ahead
             if by:
                 stream.move(by)
+                self._ahead = None
                 onward = max(onward, -by)
             stream.rest_ns = round(1e9 * self.clock_offsets.rest_s(name))
         if onward and self._next is not None:
@@ -700,11 +685,10 @@ class Fusion:
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
-            if any(raster not in stream.onsets for raster in there):  # some came late
-                stream.forget()
-                stream.listen(span, self._estimator, self._shared)
+            if not stream.ear.has(there):  # some came late
+                self._hear_anew(stream, span)
             heard.sounds.pieces[name], heard.powers[name] = pieces, power[mask]
-            heard.sounds.onsets[name] = stream.onsets_at(range(span.start, rasters[-1] + 1))
+            heard.sounds.onsets[name] = stream.ear.at(range(span.start, rasters[-1] + 1))
             heard.start_ns = min(heard.start_ns, rasters[0] * FRAME_NS - stream.rest_ns)
             heard.end_ns = max(heard.end_ns, (rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
         return heard
@@ -870,8 +854,28 @@ class Fusion:
         for stream in self._streams.values():
             while stream.frames and (first := next(iter(stream.frames))) < oldest:
                 del stream.frames[first]
-            while stream.onsets and (first := next(iter(stream.onsets))) < oldest:
-                del stream.onsets[first]
+            onsets = stream.ear.onsets
+            while onsets and (first := next(iter(onsets))) < oldest:
+                del onsets[first]
+
+
+class _Segments(Sequence[Float32Array]):
+    """Runs of frames, each joined when it is looked at: of many arrays never all at once, and not if nobody looks."""
+
+    def __init__(self, pieces: Sequence[Sequence[Frame]]) -> None:
+        self._pieces = pieces
+
+    @overload
+    def __getitem__(self, index: int) -> Float32Array: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Float32Array]: ...
+    def __getitem__(self, index: int | slice) -> Float32Array | Sequence[Float32Array]:
+        if isinstance(index, slice):
+            return _Segments(self._pieces[index])
+        return np.concatenate([frame.samples for frame in self._pieces[index]], axis=1)
+
+    def __len__(self) -> int:
+        return len(self._pieces)
 
 
 def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
@@ -895,7 +899,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
 
 
 class _Sounds(Mapping[str, Sound]):
-    """What the arrays heard, each joined from its frames when it is looked at: of many, never all at once."""
+    """What the arrays heard."""
 
     def __init__(self, sources: int, doubted: Collection[str] = ()) -> None:
         self.doubted = doubted
@@ -905,12 +909,11 @@ class _Sounds(Mapping[str, Sound]):
 
     def __getitem__(self, array: str) -> Sound:
         pieces = self.pieces[array]
-        segments = tuple(np.concatenate([frame.samples for frame in piece], axis=1) for piece in pieces)
         onsets = self.onsets[array]
         return Sound(
-            segments,
+            _Segments(pieces),
             pieces[0][0].sample_rate_hz,
-            reduce(add, onsets) if onsets else None,
+            together(onsets),
             array in self.doubted,
             onsets if self.sources > 1 else (),
         )
@@ -995,7 +998,7 @@ def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
         stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
 
-def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | None) -> ArrayStatus:
+def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | None, *, levels: bool) -> ArrayStatus:
     mark = stream.mark
     age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
     state, reason = _state(stream, age_ns, now_ns, votes)
@@ -1009,7 +1012,7 @@ def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | N
         age_s=None if age_ns is None else age_ns / 1e9,
         power=stream.power,
         noise_power=mark.noise_power if mark else None,
-        channel_power=_channel_power(stream),
+        channel_power=_channel_power(stream) if levels else (),
         sample_rate_hz=stream.rate_hz,
         drift_ppm=mark.drift_ppm if mark else None,
         clock=mark.clock if mark else None,

@@ -7,21 +7,21 @@ SRP equation has the opposite one, which would mirror the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 import scipy.fft
 
 from livessl.core.activity import band_bins
+from livessl.core.bands import uses_envelope as uses_envelope
 from livessl.core.frontends import FFT_FACTOR, FrontEnd, Spectra, whole_segment
+from livessl.core.geometry import microphone_pairs as microphone_pairs
 from livessl.core.kernels import kernels
 from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
 """Fine lags a sample. Nearest-lag look-up then errs by 1/16 sample: 8 degrees of phase at 6 kHz and 16 kHz sampling."""
-
-ENVELOPE_ABOVE: Final = 0.25
-"""Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
 
 _NYQUIST_MARGIN: Final = 1.25
 """Near-Nyquist lags are so much denser than the band's upper edge asks for; the interpolation needs the room."""
@@ -35,13 +35,14 @@ _RIDGE: Final = 1e-10
 _PRODUCT_BINS: Final = 2048
 """Up to so many bins, a third of a second, lags come by a matrix that is kept; above it by a short inverse FFT."""
 
+_ROUNDING: Final = 1e-6
+"""Of a lag: arrays of one shape, turned this way and that, are equally wide but for their last digits."""
+
+_SAMPLINGS: Final = 16
+"""Samplings kept for all arrays: a site's have few shapes."""
+
 _MATRICES: Final = 16
 """Matrices kept: a site's windows have few lengths."""
-
-
-def microphone_pairs(count: int) -> IntArray:
-    """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""
-    return np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
 
 
 def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:
@@ -86,7 +87,7 @@ class GCCPhat:
         self._rate_hz = sample_rate_hz
         self._front_end = front_end
         self._envelope = uses_envelope(spec.band_hz)
-        self._sampling = LagSampling(spec.band_hz, sample_rate_hz, spec.aperture_m / c_m_s)
+        self._sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / c_m_s)
         self.lags_s = self._sampling.fine_lags_s
 
     def __call__(self, segments: Sequence[Float32Array]) -> GCC:
@@ -194,7 +195,7 @@ class LagSampling:
 
     def __init__(self, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> None:
         self._rate_hz = sample_rate_hz
-        fine = int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING)) + 2 * OVERSAMPLING
+        fine = _fine_lags(sample_rate_hz, largest_lag_s)
         self.fine_lags_s = np.arange(-fine, fine + 1) / (OVERSAMPLING * sample_rate_hz)
         least = _NYQUIST_MARGIN * 2.0 * band_hz[1] / sample_rate_hz * FFT_FACTOR
         self._per_factor = scipy.fft.next_fast_len(int(np.ceil(least)), real=True)  # lags in FFT_FACTOR samples
@@ -205,6 +206,11 @@ class LagSampling:
         self._lags_s = np.arange(-self._reach, self._reach + 1) * np.float64(step / sample_rate_hz)
         self._weights = _least_squares(self._lags_s, self.fine_lags_s, band_hz)
         self._matrices: dict[tuple[int, bool], Float32Array] = {}
+
+    @classmethod
+    def shared(cls, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> LagSampling:
+        """One for all that are alike, as arrays of one shape are: its matrices are then in the cache, and but once."""
+        return _alike(band_hz, sample_rate_hz, _fine_lags(sample_rate_hz, largest_lag_s))
 
     def sample(
         self, cross: CrossSpectra, cut_off_hz: float = np.inf, *, envelope: bool = False
@@ -243,6 +249,17 @@ class LagSampling:
         return self._matrices[key]
 
 
+def _fine_lags(sample_rate_hz: float, largest_lag_s: float) -> int:
+    """Fine lags on each side of zero: with band and rate, all that a sampling depends on."""
+    return int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING - _ROUNDING)) + 2 * OVERSAMPLING
+
+
+@lru_cache(_SAMPLINGS)
+def _alike(band_hz: tuple[float, float], sample_rate_hz: float, fine_lags: int) -> LagSampling:
+    largest_lag_s = (fine_lags - 2 * OVERSAMPLING) / (OVERSAMPLING * sample_rate_hz)
+    return LagSampling(band_hz, sample_rate_hz, largest_lag_s)
+
+
 def _least_squares(lags_s: FloatArray, fine_lags_s: FloatArray, band_hz: tuple[float, float]) -> Float32Array:
     """Weights (count, L) that minimise the mean over the band of |sum_c w_c e^{j 2 pi f t_c} - e^{j 2 pi f t}|^2."""
 
@@ -252,12 +269,6 @@ def _least_squares(lags_s: FloatArray, fine_lags_s: FloatArray, band_hz: tuple[f
 
     gram = mean_cosine(lags_s[:, None] - lags_s) + _RIDGE * np.eye(len(lags_s))
     return np.linalg.solve(gram, mean_cosine(lags_s[:, None] - fine_lags_s)).astype(np.float32)
-
-
-def uses_envelope(band_hz: tuple[float, float]) -> bool:
-    """Whether R is the magnitude instead of the real part: see `GCCPhat`."""
-    low, high = band_hz
-    return low > ENVELOPE_ABOVE * (high - low)
 
 
 def mean_square_angular_frequency(band_hz: tuple[float, float]) -> float:

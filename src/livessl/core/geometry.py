@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from livessl.core.types import FloatArray
+from livessl.core.types import FloatArray, IntArray
 
 SPEED_OF_SOUND_0C_M_S: Final = 331.3
 
@@ -187,3 +188,11 @@ class Grid:
         """Position (3,) of one node, metres."""
         cell = np.array(np.unravel_index(index, self.shape), dtype=np.float64)
         return np.asarray(self.lower_m + (cell + 0.5) * self.cell_m)
+
+
+@cache
+def microphone_pairs(count: int) -> IntArray:
+    """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""
+    pairs = np.stack(np.triu_indices(count, k=1), axis=1).astype(np.int64)
+    pairs.flags.writeable = False
+    return pairs

@@ -135,10 +135,9 @@ class OnsetFrontEnd:
         self._tail = heard[:, hops * self._hop :].copy()
         if hops == 0:
             return self.nothing
-        cut = np.lib.stride_tricks.sliding_window_view(heard, length, axis=1)[:, :: self._hop][:, :hops]
-        windows = np.zeros((hops, len(samples), self._n_fft), dtype=np.float32)
-        np.multiply(cut.swapaxes(0, 1), self._window, out=windows[:, :, :length])
-        spectra = scipy.fft.rfft(windows, axis=2)
+        windows = np.empty((hops, len(samples), self._n_fft), dtype=np.float32)
+        kernels.cut_windows(heard, self._hop, self._window, windows)
+        spectra = np.asarray(scipy.fft.rfft(windows, axis=2), dtype=np.complex64)
         weights = np.empty((hops, len(self._noise)), dtype=np.float32)
         kernels.onset_weights(
             spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,

@@ -11,6 +11,7 @@ import numpy as np
 
 from livessl.core.gcc import mean_square_angular_frequency
 from livessl.core.geometry import Grid
+from livessl.core.kernels import kernels
 from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
 from livessl.core.types import Float32Array, FloatArray, HeardBy, IntArray
 
@@ -193,9 +194,7 @@ def laplace_covariance_m2(
 
 
 def _scale(heard: HeardBy, term: PairTerms) -> float:
-    lags, values = heard.gcc.lags_s, heard.gcc.values
-    lobe_s = 2.0 * np.pi / np.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
-    elsewhere = np.abs(lags[None] - term.lags_s[:, None]) > lobe_s
-    noise = float((values**2)[elsewhere].mean()) if elsewhere.any() else 0.0
+    lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
+    noise = kernels.mean_square(heard.gcc.values, heard.gcc.lags_s, term.lags_s, lobe_s)
     height = float(term.values.mean())
     return max(height, 0.0) / noise if noise > 0 else 0.0

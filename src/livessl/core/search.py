@@ -16,21 +16,34 @@ from typing import Final
 import numpy as np
 
 from livessl.core import vectorised
-from livessl.core.gcc import microphone_pairs
+from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
+from livessl.core.onset import OnsetFrontEnd
 from livessl.core.peaks import FindPeaks, Peak, box_around
 from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray, UInt8Array, UInt16Array
+from livessl.core.types import (
+    GCC,
+    ArraySpec,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    HeardBy,
+    IntArray,
+    UInt16Array,
+)
 
 CELL_M: Final = 0.2
 """Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
 
 MOST_CELLS: Final = 50_000
 
-MOST_LOOK_UPS: Final = 5_000_000
-"""After so many a search is given up, some 10 ms compiled. Two arrays never need so many, nor do many that hear a sound
+MOST_LOOK_UPS: Final = 3_000_000
+"""After so many a search is given up, some 5 ms compiled. Two arrays never need so many, nor do many that hear a sound
 well; many that hear nothing but noise do."""
+
+MOST_HALVES_BYTES: Final = 64_000_000
+"""Cells are halved along each axis, before nodes are looked at, where the tables of that take no more."""
 
 CELLS_PER_TOP: Final = 4
 """Cells along an edge of the cubes of cells that are bounded first."""
@@ -61,7 +74,8 @@ class PeakSearch:
         self._c_m_s = c_m_s
         self._axes = [grid.axis_m(axis).astype(np.float32) for axis in range(3)]
         volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
-        self._edge = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / grid.spacing_m))
+        half = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / 2 / grid.spacing_m))
+        self._edge = 2 * half
         self._cells = [-(-n // self._edge) for n in grid.shape]
         self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
         self._specs = {spec.name: spec for spec in arrays}
@@ -70,9 +84,12 @@ class PeakSearch:
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total = sum(counts)
         tops = int(np.prod(self._tops))
-        self._low, self._high = (np.zeros((total, tops * CELLS_PER_TOP**3), np.uint16) for _ in range(2))
-        self._top_low, self._top_high = (np.zeros((total, tops), np.uint16) for _ in range(2))
-        self._places: dict[str, LagPlaces] = {}
+        children = CELLS_PER_TOP**3
+        self._halves = half > 1 and 2 * 8 * children * tops * total <= MOST_HALVES_BYTES
+        self._cell_places = np.zeros((tops, total, children), np.uint16)
+        self._leaf_places = np.zeros((tops * children, total, 8 if self._halves else 0), np.uint16)
+        self._top_places = np.zeros((total, tops), np.uint16)
+        self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Rows] = {}
 
     def prepare(self, array: str, lags_s: FloatArray) -> None:
@@ -90,14 +107,26 @@ class PeakSearch:
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         rows = slice(first, first + len(pairs))
-        places = self._places[array] = LagPlaces.on(lags_s, self._c_m_s)
-        low, high = (np.empty((len(pairs), int(np.prod(self._cells))), np.uint16) for _ in range(2))
-        microphones_m = spec.microphones_m.astype(np.float32)
+        places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
+        edge = self._edge // 2 if self._halves else self._edge
+        small = [-(-len(axis_m) // edge) for axis_m in self._axes]
+        low, high = (np.empty((len(pairs), *small), np.uint16) for _ in range(2))
         kernels.cell_intervals(
-            *self._axes, microphones_m, pairs.astype(np.int32), places.scale, places.offset, self._edge, low, high
-        )
-        self._low[rows], self._top_low[rows] = self._by_cube(low, np.minimum)
-        self._high[rows], self._top_high[rows] = self._by_cube(high, np.maximum)
+            *self._axes, spec.microphones_m.astype(np.float32), pairs.astype(np.int32), places.scale, places.offset,
+            edge, low.reshape(len(pairs), -1), high.reshape(len(pairs), -1),
+        )  # fmt: skip
+        block = _block(len(lags_s))
+        if self._halves:
+            children = CELLS_PER_TOP * 2
+            leaf_places = _by_cube(_run_places(low, high, block), self._tops, children)
+            split = leaf_places.reshape(len(pairs), -1, *(n for _ in range(3) for n in (CELLS_PER_TOP, 2)))
+            by_cell = split.transpose(1, 2, 4, 6, 0, 3, 5, 7)
+            self._leaf_places[:, rows] = by_cell.reshape(len(self._leaf_places), len(pairs), 8)
+            low, high = _extreme(low, 2, np.minimum), _extreme(high, 2, np.maximum)
+        places_of_cells = _by_cube(_run_places(low, high, block), self._tops, CELLS_PER_TOP)
+        self._cell_places[:, rows] = places_of_cells.swapaxes(0, 1)
+        low, high = _extreme(low, CELLS_PER_TOP, np.minimum), _extreme(high, CELLS_PER_TOP, np.maximum)
+        self._top_places[rows] = _run_places(low, high, block).reshape(len(pairs), -1)
         self._sets.clear()
 
     def among(
@@ -117,15 +146,18 @@ class PeakSearch:
         for array, heard in enumerate(evidence):
             values = heard.gcc.values
             rows.values[rows.first_row[array] : rows.first_row[array + 1], : values.shape[1]] = values
-        kernels.running_maxima(rows.values, rows.maxima)
+        kernels.running_maxima(rows.values, rows.block, rows.maxima)
+        kernels.bounds(rows.maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), rows.top_bound)
+        rows.bounded[:] = False
 
         def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
                 node, power, proven = kernels.highest(
-                    rows.values, rows.maxima, rows.level_of, rows.rows, rows.first_row, rows.weight, int(rule),
-                    self._low, self._high, self._top_low, self._top_high, *self._axes, self._edge, CELLS_PER_TOP,
+                    rows.values, rows.maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
+                    self._leaf_places, rows.top_bound, rows.cell_bound, rows.bounded,
+                    *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
                     np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
                 )  # fmt: skip
@@ -137,18 +169,6 @@ class PeakSearch:
 
         return find
 
-    def _by_cube(self, cells: UInt16Array, extreme: np.ufunc) -> tuple[UInt16Array, UInt16Array]:
-        """Intervals' ends (P, C) of cells in the grid's order: cube after cube, filled up with zeros; and of cubes."""
-        pairs = len(cells)
-        by_axis = cells.reshape(pairs, *self._cells)
-        of_cubes = by_axis
-        for axis, count in enumerate(self._cells):
-            of_cubes = extreme.reduceat(of_cubes, np.arange(0, count, CELLS_PER_TOP), axis=axis + 1)
-        padded = np.zeros((pairs, *(CELLS_PER_TOP * tops for tops in self._tops)), np.uint16)
-        padded[:, : self._cells[0], : self._cells[1], : self._cells[2]] = by_axis
-        split = padded.reshape(pairs, *(n for tops in self._tops for n in (tops, CELLS_PER_TOP)))
-        return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(pairs, -1), of_cubes.reshape(pairs, -1)
-
     def _rows(self, arrays: tuple[str, ...]) -> _Rows:
         if arrays not in self._sets:
             if len(self._sets) >= _SETS:
@@ -157,15 +177,19 @@ class PeakSearch:
         return self._sets[arrays]
 
     def _new_rows(self, arrays: tuple[str, ...]) -> _Rows:
-        specs, places = [self._specs[name] for name in arrays], [self._places[name] for name in arrays]
+        specs, places = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
         first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
         rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
         length = max(one.count for one in places)
-        levels = int((self._top_high[rows] - self._top_low[rows]).max()).bit_length() + 1
+        most = 1 + int(self._top_places[rows].max())
+        tops = self._top_places.shape[1]
         return _Rows(
             values=np.zeros((len(rows), length), np.float32),
-            maxima=np.zeros((levels, len(rows), length), np.float32),
-            level_of=np.array([(n + 1).bit_length() - 1 for n in range(length)], np.uint8),
+            block=np.repeat([_block(one.count) for one in places], np.diff(first_row)),
+            maxima=np.zeros((len(rows), -(-most // vectorised.BLOCKS) * vectorised.BLOCKS), np.float32),
+            top_bound=np.zeros(tops, np.float32),
+            cell_bound=np.zeros((tops, CELLS_PER_TOP**3), np.float32),
+            bounded=np.zeros(tops, np.bool_),
             rows=rows,
             first_row=first_row,
             weight=np.array([pair_weight(len(spec.microphones_m)) for spec in specs], np.float32),
@@ -177,6 +201,36 @@ class PeakSearch:
         )
 
 
+def _block(lags: int) -> int:
+    """How many lags of an axis make one of its blocks."""
+    return -(-lags // vectorised.BLOCKS)
+
+
+def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
+    """Where among the running maxima the shortest run is that begins in the block of `low` and holds `high`."""
+    first = low // block
+    return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
+
+
+def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
+    """Of intervals' ends (P, X, Y, Z), the extremes over cubes with `count` an edge."""
+    for axis in (1, 2, 3):
+        ends = extreme.reduceat(ends, np.arange(0, ends.shape[axis], count), axis=axis)
+    return ends
+
+
+def _by_cube(table: UInt16Array, cubes: Sequence[int], count: int) -> UInt16Array:
+    """A table (P, X, Y, Z) as (P, T, count^3): cube after cube, filled up with zeros where one reaches out."""
+    padded = np.zeros((len(table), *(count * n for n in cubes)), table.dtype)
+    padded[:, : table.shape[1], : table.shape[2], : table.shape[3]] = table
+    split = padded.reshape(len(table), *(n for along in cubes for n in (along, count)))
+    return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(len(table), -1, count**3)
+
+
+_PLACE_OF_LENGTH: Final = np.array(
+    [vectorised.BLOCKS * np.searchsorted(vectorised.RUNS, blocks) for blocks in range(vectorised.BLOCKS + 1)], np.uint16
+)
+
 _SETS: Final = 16
 """Sets of arrays that are kept ready."""
 
@@ -186,8 +240,11 @@ class _Rows:
     """What a search over one set of arrays needs, and the room it works in: see `vectorised.highest`."""
 
     values: Float32Array
+    block: IntArray
     maxima: Float32Array
-    level_of: UInt8Array
+    top_bound: Float32Array
+    cell_bound: Float32Array
+    bounded: BoolArray
     rows: IntArray
     first_row: IntArray
     weight: Float32Array
@@ -210,5 +267,8 @@ def warm_up() -> None:
     search = PeakSearch([spec], grid, 343.0)
     search.prepare(spec.name, lags_s)
     search.among([heard])(2)
+    ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
+    ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
+    kernels.mean_square(heard.gcc.values, lags_s, np.zeros(1), 0.0)
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
     SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))

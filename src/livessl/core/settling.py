@@ -124,9 +124,9 @@ class Settling:
         self.live.spare(arrays)
         self._slow.spare(arrays)
 
-    def status(self, now_ns: int) -> list[ArrayStatus]:
-        """How every array is doing."""
-        return self.live.status(now_ns)
+    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+        """How every array is doing: see `Fusion.status`."""
+        return self.live.status(now_ns, levels=levels)
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output | Settled]:
         """Take in messages, in any order between arrays; return what there is to tell."""

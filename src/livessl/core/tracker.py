@@ -32,6 +32,10 @@ SILENCE_S: Final = 3.0
 _NEVER: Final = 1e9
 """Stands for what is outside every gate, where sums must stay finite."""
 
+CONFIRM_S: Final = 1.0
+"""While a source is followed, another is told of from its second estimate on, which must come within so long: a single
+one beside it is a reflection more often than somebody new."""
+
 MIN_STD_M: Final = 0.05
 """The least believed of a single estimate's uncertainty: models of the room are not better than this."""
 
@@ -42,6 +46,7 @@ class _Filter:
     time_ns: int
     state: FloatArray  # position and velocity (6,)
     covariance: FloatArray  # (6, 6)
+    told: bool = False
 
     def predict(self, time_ns: int) -> None:
         dt = max(0.0, (time_ns - self.time_ns) / 1e9)
@@ -75,14 +80,21 @@ class Tracker:
     def step(self, time_ns: int, estimates: Iterable[Estimate] = ()) -> list[Track]:
         """Take in the estimates of one moment, no two of one source; return the tracks that changed."""
         changed = self._end_silent(time_ns)
+        followed = any(track.told and time_ns - track.time_ns <= CONFIRM_S * 1e9 for track in self._filters)
         found = [(each, each.covariance_m2 + MIN_STD_M**2 * np.eye(3)) for each in estimates]
         for (estimate, noise), known in zip(found, self._assigned(found), strict=True):
             if known is None:
-                changed.append(self._start(estimate, noise).track(TrackState.NEW))
+                track = self._start(estimate, noise)
             else:
-                known.predict(estimate.time_ns)
-                known.update(estimate.position_m, noise)
-                changed.append(known.track(TrackState.UPDATE))
+                track = known
+                track.predict(estimate.time_ns)
+                track.update(estimate.position_m, noise)
+            if track.told:
+                changed.append(track.track(TrackState.UPDATE))
+            elif known is not None or not followed:
+                track.id, track.told = self._next_id, True
+                self._next_id += 1
+                changed.append(track.track(TrackState.NEW))
         return changed
 
     def _assigned(self, found: Sequence[tuple[Estimate, FloatArray]]) -> list[_Filter | None]:
@@ -108,15 +120,17 @@ class Tracker:
         covariance[:3, :3] = noise_m2
         covariance[3:, 3:] = START_SPEED_M_S**2 * np.eye(3)
         state = np.concatenate([estimate.position_m, np.zeros(3)])
-        started = _Filter(self._next_id, estimate.time_ns, state, covariance)
-        self._next_id += 1
+        started = _Filter(0, estimate.time_ns, state, covariance)
         self._filters.append(started)
         return started
 
     def _end_silent(self, time_ns: int) -> list[Track]:
-        silent = [f for f in self._filters if time_ns - f.time_ns > SILENCE_S * 1e9]
-        self._filters = [f for f in self._filters if f not in silent]
-        return [f.track(TrackState.END) for f in silent]
+        def is_silent(track: _Filter) -> bool:
+            return time_ns - track.time_ns > (SILENCE_S if track.told else CONFIRM_S) * 1e9
+
+        ended = [track.track(TrackState.END) for track in self._filters if track.told and is_silent(track)]
+        self._filters = [track for track in self._filters if not is_silent(track)]
+        return ended
 
 
 def _surprise(track: _Filter, estimate: Estimate, noise_m2: FloatArray) -> float:

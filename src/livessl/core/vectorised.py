@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from livessl.core.types import ComplexArray, Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
+from livessl.core.types import BoolArray, ComplexArray, Float32Array, FloatArray, IntArray, RealArray, UInt16Array
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -25,6 +25,12 @@ NAME: Final = "NumPy"
 SUM: Final = 0
 PRODUCT: Final = 1
 MINIMUM: Final = 2
+
+BLOCKS: Final = 256
+"""Blocks that a lag axis is divided into, at most, for the bounds."""
+
+RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(6) for q in (4, 5, 6, 7)), BLOCKS])
+"""Lengths, in blocks, of the runs whose maxima are kept: none is more than a quarter longer than the one before."""
 
 NO_LAG: Final = 65535
 """Above every lag: what a cell without nodes begins with."""
@@ -37,6 +43,14 @@ _SLAB_NODES: Final = 1 << 15
 
 _CELLS_AT_ONCE: Final = 64
 """Most cells whose nodes are looked at together; it begins with few, for mostly few are needed."""
+
+
+def cut_windows(samples: Float32Array, hop: int, window: Float32Array, windows: Float32Array) -> None:
+    """Windows (T, K, n) of sound (K, N), `hop` samples apart: weighed by `window`, and zeros after it."""
+    length = len(window)
+    cut = np.lib.stride_tricks.sliding_window_view(samples, length, axis=1)[:, ::hop][:, : len(windows)]
+    np.multiply(cut.swapaxes(0, 1), window, out=windows[:, :, :length])
+    windows[:, :, length:] = 0.0
 
 
 def cross_spectra(
@@ -193,6 +207,12 @@ def add_power(values: Float32Array, table: csr_array, weight: np.float32, power:
     power += weight * (table @ values.ravel())
 
 
+def mean_square(values: RealArray, lags_s: FloatArray, but_s: FloatArray, apart_s: float) -> float:
+    """Mean square of a GCC (P, L) at lags further than `apart_s` from one of each pair (P,); 0 for no lags."""
+    elsewhere = np.abs(lags_s[None] - but_s[:, None]) > apart_s
+    return float((values**2)[elsewhere].mean(dtype=np.float64)) if elsewhere.any() else 0.0
+
+
 def smooth_power(
     points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float, first_s: FloatArray,
     step_s: FloatArray, start: IntArray, last: IntArray, weight: FloatArray, values: RealArray,
@@ -251,37 +271,73 @@ def interpolated(
     return value, slope, curvature
 
 
-def running_maxima(values: Float32Array, maxima: Float32Array) -> None:
-    """Maxima over 1, 2, 4, ... lags from each lag on: (levels, R, L) of (R, L)."""
-    maxima[0] = values
-    for level in range(1, len(maxima)):
-        half = 1 << (level - 1)
-        maxima[level] = maxima[level - 1]
-        np.maximum(
-            maxima[level - 1, :, :-half], maxima[level - 1, :, half:], out=maxima[level, :, : values.shape[1] - half]
-        )
+def running_maxima(values: Float32Array, block: IntArray, maxima: Float32Array) -> None:
+    """Maxima of each row over runs of blocks of lags.
+
+    Parameters
+    ----------
+    values : (R, L) float32
+    block : (R,) int64
+        Lags in a block.
+    maxima : (R, levels * `BLOCKS`) float32
+        The answer: of each row, at `level * BLOCKS + b`, the greatest value in the `RUNS[level]` blocks from b on.
+    """
+    padded = np.full((len(values), int(block.max()) * BLOCKS), -np.inf, dtype=np.float32)
+    for size in np.unique(block):
+        which, width = block == size, min(values.shape[1], size * BLOCKS)
+        padded[which, :width] = values[which, :width]
+        maxima[which, :BLOCKS] = padded[which, : size * BLOCKS].reshape(-1, BLOCKS, size).max(axis=2)
+    levels = maxima.reshape(len(maxima), -1, BLOCKS)
+    for level in range(1, levels.shape[1]):
+        further = RUNS[level] - RUNS[level - 1]
+        levels[:, level] = levels[:, level - 1]
+        np.maximum(levels[:, level - 1, :-further], levels[:, level - 1, further:], out=levels[:, level, :-further])
+
+
+def bounds(
+    maxima: Float32Array, places: UInt16Array, rows: IntArray, first_row: IntArray, weight: Float32Array, rule: int,
+    bound: Float32Array,
+) -> None:  # fmt: skip
+    """What no node of each of some cells exceeds: the fusion of the pairs' highest values over the cell's lags.
+
+    Parameters
+    ----------
+    maxima : (R, levels * `BLOCKS`) float32
+        See `running_maxima`.
+    places : (site's pairs, C) uint16
+        Where among a row's maxima the one over a run of lags is that holds all of the cell's.
+    rows, first_row, weight, rule
+        As for `highest`.
+    bound : (C,) float32
+        The answer.
+    """
+    joined = _start(rule, len(bound))
+    for a in range(len(weight)):
+        total = np.zeros(len(bound), dtype=np.float32)
+        for r in range(first_row[a], first_row[a + 1]):
+            total += maxima[r, places[rows[r]]]
+        joined = _joined(rule, joined, weight[a] * total)
+    bound[:] = joined
 
 
 def highest(
-    values: Float32Array, maxima: Float32Array, level_of: UInt8Array, rows: IntArray, first_row: IntArray,
-    weight: Float32Array, rule: int, low: UInt16Array, high: UInt16Array, top_low: UInt16Array, top_high: UInt16Array,
-    x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int, microphones_m: Float32Array,
-    first_microphone: IntArray, pairs: IntArray, scale: Float32Array, offset: Float32Array, boxes: IntArray, most: int,
+    values: Float32Array, maxima: Float32Array, rows: IntArray, first_row: IntArray, weight: Float32Array, rule: int,
+    places: UInt16Array, leaf_places: UInt16Array, top_bound: Float32Array, cell_bound: Float32Array,
+    bounded: BoolArray, x_m: Float32Array, y_m: Float32Array, z_m: Float32Array, edge: int, per_top: int,
+    microphones_m: Float32Array, first_microphone: IntArray, pairs: IntArray, scale: Float32Array,
+    offset: Float32Array, boxes: IntArray, most: int,
 ) -> tuple[int, float, bool]:  # fmt: skip
     """The highest node outside some boxes, by branch and bound: the very one that the whole map would give.
 
-    No node of a cell exceeds the fusion of the pairs' highest values over the cell's lags; two look-ups in the running
-    maxima give the maximum over any interval. Cubes of cells are looked into in the order of their bounds, and of their
-    cells those whose bound reaches what is known already. Of nodes that are equal the first in the grid's order is
-    taken. With no node outside the boxes the value is -inf.
+    Cubes of cells are looked into in the order of their bounds, and of their cells those whose bound reaches what is
+    known already. Of nodes that are equal the first in the grid's order is taken. With no node outside the boxes the
+    value is -inf.
 
     Parameters
     ----------
     values : (R, L) float32
         GCCs.
-    maxima : (levels, R, L) float32
-    level_of : (L,) uint8
-        By an interval's length less one, the level whose maxima cover it with two.
+    maxima : (R, levels * `BLOCKS`) float32
     rows : (R,) int64
         Which of the site's pairs the search's rows are.
     first_row : (A + 1,) int64
@@ -289,10 +345,15 @@ def highest(
     weight : (A,) float32
     rule : int
         `SUM`, `PRODUCT` of the positive parts or `MINIMUM` over the arrays.
-    low, high : (site's pairs, T per_top^3) uint16
-        Lag intervals of the cells, cube after cube; 0 where a cube reaches out of the volume.
-    top_low, top_high : (site's pairs, T) uint16
-        The same of the cubes of `per_top` cells an edge.
+    places : (T, site's pairs, per_top^3) uint16
+        Of the cells of each cube: see `bounds`.
+    leaf_places : (T per_top^3, site's pairs, 8 or 0) uint16
+        Of the halves, along each axis, of each cell; 0 where the nodes of a whole cell are looked at together.
+    top_bound : (T,) float32
+        Bounds of the cubes.
+    cell_bound : (T, per_top^3) float32
+    bounded : (T,) bool
+        Of which cubes the cells' bounds are known already; both are filled in.
     x_m, y_m, z_m, edge
         As for `cell_intervals`.
     microphones_m : (M, 3) float32
@@ -317,35 +378,48 @@ def highest(
     tops = tuple(-(-n // (per_top * edge)) for n in shape)
     best, best_node, spent = np.float32(-np.inf), int(np.prod(shape)), 0
 
-    def promising(which: IntArray, first: IntArray, nodes: int, table: tuple[UInt16Array, UInt16Array]) -> _Cells:
+    def promising(which: IntArray, first: IntArray, nodes: int, bound: Float32Array) -> _Cells:
         """Of cubes with `nodes` an edge, those that may be better than what is known."""
-        bound = _bounds(which, *table, rows, first_row, weight, rule, maxima, level_of)
         last = np.minimum(first + nodes, shape) - 1
-        bound[(first >= shape).any(axis=1)] = -np.inf
+        out = (first >= shape).any(axis=1)
         for box in boxes:
-            bound[((first >= box[:, 0]) & (last <= box[:, 1])).all(axis=1)] = -np.inf
+            out |= ((first >= box[:, 0]) & (last <= box[:, 1])).all(axis=1)
+        bound = np.where(out, np.float32(-np.inf), bound)
         order = np.argsort(-bound, kind="stable")
         order = order[(bound[order] > -np.inf) & (bound[order] >= best)]
         return _Cells(which[order], first[order], bound[order], np.ravel_multi_index(tuple(first[order].T), shape))
 
     inner = np.stack(np.unravel_index(np.arange(per_top**3), (per_top,) * 3), axis=1) * edge
-    inmost = np.stack(np.unravel_index(np.arange(edge**3), (edge,) * 3), axis=1)
-    every = np.arange(top_low.shape[1])
+    halves = leaf_places.shape[2] > 0
+    leaf_edge = edge // 2 if halves else edge
+    leaf_bound = np.empty((_CELLS_AT_ONCE, 8), dtype=np.float32)
+    leaves = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * leaf_edge
+    inmost = np.stack(np.unravel_index(np.arange(leaf_edge**3), (leaf_edge,) * 3), axis=1)
+    every = np.arange(len(top_bound))
     corners = np.stack(np.unravel_index(every, tops), axis=1) * (per_top * edge)
-    cubes = promising(every, corners, per_top * edge, (top_low, top_high))
-    spent += 2 * len(every) * len(rows)
+    cubes = promising(every, corners, per_top * edge, top_bound)
     while (chosen := cubes.take(best, best_node)) is not None:
-        if spent > most and best > -np.inf:
-            return best_node, float(best), False
         which, first = chosen
+        for top in which[~bounded[which]]:
+            if spent > most and best > -np.inf:
+                return best_node, float(best), False
+            spent += per_top**3 * len(rows)
+            bounds(maxima, places[top], rows, first_row, weight, rule, cell_bound[top])
+            bounded[top] = True
         children = (which[:, None] * per_top**3 + np.arange(per_top**3)).ravel()
-        spent += 2 * len(children) * len(rows)
-        cells = promising(children, (first[:, None] + inner).reshape(-1, 3), edge, (low, high))
+        cells = promising(children, (first[:, None] + inner).reshape(-1, 3), edge, cell_bound[which].ravel())
         while (chosen := cells.take(best, best_node)) is not None:
             if spent > most and best > -np.inf:
                 return best_node, float(best), False
-            spent += len(chosen[1]) * edge**3 * len(rows)
-            at = (chosen[1][:, None] + inmost).reshape(-1, 3)
+            which, first = chosen
+            for cell in range(len(which) if halves else 0):
+                bounds(maxima, leaf_places[which[cell]], rows, first_row, weight, rule, leaf_bound[cell])
+            if halves:
+                spent += leaf_bound[: len(which)].size * len(rows)
+                hopeful = leaf_bound[: len(which)] >= best
+                first = (first[:, None] + leaves)[hopeful]
+            spent += len(first) * leaf_edge**3 * len(rows)
+            at = (first[:, None] + inmost).reshape(-1, 3)
             at = at[(at < shape).all(axis=1)]
             for box in boxes:
                 at = at[~((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)]
@@ -382,22 +456,6 @@ class _Cells:
             if may_hold.any():
                 return self.which[now][may_hold], self.first[now][may_hold]
         return None
-
-
-def _bounds(
-    which: IntArray, low: UInt16Array, high: UInt16Array, rows: IntArray, first_row: IntArray, weight: Float32Array,
-    rule: int, maxima: Float32Array, level_of: UInt8Array,
-) -> Float32Array:  # fmt: skip
-    """What no node of each of some cells exceeds."""
-    joined = _start(rule, len(which))
-    for a in range(len(weight)):
-        total = np.zeros(len(which), dtype=np.float32)
-        for r in range(first_row[a], first_row[a + 1]):
-            lowest, highest_lag = low[rows[r], which].astype(np.int64), high[rows[r], which].astype(np.int64)
-            level = level_of[highest_lag - lowest].astype(np.int64)
-            total += np.maximum(maxima[level, r, lowest], maxima[level, r, highest_lag + 1 - (1 << level)])
-        joined = _joined(rule, joined, weight[a] * total)
-    return joined
 
 
 def _fused(

@@ -17,6 +17,7 @@ from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
 from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
+from livessl.server.helper import Helper
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
@@ -109,6 +110,7 @@ class Engine:
         self._disabled = store.disabled(site.site)  # replaced, never changed: other threads read it
         self._switching = threading.Lock()
         self.maps = Maps(clock)
+        self._helper = Helper()
         self.latency = Latency()
         _warm_up()
         self._begin_live()
@@ -160,6 +162,7 @@ class Engine:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=3.0)
+        self._helper.stop()
         self.maps.stop()
         self._receiver.stop()
 
@@ -177,9 +180,9 @@ class Engine:
         """Seconds since the start."""
         return (self._clock.monotonic_ns() - self._began_ns) / 1e9
 
-    def arrays(self) -> list[JsonObject]:
+    def arrays(self, *, levels: bool = True) -> list[JsonObject]:
         """How every array is doing; from any thread, and without waiting for a localization that is going on."""
-        return [self._array(status) for status in self._settling.status(self.now_ns())]
+        return [self._array(status) for status in self._settling.status(self.now_ns(), levels=levels)]
 
     def enable(self, array: str, enabled: bool) -> None:
         """Use an array's sound from now on, or do not; from any thread.
@@ -236,7 +239,7 @@ class Engine:
         self._clocks = self._site.make_clock_offsets()
         if clocks is not None:
             self._clocks.restore(clocks)
-        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks)
+        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks, each=self._helper.each)
         self._settling = Settling(fusion, arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
@@ -290,9 +293,11 @@ class Engine:
             self._settling.greet(array, item.hello.backlog.get(array), self.now_ns(), answers=item.hello.answers)
 
     def _watch_arrays(self, now_ns: int) -> None:
+        if now_ns - self._status_ns < STATUS_NS:
+            states = {array["name"]: array["state"] for array in self.arrays(levels=False)}
+            if all(state == self._states.get(name) for name, state in states.items()):
+                return
         arrays = self.arrays()
-        if now_ns - self._status_ns < STATUS_NS and all(a["state"] == self._states.get(a["name"]) for a in arrays):
-            return
         self._status_ns = now_ns
         for array in arrays:
             before = self._states.get(array["name"])

@@ -97,6 +97,7 @@ const HEARD = {
     const bornMs = born(message, 0, true);
     const shown = marker(message, bornMs);
     state.current.set(message.event_id, shown);
+    setOthers(message, bornMs);
     if (shown.position) leaveTrail(shown);
     learnLatency("update", message);
     newest(message, shown);
@@ -105,6 +106,7 @@ const HEARD = {
     const bornMs = born(message, message.duration_s, true);
     const shown = marker(message, bornMs);
     state.current.delete(message.id);
+    setOthers({ event_id: message.id }, bornMs);
     state.events.add(message.id);
     eventList.add(message, serverNow());
     if (shown.position && shown.status === "located") leaveTrail(shown);
@@ -215,6 +217,17 @@ function marker(message, bornMs) {
 /** Oldest first; what is infinitely old has no order among itself. */
 function byAge(a, b) {
   return a.bornMs === b.bornMs ? 0 : a.bornMs < b.bornMs ? -1 : 1;
+}
+
+/** Further sources of a sound that goes on, each a marker of its own; they end with it. */
+function setOthers({ event_id: id, others = [] }, bornMs) {
+  for (const key of [...state.current.keys()]) if (key.startsWith(`${id}/`)) state.current.delete(key);
+  others.forEach((other, index) => {
+    const key = `${id}/${index + 2}`;
+    const shown = marker({ ...other, kind: "update", event_id: key }, bornMs);
+    state.current.set(key, shown);
+    leaveTrail(shown);
+  });
 }
 
 function leaveTrail(shown) {

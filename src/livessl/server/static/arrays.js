@@ -190,6 +190,8 @@ export class ArraysPanel {
     if (array.clock_offset) facts.push(offset(array.clock_offset));
     if (Number.isFinite(array.sample_rate_hz)) facts.push([`${number(array.sample_rate_hz / 1000, 2)} kHz`, ""]);
     if (array.node) facts.push([`node ${array.node}`, ""]);
+    const { agreed = 0, disagreed = 0 } = array.agreement ?? {};
+    if (agreed + disagreed > 0) facts.push([`agrees in ${agreed} of ${agreed + disagreed} sounds`, disagreed > agreed ? "trouble" : ""]);
     facts.push([`${frames.toLocaleString("en").replaceAll(",", "\u202f")} frames`, ""]);
     facts.push([`${marks.toLocaleString("en").replaceAll(",", "\u202f")} marks`, ""]);
     if (backfilled > 0) facts.push([`${backfilled} kept and sent later`, ""]);

@@ -140,6 +140,7 @@ function summary(event, nowMs) {
   fill.style.width = `${Math.round(100 * Math.min(1, Math.max(0, event.confidence ?? 0)))}%`;
   const told = verdict(event);
   const facts = [
+    event.source > 1 ? "second of two sources" : "",
     (event.arrays?.length ? event.arrays : event.heard_by ?? []).map((name) => named(name, event)).join(" + "),
     `${number(event.duration_s, 2)} s long`,
     `${number(event.level_dbfs, 0)} dBFS`,
@@ -192,7 +193,7 @@ function details(event) {
   if (!event.contributions?.length) return [list];
   const heads = ["array", "used s", "dBFS", "azimuth", "elevation", "distance"];
   const rows = event.contributions.map((c) => el("tr", {},
-    el("th", { text: named(c.array, event), scope: "row" }),
+    el("th", { text: named(c.array, event) + (c.agrees === false ? ` (outvoted, ${number(c.off_deg, 0)}° off)` : ""), scope: "row" }),
     ...[number(c.active_s), number(c.level_dbfs, 1), `${number(c.azimuth_deg, 1)}°`, `${number(c.elevation_deg, 1)}°`, `${number(c.distance_m)} m`].map((text) => el("td", { text }))));
   return [list, el("table", {},
     el("caption", { text: "What each array brought" }),
