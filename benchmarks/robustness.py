@@ -1,7 +1,7 @@
 """One array of three wrong, two sources at once, a walking talker: simulated, by the localizer as it is served.
 
 `python benchmarks/robustness.py array --events DIR`, `sources`, `walk`; the sounds are those of DCASE 2016 task 2, the
-development half unless told. What came out is in docs/accuracy/robustness.md.
+development half unless told. What the first two came to is in docs/accuracy/robustness.md.
 """
 
 from __future__ import annotations
