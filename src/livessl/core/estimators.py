@@ -310,7 +310,8 @@ class Onset(SrpPhat):
         something at both places, none is outvoted.
         """
         divided = bool(agreed.outvoted) or agreed.refused is not None
-        for evidence in (everyone, agreed.place.evidence) if divided else (everyone,):
+        for all_of_them in (everyone, agreed.place.evidence) if divided else (everyone,):
+            evidence = _clearest(all_of_them, sounds)
             specs = [heard.spec for heard in evidence]
             if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
                 return None
@@ -377,6 +378,17 @@ class Onset(SrpPhat):
         return sampling
 
 
+def _clearest(evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+    """Of many arrays those that heard the clearest onsets, in the order of their names."""
+    if len(evidence) <= MOST_TELLING_APART:
+        return evidence
+    weights = {
+        heard.spec.name: onsets.weight if (onsets := sounds[heard.spec.name].onsets) else 0.0 for heard in evidence
+    }
+    clearest = sorted(weights, key=lambda name: -weights[name])[:MOST_TELLING_APART]
+    return tuple(heard for heard in evidence if heard.spec.name in clearest)
+
+
 def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
     return certainty.judge(place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid)
 
@@ -393,6 +405,9 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
+
+MOST_TELLING_APART: Final = 8
+"""Arrays that two sources at once are told apart by: their number is what it costs, and so many say it clearly."""
 
 MAP_SPACING_M: Final = 0.1
 """Maps are not drawn finer than this: a screen shows no more of a room."""
