@@ -16,8 +16,9 @@ from livessl.capture.recorded import lines_of
 from livessl.clock import UnpacedClock
 from livessl.config import Site
 from livessl.core.clock_offsets import LEAST_SOUNDS, ClockOffset
-from livessl.core.fusion import ArrayState, ArrayStatus, Fusion
+from livessl.core.fusion import Fusion
 from livessl.core.settling import Settled, Settling
+from livessl.core.streams import ArrayState, ArrayStatus
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
 from small_site import RATE_HZ, scene, scene_parts, site_of
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from livessl.core.clock_offsets import ClockOffset
-from livessl.core.fusion import ArrayState, ArrayStatus
+from livessl.core.streams import ArrayState, ArrayStatus
 from livessl.core.types import ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status, dbfs
 from small_site import site_of

@@ -10,7 +10,7 @@ import orjson
 
 from livessl.clock import utc_text
 from livessl.config import Site
-from livessl.core.fusion import ArrayStatus
+from livessl.core.streams import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
 
 API_VERSION: Final = 1

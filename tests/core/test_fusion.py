@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
 from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
-from livessl.core.fusion import ArrayState, ArrayStatus, Fusion, FusionParameters
+from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.joint import joined
 from livessl.core.onset import OnsetGCC
+from livessl.core.streams import ArrayState, ArrayStatus
 from livessl.core.types import (
     FRAME_NS,
     GCC,

@@ -9,8 +9,8 @@ import pytest
 from test_fusion import HANG_OVER, START, Arrivals, frame, fusion_of, mark, node, now_ns
 
 from livessl.core import settling
-from livessl.core.fusion import LOST_NS
 from livessl.core.settling import HOLD_NS, Settled, Settling
+from livessl.core.streams import LOST_NS
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")

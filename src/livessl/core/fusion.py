@@ -9,32 +9,30 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import Final, overload
 
 import numpy as np
 
-from livessl.core.activity import THRESHOLD, band_power, dead_channels, exact_mask, runs
-from livessl.core.asking import MOST_ASKED_S, Allowance, Asked, AskedSound, better, is_sure, nearest
-from livessl.core.clock_offsets import ClockOffset, ClockOffsets, clock_is_off
+from livessl.core.activity import THRESHOLD, exact_mask, runs
+from livessl.core.asking import MOST_ASKED_S, Asked, AskedSound, better, is_sure, nearest
+from livessl.core.clock_offsets import ClockOffsets
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
 from livessl.core.listening import Each, Ear, Listening, together
 from livessl.core.onset import OnsetGCC
+from livessl.core.streams import LEAST_VOTES, LOST_NS, VOTES, ArrayStatus, Stream, Votes, doubts
 from livessl.core.tracker import SILENCE_S, Tracker
 from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
     ArraySpec,
     Ask,
-    ClockState,
     Contribution,
     Estimate,
     Event,
     Float32Array,
     FloatArray,
     Frame,
-    Mark,
     Message,
     Output,
     Status,
@@ -42,15 +40,6 @@ from livessl.core.types import (
     Update,
     Window,
 )
-
-LOST_NS: Final = 1_500_000_000
-"""An array not heard from for so long is lost: marks come every 50 ms, and everyone shall know within 2 s."""
-
-TROUBLE_NS: Final = 10_000_000_000
-"""How long a fault keeps an array degraded after it was last seen."""
-
-SILENT_NS: Final = 1_000_000_000
-"""All-zero samples for so long are a dead microphone: any real one has noise."""
 
 ANSWER_S: Final = 0.3
 """Long against the way to a node and back, short for who waits for an event."""
@@ -70,27 +59,6 @@ RANGE_UNKNOWN: Final = 0.25
 RANGE_APERTURES: Final = 2.0
 """Further away than so many times its own width, an array alone tells no distance: what reverberation does to its
 delays, which the covariance cannot know, moves the place along the line of sight by metres."""
-
-
-VOTES: Final = 10
-"""Sounds that an array's agreement with the others is told of."""
-
-LEAST_VOTES: Final = 3
-"""An array is doubted that was outvoted so often, and in more than half of the last `VOTES` sounds; until it has agreed
-so often in a row."""
-
-_Votes = tuple[tuple[int, float | None], ...]
-"""Of the last sounds, by the raster interval each began at: by what angle the array was off, None where it agreed."""
-
-
-class ArrayState(StrEnum):
-    """How an array is doing, as the server sees it."""
-
-    STARTING = "starting"
-    HEALTHY = "healthy"
-    QUIET = "quiet"
-    DEGRADED = "degraded"
-    LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,106 +96,6 @@ class FusionParameters:
     hang_over_s: float = 0.3
     sources: int = 2
     live_sources: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class ArrayStatus:
-    """One array, for people: powers in full scale squared, age since anything was heard from it."""
-
-    name: str
-    state: ArrayState
-    reason: str | None
-    active: bool
-    age_s: float | None
-    power: float | None
-    noise_power: float | None
-    channel_power: tuple[float, ...]
-    sample_rate_hz: float | None
-    drift_ppm: float | None
-    clock: ClockState | None
-    counters: Mapping[str, int]
-    agreed: int = 0
-    disagreed: int = 0
-    """In how many of the last sounds that three arrays or more heard it agreed with the others, and in how many not."""
-    clock_offset: ClockOffset | None = None
-    corrected_frames: int = 0
-
-
-@dataclass(slots=True)
-class _Stream:
-    """What is known of one array."""
-
-    spec: ArraySpec
-    frames: dict[int, Frame] = field(default_factory=dict)
-    watermark: int | None = None
-    heard_ns: int | None = None
-    waited_for: bool = True
-    mark: Mark | None = None
-    power: float | None = None
-    active: bool = False
-    rate_hz: float | None = None
-    dead: tuple[int, ...] = ()  # channels from 1, of all-zero samples
-    dead_since_ns: int = 0
-    weak: tuple[int, ...] = ()  # channels from 1, that hear next to nothing of what the others hear
-    weak_since_ns: int = 0
-    trouble_ns: int | None = None
-    trouble: str = ""
-    left: bool = False
-    ahead: int = 0  # whole frames that its clock is ahead, taken off what it sends
-    rest_ns: int = 0  # that it is ahead besides
-    allowance: Allowance = field(default_factory=Allowance)
-    ear: Ear = field(default_factory=Ear)
-    next_ear: Ear = field(default_factory=Ear)  # for the sound that may come after this one
-    counters: dict[str, int] = field(
-        default_factory=lambda: dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0)
-    )
-
-    def worry(self, now_ns: int, what: str) -> None:
-        self.trouble_ns, self.trouble = now_ns, what
-
-    def find_dead(self, now_ns: int, alive: Iterable[bool]) -> None:
-        """Take note of the channels that had anything but zeros."""
-        dead = tuple(k for k, lives in enumerate(alive, start=1) if not lives)
-        if dead and not self.dead:
-            self.dead_since_ns = now_ns
-        self.dead = dead
-
-    def find_weak(self, now_ns: int, samples: Float32Array) -> None:
-        """Take note of the channels that hear nothing of a sound."""
-        weak = tuple(k for k, dead in enumerate(dead_channels([samples]).tolist(), start=1) if dead)
-        if weak and not self.weak:
-            self.weak_since_ns = now_ns
-        self.weak = weak
-
-    def has_active(self, raster: int) -> bool:
-        frame = self.frames.get(raster)
-        return frame is not None and frame.active
-
-    def segments(self, rasters: Sequence[int]) -> tuple[list[list[Frame]], list[int]]:
-        """The frames at `rasters` (ascending), cut wherever one is missing; and the rasters that are there."""
-        pieces: list[list[Frame]] = []
-        there: list[int] = []
-        for raster in rasters:
-            frame = self.frames.get(raster)
-            if frame is None:
-                continue
-            if not there or raster != there[-1] + 1:
-                pieces.append([])
-            pieces[-1].append(frame)
-            there.append(raster)
-        return pieces, there
-
-    def move(self, frames: int) -> None:
-        """Take it that its clock is ahead by so many frames more."""
-        self.ahead += frames
-        self.frames = {r - frames: replace(frame, raster=r - frames) for r, frame in self.frames.items()}
-        if self.watermark is not None:
-            self.watermark -= frames
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget what was listened to."""
-        self.ear, self.next_ear = Ear(), Ear()
 
 
 @dataclass(slots=True)
@@ -284,7 +152,8 @@ class Fusion:
         self._newest_only = newest_only
         self.clock_offsets = clock_offsets
         self._learns = True
-        self._streams = {spec.name: _Stream(spec) for spec in arrays}
+        self._watches = True  # how arrays are doing
+        self._streams = {spec.name: Stream(spec) for spec in arrays}
         self._tracker = Tracker()
         self._next: int | None = None
         self._reached: deque[tuple[int, int]] = deque()
@@ -296,7 +165,7 @@ class Fusion:
         self._listening = Listening(estimator, each)
         self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
         self._spared: Collection[str] = ()
-        self._votes: dict[str, _Votes] = dict.fromkeys(self._streams, ())
+        self._votes: dict[str, Votes] = dict.fromkeys(self._streams, ())
         self.askable: set[str] = set()
         """Arrays whose nodes can be asked for what they did not send."""
         self.updates_left_out = 0
@@ -309,6 +178,7 @@ class Fusion:
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
         other._listening, other._votes, other.askable = self._listening, self._votes, self.askable
+        other._watches = False  # nobody asks the twin
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
@@ -399,7 +269,7 @@ class Fusion:
         """
         clocks = self.clock_offsets
         return [
-            _status(stream, now_ns, self._votes[name], None if clocks is None else clocks.of(name), levels=levels)
+            stream.status(now_ns, self._votes[name], None if clocks is None else clocks.of(name), levels=levels)
             for name, stream in self._streams.items()
         ]
 
@@ -411,7 +281,7 @@ class Fusion:
         outputs = self._finish() if self._event is not None else []
         outputs += self._tracker.step(self._now_ns + round(2e9 * SILENCE_S))
         self._streams = {
-            name: _Stream(old.spec, counters=old.counters, ahead=old.ahead, rest_ns=old.rest_ns)
+            name: Stream(old.spec, counters=old.counters, ahead=old.ahead, rest_ns=old.rest_ns)
             for name, old in self._streams.items()
         }
         self._reached.clear()
@@ -441,7 +311,7 @@ class Fusion:
             if not self._accept_frame(stream, message):
                 return
         else:
-            _take_mark(stream, message, self._now_ns)
+            stream.take_mark(message, self._now_ns)
         stream.heard_ns, stream.left = self._now_ns, False
         stream.watermark = message.raster if stream.watermark is None else max(stream.watermark, message.raster)
         if not self._reached or message.raster > self._reached[-1][0]:
@@ -451,7 +321,7 @@ class Fusion:
         if self._next is None:
             self._next = message.raster
 
-    def _accept_frame(self, stream: _Stream, frame: Frame) -> bool:
+    def _accept_frame(self, stream: Stream, frame: Frame) -> bool:
         if len(frame.samples) != len(stream.spec.microphones_m):
             stream.counters["rejected"] += 1
             expected, got = len(stream.spec.microphones_m), len(frame.samples)
@@ -471,7 +341,7 @@ class Fusion:
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
-            if frame.active:
+            if frame.active and self._watches:
                 stream.find_weak(self._now_ns, frame.samples)
         return True
 
@@ -515,7 +385,7 @@ class Fusion:
             stream.worry(self._now_ns, "its frames come after their deadline")
         return True
 
-    def _is_waited_for(self, stream: _Stream, raster: int) -> bool:
+    def _is_waited_for(self, stream: Stream, raster: int) -> bool:
         if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
             return False
         return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
@@ -570,10 +440,10 @@ class Fusion:
         self._ahead = None
         return _OpenEvent(raster, raster, raster)
 
-    def _hear(self, streams: Iterable[_Stream], rasters: Sequence[int]) -> None:
+    def _hear(self, streams: Iterable[Stream], rasters: Sequence[int]) -> None:
         self._listening.hear(((stream.spec.name, stream.ear, stream.frames) for stream in streams), rasters)
 
-    def _hear_anew(self, stream: _Stream, rasters: Sequence[int]) -> None:
+    def _hear_anew(self, stream: Stream, rasters: Sequence[int]) -> None:
         stream.ear = Ear()
         self._hear([stream], rasters)
 
@@ -606,7 +476,7 @@ class Fusion:
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
-            if pieces and not _doubts(self._votes[name]):
+            if pieces and not doubts(self._votes[name]):
                 sounds.pieces[name] = pieces
                 sounds.onsets[name] = stream.ear.at(window)
                 powers[name] = np.array([stream.frames[r].power for r in there])
@@ -671,7 +541,7 @@ class Fusion:
     def _heard(self, event: _OpenEvent) -> _Heard:
         parameters = self._parameters
         span = self._span(event)
-        heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if _doubts(votes)}))
+        heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if doubts(votes)}))
         for name, stream in self._streams.items():
             active = [raster for raster in span if stream.has_active(raster)]
             if not active:
@@ -792,7 +662,7 @@ class Fusion:
             return True
         return all(asked.is_answered or name not in self.askable for name, asked in event.asked.items())
 
-    def _take_answer(self, stream: _Stream, frame: Frame) -> None:
+    def _take_answer(self, stream: Stream, frame: Frame) -> None:
         asked = None if self._event is None else self._event.asked.get(frame.array)
         if asked is not None and frame.raster in asked.span and len(frame.samples) == len(stream.spec.microphones_m):
             asked.frames[frame.raster] = frame
@@ -974,84 +844,3 @@ def _dissent(found: Localization) -> str | None:
         return None
     each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outvoted.items()))
     return f"located without {each}: outvoted by the others"
-
-
-def _doubts(votes: _Votes) -> bool:
-    """Whether an array is to be doubted: see `LEAST_VOTES`."""
-    off = [vote for vote in votes if vote[1] is not None]
-    lately = any(vote[1] is not None for vote in votes[-LEAST_VOTES:])
-    return len(off) >= LEAST_VOTES and 2 * len(off) > len(votes) and lately
-
-
-def _take_mark(stream: _Stream, mark: Mark, now_ns: int) -> None:
-    stream.counters["marks"] += 1
-    if stream.mark is not None:
-        if mark.overflows > stream.mark.overflows:
-            stream.worry(now_ns, "its device loses samples; use larger blocks or a less busy machine")
-        elif mark.lost_frames > stream.mark.lost_frames:
-            stream.worry(now_ns, "frames were torn by a gap in the sound")
-    if mark.clock is ClockState.STEPPED:
-        stream.worry(now_ns, "its clock has stepped")
-    stream.counters["overflows"], stream.counters["lost_frames"] = mark.overflows, mark.lost_frames
-    if stream.watermark is None or mark.raster >= stream.watermark:
-        stream.mark, stream.power, stream.active = mark, mark.power, False
-        stream.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
-
-
-def _status(stream: _Stream, now_ns: int, votes: _Votes, offset: ClockOffset | None, *, levels: bool) -> ArrayStatus:
-    mark = stream.mark
-    age_ns = None if stream.heard_ns is None else max(0, now_ns - stream.heard_ns)
-    state, reason = _state(stream, age_ns, now_ns, votes)
-    if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
-        state, reason = ArrayState.DEGRADED, clock_is_off(offset)
-    return ArrayStatus(
-        name=stream.spec.name,
-        state=state,
-        reason=reason,
-        active=stream.active and state is not ArrayState.LOST,
-        age_s=None if age_ns is None else age_ns / 1e9,
-        power=stream.power,
-        noise_power=mark.noise_power if mark else None,
-        channel_power=_channel_power(stream) if levels else (),
-        sample_rate_hz=stream.rate_hz,
-        drift_ppm=mark.drift_ppm if mark else None,
-        clock=mark.clock if mark else None,
-        counters=dict(stream.counters),
-        agreed=sum(off_deg is None for _, off_deg in votes),
-        disagreed=sum(off_deg is not None for _, off_deg in votes),
-        clock_offset=offset,
-        corrected_frames=stream.ahead,
-    )
-
-
-def _channel_power(stream: _Stream) -> tuple[float, ...]:
-    """Of the newest interval, whether it was a mark or a frame."""
-    newest = stream.frames.get(stream.watermark) if stream.watermark is not None else None
-    if newest is not None:
-        return tuple(float(power) for power in band_power(newest.samples, newest.sample_rate_hz, stream.spec.band_hz))
-    return stream.mark.channel_power if stream.mark else ()
-
-
-def _state(stream: _Stream, age_ns: int | None, now_ns: int, votes: _Votes) -> tuple[ArrayState, str | None]:
-    troubled = stream.trouble_ns is not None and now_ns - stream.trouble_ns < TROUBLE_NS
-    if age_ns is None:
-        return (ArrayState.DEGRADED, stream.trouble) if troubled else (ArrayState.STARTING, "not heard from yet")
-    if stream.left:
-        return ArrayState.LOST, "its node has ended"
-    if age_ns >= LOST_NS:
-        silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
-        return ArrayState.LOST, f"{silence}; before that, {stream.trouble}" if troubled else silence
-    if stream.dead and now_ns - stream.dead_since_ns >= SILENT_NS:
-        every = len(stream.dead) == len(stream.spec.microphones_m)
-        which = "all channels are" if every else f"microphone {list(stream.dead)} is"
-        return ArrayState.DEGRADED, f"{which} dead: all-zero samples; check cable, gain and channel numbers"
-    if stream.weak and now_ns - stream.weak_since_ns >= SILENT_NS:
-        which = f"microphone {list(stream.weak)} hears nothing of what the others hear, and is left out"
-        return ArrayState.DEGRADED, f"{which}; check cable, gain and channel numbers"
-    if troubled:
-        return ArrayState.DEGRADED, stream.trouble
-    if _doubts(votes):
-        off_deg = [off for _, off in votes if off is not None]
-        told = f"{len(off_deg)} of the last {len(votes)} sounds, by {np.median(off_deg):.0f}°"
-        return ArrayState.DEGRADED, f"disagrees with the others in {told}: is its pose right, and its channels' order?"
-    return ArrayState.HEALTHY, None

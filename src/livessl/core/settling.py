@@ -13,7 +13,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from livessl.core.fusion import EARLIEST_NS, LATEST_NS, LOST_NS, ArrayStatus, Fusion
+from livessl.core.fusion import EARLIEST_NS, LATEST_NS, Fusion
+from livessl.core.streams import LOST_NS, ArrayStatus
 from livessl.core.types import FRAME_NS, FRAME_S, Ask, Event, Frame, Mark, Message, Output
 
 HOLD_NS: Final = 600_000_000_000

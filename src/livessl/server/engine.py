@@ -12,9 +12,9 @@ from typing import Final
 from livessl import wire
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site
-from livessl.core.fusion import ArrayState, ArrayStatus
 from livessl.core.search import warm_up
 from livessl.core.settling import Settled, Settling
+from livessl.core.streams import ArrayState, ArrayStatus
 from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.messages import JsonObject, Messages, Stages, array_status
 from livessl.server.helper import Helper
