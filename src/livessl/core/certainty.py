@@ -41,7 +41,7 @@ _DELAYS: Final = 3.0
 _INFLATION: Final = 1.6
 """What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
 
-_FINEST_M: Final = 0.01
+_FINEST_M: Final = 0.005
 """Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
 of which the lag axis tells nothing, move several arrays' places by as much."""
 
