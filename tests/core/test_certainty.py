@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from livessl.core import peaks
-from livessl.core.certainty import LEAST_CONFIDENCE, Judgement, Signs, judge
+from livessl.core.certainty import LEAST_CONFIDENCE, Judgement, Signs, crossing_deg, judge
 from livessl.core.geometry import Grid
 from livessl.core.srp import SRPFunctional
 from livessl.core.types import ArraySpec, HeardBy
@@ -58,6 +58,16 @@ def test_an_array_that_hears_only_noise_hardly_takes_away() -> None:
     both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).signs
     assert both.standing == pytest.approx(alone.standing, abs=1.0)  # noise stands no higher than once its own rms
     assert judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).signs.standing > alone.standing + 2.0
+
+
+def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
+    assert Signs(0.01, 5.0, crossing_deg=45.0).confidence > Signs(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
+    east = tetra("east", [2.0, 0.0, 1.0])
+    west = tetra("west", [0.0, 2.0, 1.0])
+    assert crossing_deg([east], np.array([2.0, 3.0, 1.0])) == 0.0
+    assert crossing_deg([east, west], np.array([2.0, 2.0, 1.0])) == pytest.approx(90.0, abs=3.0)
+    beyond = east.centre_m + 3.0 * (west.centre_m - east.centre_m)
+    assert crossing_deg([east, west], beyond) == pytest.approx(0.0, abs=1e-3)
 
 
 def test_nothing_heard_is_refused_without_a_warning() -> None:

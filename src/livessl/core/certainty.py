@@ -14,7 +14,7 @@ import numpy as np
 from livessl.core import peaks
 from livessl.core.geometry import Grid
 from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
-from livessl.core.types import FloatArray, HeardBy
+from livessl.core.types import ArraySpec, FloatArray, HeardBy
 
 NEAR_M: Final = 0.5
 """The confidence is the probability that the place is right to within so much."""
@@ -34,6 +34,9 @@ LEAST_CONFIDENCE_OF_SECOND: Final = 0.5
 
 _LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
 """As `_HEARD`, of the best place left when the first source is taken out: is there a second, and is it there?"""
+
+CROSSING_DEG: Final = 20.0
+"""Where arrays' lines of sight cross at a larger angle they tell how far away a place is, whatever the margin."""
 
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
@@ -57,14 +60,19 @@ class Signs:
     standing : float
         Sum over the arrays of the mean height of an array's GCCs at the place over their root mean square, never below
         0, in proportion to its independent delays: an array that disagrees, or hears only noise, adds nothing.
+    crossing_deg : float
+        Largest angle at which lines from two arrays cross at the place, 0 to 90; 0 for one array.
     """
 
     margin: float
     standing: float
+    crossing_deg: float = 0.0
 
     @property
     def confidence(self) -> float:
         """Probability that the place is right to within `NEAR_M`: heard, and nowhere else."""
+        if self.crossing_deg >= CROSSING_DEG:
+            return self.heard
         intercept, of_margin = _NOWHERE_ELSE
         return self.heard * _likely(intercept + of_margin * self.margin)
 
@@ -128,7 +136,7 @@ def judge(
     """
     terms = functional.pair_terms(position_m)
     together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(peaks.margin(power, rival_power), together)
+    signs = Signs(peaks.margin(power, rival_power), together, crossing_deg([h.spec for h in evidence], position_m))
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _FINEST_M**2
@@ -139,6 +147,13 @@ def judge(
             f"{LEAST_CONFIDENCE:g} wanted"
         )
     return Judgement(covariance_m2, signs, refused)
+
+
+def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:
+    """Largest angle at which lines from two arrays' centres cross at a place, 0 to 90 degrees; 0 for one array."""
+    lines = np.stack([position_m - spec.centre_m for spec in specs])
+    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-9)
+    return float(np.degrees(np.arccos(np.clip(np.abs(lines @ lines.T).min(), 0.0, 1.0))))
 
 
 def _likely(log_odds: float) -> float:
