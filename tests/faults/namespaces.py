@@ -40,6 +40,7 @@ class Cable:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        _ip("link", "delete", self._here)  # the namespace goes in its own time, and the next cable may come before
         _ip("netns", "delete", self._namespace)
 
     @property

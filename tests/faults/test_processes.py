@@ -85,20 +85,6 @@ def test_cables_pulled(recordings: Path, undisturbed: list[Event], tmp_path: Pat
     assert events[2]["late"]
 
 
-def test_narrow_link(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
-    """A third of what the sound needs: it comes, if late."""
-    reason = why_not()
-    if reason is not None:
-        pytest.skip(f"no network namespaces here: {reason}")
-
-    def narrows(site: Playing, rng: random.Random, end_s: float) -> None:
-        for cable in site.cables.values():
-            cable.narrow(200)
-        site.sleep_until(end_s)
-
-    assert_same(play(recordings, tmp_path, narrows, cabled=True), undisturbed)
-
-
 def array_state(site: Playing, name: str) -> dict[str, Any]:
     answer = site.get("arrays")
     found: dict[str, Any] = next((a for a in answer["arrays"] if a["name"] == name), {}) if answer else {}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
 import pytest
-from soak import GROWTH, READERS, soak
+from soak import GROWTH, READERS, Outcome, soak
 
 from livessl.core.settling import Settling
 from livessl.core.types import Message
@@ -23,16 +26,11 @@ MARK_BYTES: Final = 1000
 """Of memory that each message takes for ever: 45 MB from the reference on, an eighth of all."""
 
 
-def test_memory_stays_as_it_was(tmp_path: Path) -> None:
-    outcome = soak(tmp_path, HOURS, REFERENCE_HOURS, sample_s=SAMPLE_S, absence_first=False)
-    assert outcome.growth < SOON
-    assert (outcome.sounds, outcome.unheard) == (15, 0)
-    assert outcome.clients["events"] == READERS * outcome.events
-    assert outcome.clients["maps"] > 0
-    assert outcome.clients["answers"] > 0
+def steady(directory: Path) -> Outcome:
+    return soak(directory, HOURS, REFERENCE_HOURS, sample_s=SAMPLE_S, absence_first=False)
 
 
-def test_memory_that_grows_is_seen(tmp_path: Path) -> None:
+def leaking(directory: Path) -> Outcome:
     kept: list[Message | bytes] = []
     take = Settling._take
 
@@ -42,4 +40,23 @@ def test_memory_that_grows_is_seen(tmp_path: Path) -> None:
         return take(self, message, now_ns)
 
     with patch.object(Settling, "_take", hoard):
-        assert soak(tmp_path, HOURS, REFERENCE_HOURS, sample_s=SAMPLE_S, absence_first=False).growth > SOON
+        return steady(directory)
+
+
+def alone(run: Callable[[Path], Outcome], directory: Path) -> Outcome:
+    """In a process of its own: what other tests have left in this one's memory would hide a leak."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as processes:
+        return processes.submit(run, directory).result()
+
+
+def test_memory_stays_as_it_was(tmp_path: Path) -> None:
+    outcome = alone(steady, tmp_path)
+    assert outcome.growth < SOON
+    assert (outcome.sounds, outcome.unheard) == (15, 0)
+    assert outcome.clients["events"] == READERS * outcome.events
+    assert outcome.clients["maps"] > 0
+    assert outcome.clients["answers"] > 0
+
+
+def test_memory_that_grows_is_seen(tmp_path: Path) -> None:
+    assert alone(leaking, tmp_path).growth > SOON
