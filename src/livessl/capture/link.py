@@ -374,11 +374,7 @@ class Link:
         """Everything that the server has not got follows in order of time; what is cut from now on is live."""
         frames = [kept for kept in self._spool.frames() if kept.array in self._hello.arrays]
         self._backlog = deque(kept for kept in frames if not self._is_received(kept))
-        self._hello = replace(self._hello, backlog=_spans(self._backlog))
-        now_ns = self._clock.monotonic_ns()
-        self._live.extend((now_ns, mark) for mark in self._marks.values())
-        self._marks.clear()
-        self._say_hello()
+        self._announce()
 
     def _fall_behind(self) -> None:
         """What waits is sound of the past now: it follows when there is room, and what is heard next goes first."""
@@ -388,17 +384,22 @@ class Link:
             )
         waiting, self._live = self._live, deque()
         self._backlog.extend(message for _, message in waiting if isinstance(message, Kept))
-        newest = {message.array: message for _, message in waiting if isinstance(message, Mark)}
-        now_ns = self._clock.monotonic_ns()
-        self._live.extend((now_ns, mark) for mark in newest.values())
+        self._marks.update(_newest_marks(waiting))
+        self._announce()
+
+    def _announce(self) -> None:
+        """Say what follows as backlog; what is cut from now on is live, and so is how things are."""
         self._hello = replace(self._hello, backlog=_spans([*self._backlog_sent, *self._backlog]))
+        now_ns = self._clock.monotonic_ns()
+        self._live.extend((now_ns, mark) for mark in self._marks.values())
+        self._marks.clear()
         self._say_hello()
 
     def _lose(self) -> None:
         """The server may not have got what it has not acknowledged: it is lined up again when it answers."""
         self._greeted = False
         self._received = {}
-        self._marks.update({message.array: message for _, message in self._live if isinstance(message, Mark)})
+        self._marks.update(_newest_marks(self._live))
         self._answers.clear()
         for queue in (self._live, self._live_sent, self._backlog_sent):
             queue.clear()
@@ -437,3 +438,8 @@ def _spans(frames: Iterable[Kept]) -> dict[str, tuple[int, int]]:
     for kept in frames:
         spans[kept.array] = (spans.get(kept.array, (kept.raster, 0))[0], kept.raster + 1)
     return spans
+
+
+def _newest_marks(waiting: Iterable[tuple[int, Kept | Mark]]) -> dict[str, Mark]:
+    """Of each array the last mark among messages that wait."""
+    return {message.array: message for _, message in waiting if isinstance(message, Mark)}

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.certainty import NEAR_M, array_power, standing
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, angle_deg
 from livessl.core.search import PeakSearch
 from livessl.core.srp import SRPFunctional, pair_weight
 from livessl.core.types import FloatArray, HeardBy
@@ -156,20 +156,17 @@ class _Own:
         """What standing each array loses at a place."""
         lost = {}
         for heard, term in zip(place.evidence, place.functional.pair_terms(place.position_m), strict=True):
-            power = array_power(heard, term)
-            most = pair_weight(len(heard.spec.microphones_m)) * float(
-                heard.gcc.values.max(axis=1).sum(dtype=np.float64)
-            )  # no place can have more
-            if standing(heard, most) - standing(heard, power) > MOST_LOST / SUSPECTS:
-                most = self._at(heard)[0]
-            lost[heard.spec.name] = max(0.0, standing(heard, most) - standing(heard, power))
+            here = standing(heard, array_power(heard, term))
+            highest = heard.gcc.values.max(axis=1).sum(dtype=np.float64)  # of each pair: no place can have more
+            most = standing(heard, pair_weight(len(heard.spec.microphones_m)) * float(highest))
+            if most - here > MOST_LOST / SUSPECTS:
+                most = standing(heard, self._at(heard)[0])
+            lost[heard.spec.name] = max(0.0, most - here)
         return lost
 
     def angle_deg(self, heard: HeardBy, position_m: FloatArray) -> float:
         """Angle at an array between its own place and another."""
-        one, other = (towards - heard.spec.centre_m for towards in (self._at(heard)[1], position_m))
-        cosine = one @ other / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-12)
-        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        return angle_deg(self._at(heard)[1] - heard.spec.centre_m, position_m - heard.spec.centre_m)
 
     def _at(self, heard: HeardBy) -> tuple[float, FloatArray]:
         name = heard.spec.name

@@ -102,6 +102,11 @@ def posed(
     return np.asarray(shape_m @ (yaw @ pitch @ roll).T + np.asarray(position_m, dtype=np.float64))
 
 
+def angle_deg(one: FloatArray, other: FloatArray) -> float:
+    """Angle between two vectors (3,), 0 to 180 degrees."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
+
+
 def direction_deg(origin_m: FloatArray, target_m: FloatArray) -> tuple[float, float, float]:
     """Azimuth (counter-clockwise from +x) and elevation in degrees, and distance in metres, of target from origin."""
     x, y, z = np.asarray(target_m, dtype=np.float64) - origin_m

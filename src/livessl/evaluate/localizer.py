@@ -22,6 +22,7 @@ from livessl.core.activity import exact_mask, runs
 from livessl.core.certainty import Signs
 from livessl.core.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.fusion import judged
+from livessl.core.geometry import angle_deg
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
 from livessl.evaluate.command import HALVES, LOCALIZER
 from livessl.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M
@@ -258,7 +259,7 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
             sum(piece.shape[1] for piece in each.segments) / each.sample_rate_hz for each in sounds.values()
         ),
         "error_m": float(np.linalg.norm(error)),
-        "bearing_deg": _angle_deg(found.position_m - nearest_m, source_m - nearest_m),
+        "bearing_deg": angle_deg(found.position_m - nearest_m, source_m - nearest_m),
         "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
         "status": str(judged(found, [spec for spec in specs if spec.name not in outvoted])[0]),
         "outvoted": "".join(sorted(outvoted)),
@@ -268,10 +269,6 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
     if found.signs is not None:
         row |= {"confidence": found.confidence, "margin": found.signs.margin, "standing": found.signs.standing}
     return row
-
-
-def _angle_deg(one: FloatArray, other: FloatArray) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
 
 
 def _seed(seed: int, number: int, purpose: int, name: str) -> np.random.SeedSequence:
