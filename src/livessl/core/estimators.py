@@ -357,10 +357,10 @@ class Onset(SrpPhat):
         delays_s = [term.lags_s for term in place.functional.pair_terms(place.position_m)]
         other = self._place([each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True)])
         terms = other.functional.pair_terms(other.position_m)
-        clear = [
+        clearness = [
             each.clearness(term.lags_s, taken_s) for each, term, taken_s in zip(moments, terms, delays_s, strict=True)
         ]
-        return other, several.confidence(peaks.margin(other.power, other.rival_power), float(np.mean(clear)))
+        return other, several.confidence(clearness)
 
     def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
