@@ -318,8 +318,8 @@ class Onset(SrpPhat):
         then the second once more. Arrays may disagree because one hears another source best: where each of them hears
         something at both places, none is outvoted.
         """
-        divided = bool(agreed.outvoted) or agreed.refused is not None
-        for all_of_them in (everyone, agreed.place.evidence) if divided else (everyone,):
+        for all_of_them in (everyone, agreed.place.evidence) if agreed.outvoted else (everyone,):
+            divided = agreed.refused is not None or len(all_of_them) > len(agreed.place.evidence)
             telling = _clearest({heard.spec.name: sounds[heard.spec.name] for heard in all_of_them}, MOST_TELLING_APART)
             evidence = tuple(heard for heard in all_of_them if heard.spec.name in telling)
             specs = [heard.spec for heard in evidence]
