@@ -252,3 +252,21 @@ def test_a_doubtful_estimate_moves_the_track_less() -> None:
         (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.5, 1.0, 1.0], confidence=confidence)])
         moved_m.append(float(track.position_m[0]) - 1.0)
     assert 0.0 < moved_m[0] < 0.75 * moved_m[1] < 0.75 * 0.75 * moved_m[2]
+    tracker = Tracker()  # where the confidence is no probability it says nothing of that
+    follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+    (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.5, 1.0, 1.0], confidence=0.2)], probable=False)
+    assert float(track.position_m[0]) - 1.0 == pytest.approx(moved_m[2])
+
+
+def test_who_turned_while_only_a_direction_was_told_keeps_the_name() -> None:
+    """Then, too, it is the last place that counts, and not where it would be along the line of sight."""
+    tracker = Tracker()
+    path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
+    follow(tracker, [path])
+    for k in range(30, 37):  # it has turned round, which along the line of sight nobody hears
+        (track,) = tracker.step(at_ns(k * STEP_S), [direction(k * STEP_S, [4.5, 5.0, 1.5])])
+        assert track.id == 1
+    assert track.position_m[0] > 4.4
+    (again,) = tracker.step(at_ns(3.7), [estimate(3.7, [3.1, 5.0, 1.5], std_m=0.02)])
+    assert again.id == 1
+    assert abs(again.position_m[0] - 3.1) < 0.1

@@ -51,20 +51,16 @@ class _Filter:
     time_ns: int
     state: FloatArray  # position and velocity (6,)
     covariance: FloatArray  # (6, 6)
+    last: _Last
     told: bool = False
 
     def predicted(self, time_ns: int) -> _Motion:
         """Where it is if it goes on as it went."""
-        dt = max(0.0, (time_ns - self.time_ns) / 1e9)
-        motion = np.eye(6)
-        motion[:3, 3:] = dt * np.eye(3)
-        noise = np.kron(np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]]), np.eye(3)) * ACCELERATION_M_S2**2
-        return _Motion(motion @ self.state, motion @ self.covariance @ motion.T + noise)
+        return _moved(self.state, self.covariance, time_ns - self.time_ns)
 
     def set_off_anew(self, time_ns: int) -> _Motion:
         """Where it is if it went anywhere from where it was heard last."""
-        state, covariance = _at_rest(self.state[:3], self.covariance[:3, :3])
-        return _Filter(self.id, self.time_ns, state, covariance).predicted(time_ns)
+        return _moved(*_at_rest(self.last.position_m, self.last.covariance_m2), time_ns - self.last.time_ns)
 
     def update(self, motion: _Motion, estimate: _Found) -> None:
         """Take in an estimate of it, having moved so."""
@@ -75,11 +71,23 @@ class _Filter:
         keep[:, :3] -= gain
         self.covariance = keep @ before @ keep.T + gain @ estimate.noise_m2 @ gain.T  # Joseph form: stays symmetric
         self.time_ns = max(self.time_ns, estimate.time_ns)
+        if estimate.tells_place or not self.last.is_place:
+            self.last = _Last(self.time_ns, self.state[:3], self.covariance[:3, :3], estimate.tells_place)
 
     def track(self, state: TrackState) -> Track:
         return Track(
             self.id, state, self.time_ns, self.state[:3].copy(), self.state[3:].copy(), self.covariance[:3, :3].copy()
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _Last:
+    """Where a track was when an estimate last told its place; as long as none did, any estimate."""
+
+    time_ns: int
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    is_place: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +108,10 @@ class _Found:
     tells_place: bool
 
     @classmethod
-    def of(cls, estimate: Estimate) -> _Found:
+    def of(cls, estimate: Estimate, *, probable: bool) -> _Found:
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
-        least_m2 = MIN_STD_M**2 + (1.0 - estimate.confidence) * WRONG_STD_M**2
+        wrong = 1.0 - estimate.confidence if probable else 0.0
+        least_m2 = MIN_STD_M**2 + wrong * WRONG_STD_M**2
         noise_m2 = estimate.covariance_m2 + least_m2 * np.eye(3)
         return cls(estimate.time_ns, estimate.position_m, noise_m2, spread_m <= GATE_M)
 
@@ -114,11 +123,19 @@ class Tracker:
         self._filters: list[_Filter] = []
         self._next_id = 1
 
-    def step(self, time_ns: int, estimates: Iterable[Estimate] = ()) -> list[Track]:
-        """Take in the estimates of one moment, no two of one source; return the tracks that changed."""
+    def step(self, time_ns: int, estimates: Iterable[Estimate] = (), *, probable: bool = True) -> list[Track]:
+        """Take in the estimates of one moment, no two of one source; return the tracks that changed.
+
+        Parameters
+        ----------
+        time_ns : int
+        estimates : iterable of Estimate
+        probable : bool
+            Whether their confidence is the probability that they are right.
+        """
         changed = self._end_silent(time_ns)
         followed = any(track.told and time_ns - track.time_ns <= CONFIRM_S * 1e9 for track in self._filters)
-        found = [_Found.of(each) for each in estimates]
+        found = [_Found.of(each, probable=probable) for each in estimates]
         for estimate, known in zip(found, self._assigned(found), strict=True):
             if known is not None:
                 track, motion = known
@@ -155,7 +172,8 @@ class Tracker:
         return chosen
 
     def _start(self, estimate: _Found) -> _Filter:
-        started = _Filter(0, estimate.time_ns, *_at_rest(estimate.position_m, estimate.noise_m2))
+        last = _Last(estimate.time_ns, estimate.position_m, estimate.noise_m2, estimate.tells_place)
+        started = _Filter(0, estimate.time_ns, *_at_rest(estimate.position_m, estimate.noise_m2), last)
         self._filters.append(started)
         return started
 
@@ -174,6 +192,14 @@ def _at_rest(position_m: FloatArray, covariance_m2: FloatArray) -> tuple[FloatAr
     covariance[:3, :3] = covariance_m2
     covariance[3:, 3:] = START_SPEED_M_S**2 * np.eye(3)
     return np.concatenate([position_m, np.zeros(3)]), covariance
+
+
+def _moved(state: FloatArray, covariance: FloatArray, duration_ns: int) -> _Motion:
+    dt = max(0.0, duration_ns / 1e9)
+    motion = np.eye(6)
+    motion[:3, 3:] = dt * np.eye(3)
+    noise = np.kron(np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]]), np.eye(3)) * ACCELERATION_M_S2**2
+    return _Motion(motion @ state, motion @ covariance @ motion.T + noise)
 
 
 def _expected(track: _Filter, estimate: _Found) -> tuple[float, _Motion]:
