@@ -889,6 +889,23 @@ def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
     assert estimator.doubted[-1] == set()
 
 
+class Choosing(Voting):
+    """An estimator that needs no more than two arrays, and asks all of these."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        return replace(super().locate(sounds), unneeded={"north"}, outvoted={})
+
+
+def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Choosing())
+    (event,) = (output for output in sound_at(fusion, 0) if isinstance(output, Event))
+    assert event.heard_by == ("north", "south", "east")
+    assert event.estimate is not None
+    assert event.estimate.arrays == ("south", "east")
+    assert {c.array: c.agrees for c in event.contributions} == {"north": None, "south": True, "east": True}
+    assert [status_of(fusion, name, 20).agreed for name in ("north", "south", "east")] == [0, 1, 1]
+
+
 def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:
     estimator = Voting()
     fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator)

@@ -11,6 +11,7 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from livessl.core import estimators
 from livessl.core.estimators import Onset, Sound
 from livessl.core.gcc import LagSampling
 from livessl.core.geometry import Grid
@@ -153,3 +154,25 @@ def test_high_bands_go_by_the_envelope() -> None:
     assert np.iscomplexobj(front_end(high, 44100.0).nothing.lags)
     assert not np.iscomplexobj(front_end().nothing.lags)
     assert NORTH.band_hz == BAND_HZ
+
+
+def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    east = tetra("east", [3.9, 4.8, 1.2])
+    estimator = Onset([NORTH, SOUTH, east], GRID, C_M_S)
+    loudness = {"north": 1.0, "south": 1.0, "east": 0.02}
+    sounds = {
+        spec.name: listened(
+            spec, np.float32(loudness[spec.name]) * echoing(spec) + noise(12000, 0.002), noise(6400, 0.002)
+        )
+        for spec in (NORTH, SOUTH, east)
+    }
+    everyone = estimator.locate(sounds)
+    assert not everyone.unneeded
+    assert [heard.spec.name for heard in everyone.evidence] == ["east", "north", "south"]
+    monkeypatch.setattr(estimators, "MOST_ARRAYS", 2)
+    found = estimator.locate(sounds)
+    assert set(found.unneeded) == {"east"}
+    assert [heard.spec.name for heard in found.evidence] == ["north", "south"]
+    without = estimator.locate({name: sounds[name] for name in ("north", "south")})
+    assert found.position_m.tobytes() == without.position_m.tobytes()
+    assert found.outvoted == without.outvoted
