@@ -361,9 +361,9 @@ class Onset(SrpPhat):
         if onsets is None:
             onsets = self.listener(array, sound.sample_rate_hz).listen(sound.segments)
         sampling = self._sampling(array, sound.sample_rate_hz)
-        values = sampling.fine(onsets.lags / np.float32(max(onsets.weight, 1.0)))
         spec = self._arrays[array]
-        gcc = GCC(microphone_pairs(len(spec.microphones_m)), sampling.fine_lags_s, values)
+        pairs = microphone_pairs(len(spec.microphones_m))
+        gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
         return HeardBy(spec, sound.live(gcc))
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:

@@ -47,10 +47,11 @@ def together(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
     """The sum; None for nothing."""
     if not heard:
         return None
-    lags = heard[0].lags.copy()
+    lags, levels = heard[0].lags.copy(), heard[0].levels.copy()
     for one in heard[1:]:
         lags += one.lags
-    return OnsetGCC(lags, sum(one.weight for one in heard))
+        levels += one.levels
+    return OnsetGCC(lags, levels)
 
 
 Followed = tuple[str, Ear, Mapping[int, Frame]]
