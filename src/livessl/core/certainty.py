@@ -25,6 +25,15 @@ LEAST_CONFIDENCE: Final = 0.8
 _HEARD: Final = (-3.34, 2.69, 1.03)
 """Intercept, weights of margin and standing in the log-odds of a right place, of arrays that tell distance."""
 
+_HEARD_WHOLE: Final = (-3.56, 10.0, 0.82)
+"""The same of evidence that whole segments are part of, where onsets alone were not sure."""
+
+SURE: Final = 0.9
+"""From this confidence on, onsets alone will do, if two arrays hear them."""
+
+_HEARS: Final = 2.0
+"""Of one array, a standing from which on it surely hears something: noise alone stands as high as its rms."""
+
 _NOWHERE_ELSE: Final = (-0.04, 62.2)
 """Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
 side by side, many are."""
@@ -62,11 +71,17 @@ class Signs:
         0, in proportion to its independent delays: an array that disagrees, or hears only noise, adds nothing.
     crossing_deg : float
         Largest angle at which lines from two arrays cross at the place, 0 to 90; 0 for one array.
+    shared : float
+        The second highest of the arrays' shares of the standing; 0 for one array.
+    whole : bool
+        Whether whole segments are part of the evidence.
     """
 
     margin: float
     standing: float
     crossing_deg: float = 0.0
+    shared: float = 0.0
+    whole: bool = False
 
     @property
     def confidence(self) -> float:
@@ -79,7 +94,12 @@ class Signs:
     @property
     def heard(self) -> float:
         """The same, where the arrays tell distance."""
-        return self._probability(_HEARD)
+        return self._probability(_HEARD_WHOLE if self.whole else _HEARD)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether another look at the sound is not worth its time."""
+        return self.confidence >= SURE and self.shared >= _HEARS
 
     @property
     def confidence_of_second(self) -> float:
@@ -120,6 +140,8 @@ def judge(
     power: float,
     rival_power: float,
     grid: Grid,
+    *,
+    whole: bool = False,
 ) -> Judgement:
     """Judge the place found.
 
@@ -133,10 +155,18 @@ def judge(
     power, rival_power : float
         The functional there, and the highest outside its `peaks.neighbourhood`.
     grid : Grid
+    whole : bool
+        Whether whole segments are part of the evidence.
     """
     terms = functional.pair_terms(position_m)
-    together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(peaks.margin(power, rival_power), together, crossing_deg([h.spec for h in evidence], position_m))
+    each = sorted(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
+    signs = Signs(
+        peaks.margin(power, rival_power),
+        sum(each),
+        crossing_deg([heard.spec for heard in evidence], position_m),
+        each[-2] if len(each) > 1 else 0.0,
+        whole,
+    )
     covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _FINEST_M**2

@@ -33,6 +33,8 @@ class Sound:
     """Whether the array has disagreed with the others lately."""
     moments: tuple[OnsetGCC, ...] = ()
     """The onsets frame by frame, where a second source is to be looked for."""
+    ended: bool = True
+    """Whether this is all of it; what goes on will be heard again, and is not worth a second look."""
 
     def live(self, gcc: GCC) -> GCC:
         """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
@@ -279,26 +281,44 @@ class Onset(SrpPhat):
         """Find the highest place of the summed maps, outvote who does not agree on it, and judge what is left."""
         evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
         doubted = [name for name, sound in sounds.items() if sound.doubted]
-        agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
-        second = self._second(agreed, evidence, sounds)
-        outvoted = agreed.outvoted if second is None else second[1].outvoted
-        place = agreed.place if second is None else second[0]
-        others = () if second is None else (second[1],)
-        judged = _judged(place, self._grid)
-        refused = judged.refused if second is not None else agreed.refused or judged.refused
-        if not place.proven:
-            refused = "nothing stands out: the search for the place was given up"
+        found = self._answer(evidence, doubted)
+        second = self._second(found.agreed, evidence, sounds)
+        if second is not None:
+            place, other = second
+            judged = _judged(place, self._grid)
+            found = _Answer(evidence, agreement.Agreed(place, other.outvoted or {}), judged, judged.refused)
+        elif not found.is_sure and all(sound.ended for sound in sounds.values()):
+            again = self._answer(self._with_whole(evidence, sounds), doubted, whole=True)
+            found = max(found, again, key=lambda answer: (answer.refused is None, answer.judged.signs.confidence))
+        place = found.agreed.place
         return Localization(
             place.position_m,
-            judged.covariance_m2,
-            judged.signs.confidence,
-            evidence,
+            found.judged.covariance_m2,
+            found.judged.signs.confidence,
+            found.evidence,
             place.proven,
-            judged.signs,
-            refused,
-            outvoted,
-            others,
+            found.judged.signs,
+            found.refused if place.proven else "nothing stands out: the search for the place was given up",
+            found.agreed.outvoted,
+            () if second is None else (second[1],),
         )
+
+    def _answer(self, evidence: tuple[HeardBy, ...], doubted: Collection[str], *, whole: bool = False) -> _Answer:
+        agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
+        judged = _judged(agreed.place, self._grid, whole=whole)
+        return _Answer(evidence, agreed, judged, agreed.refused or judged.refused)
+
+    def _with_whole(self, evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+        """The evidence and that of whole segments: what goes on steadily counts as much as what begins."""
+        clearest = {heard.spec.name for heard in _clearest(evidence, sounds)}
+        return tuple(
+            self._plus_whole(heard, sounds[heard.spec.name]) if heard.spec.name in clearest else heard
+            for heard in evidence
+        )
+
+    def _plus_whole(self, heard: HeardBy, sound: Sound) -> HeardBy:
+        whole = super()._heard(heard.spec.name, sound).gcc
+        return HeardBy(heard.spec, replace(heard.gcc, values=heard.gcc.values + whole.values))
 
     def _second(
         self, agreed: agreement.Agreed, everyone: tuple[HeardBy, ...], sounds: Mapping[str, Sound]
@@ -389,8 +409,25 @@ def _clearest(evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tup
     return tuple(heard for heard in evidence if heard.spec.name in clearest)
 
 
-def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
-    return certainty.judge(place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid)
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """Of what evidence, who agrees on which place, what it is worth, and why it should not be relied on if so."""
+
+    evidence: tuple[HeardBy, ...]
+    agreed: agreement.Agreed
+    judged: certainty.Judgement
+    refused: str | None
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether a second look is not worth its time."""
+        return self.refused is None and self.judged.signs.is_sure
+
+
+def _judged(place: agreement.Place, grid: Grid, *, whole: bool = False) -> certainty.Judgement:
+    return certainty.judge(
+        place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid, whole=whole
+    )
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
@@ -407,7 +444,8 @@ _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
 
 MOST_TELLING_APART: Final = 8
-"""Arrays that two sources at once are told apart by: their number is what it costs, and so many say it clearly."""
+"""Arrays that two sources at once are told apart by, and that are listened to twice where an answer is not sure: their
+number is what it costs, and so many say it clearly."""
 
 MAP_SPACING_M: Final = 0.1
 """Maps are not drawn finer than this: a screen shows no more of a room."""
