@@ -50,8 +50,13 @@ CROSSING_DEG: Final = 20.0
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
 
-_INFLATION: Final = 1.6
-"""What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
+_INFLATION: Final = 1.15
+"""What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance, by the root of
+the number of arrays: their maps are summed as they are, and the clearest should count for more."""
+
+_DISCORD: Final = 0.4
+"""Where pairs disagree by less, most of what stands elsewhere on the lag axis is no noise but the sound's own side lobes,
+and the variance shrinks as the square. Typical are 0.05 in free field, and 0.5 and more where a room reverberates."""
 
 _FINEST_M: Final = 0.005
 """Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
@@ -167,7 +172,9 @@ def judge(
         each[-2] if len(each) > 1 else 0.0,
         whole,
     )
-    covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    covariance_m2 = peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    covariance_m2 *= _INFLATION * np.sqrt(len(evidence))
+    covariance_m2 *= min(1.0, _discord(evidence, terms, len(grid.free_axes)) / _DISCORD) ** 2
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _FINEST_M**2
     refused = None
@@ -177,6 +184,27 @@ def judge(
             f"{LEAST_CONFIDENCE:g} wanted"
         )
     return Judgement(covariance_m2, signs, refused)
+
+
+def _discord(evidence: Sequence[HeardBy], terms: Sequence[PairTerms], axes: int) -> float:
+    """How far the pairs disagree about a place with so many free axes, as a share of what stands elsewhere; at most 1.
+
+    They have more delays than the place has coordinates, and where they do not agree their slopes R' there are not 0:
+    the mean square slope, with the delays that the place has used up allowed for, over s^2 kappa. s^2 is the mean square
+    of the GCCs away from the peak and kappa = sum (-R'') / sum R the mean square angular frequency.
+    """
+    slope, noise, delays = 0.0, 0.0, 0
+    for heard, term in zip(evidence, terms, strict=True):
+        live = np.any(heard.gcc.values, axis=1)
+        if live.any():
+            slope += float(np.square(term.slope[live]).mean())
+            noise += peaks.noise(heard, term, live)
+            delays += len(np.unique(heard.gcc.pairs[live])) - 1
+    height = sum(float(term.values.sum()) for term in terms)
+    hill = sum(float(np.maximum(-term.curvature, 0.0).sum()) for term in terms)
+    if delays <= axes or height <= 0.0 or noise * hill <= 0.0:
+        return 1.0
+    return min(1.0, slope / (noise * hill / height) * delays / (delays - axes))
 
 
 def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:
