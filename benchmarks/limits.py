@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Final
 
@@ -57,8 +55,10 @@ class Known:
         rest += here._least
         weights = np.minimum(power**2 / (rest * (rest + 2.0 * power)), _STRONGEST).astype(np.float32)
         spectra_of_all = Spectra(whole, here._n_fft)
-        cross = CrossSpectra(spectra_of_all, here._pairs, here.sample_rate_hz, here._band_hz, weights)
-        return OnsetGCC(here._sampling.sample(cross), float(weights.sum()))
+        cross = CrossSpectra(
+            spectra_of_all, here._pairs, here.sample_rate_hz, here._band_hz, weights, phases=here._wide
+        )
+        return OnsetGCC(here._sampling.sample(cross), cross.levels)
 
 
 def _power(spectra: ComplexArray) -> Float32Array:
@@ -90,7 +90,7 @@ def errors_m(
         shipped = [listener.push(every[:, at], quiet=not active[at.start // FRAME]) for at in frames]
         told = [known.push(every[:, at], straight[:, at]) for at in frames]
         for sounds, onsets in zip(heard, (shipped, told), strict=True):
-            sounds[spec.name] = Sound((every,), RATE_HZ, reduce(add, onsets))
+            sounds[spec.name] = Sound((every,), RATE_HZ, onsets)
     one, other = (float(np.linalg.norm(estimator.locate(sounds).position_m - source_m)) for sounds in heard)
     return one, other
 

@@ -55,8 +55,8 @@ _INFLATION: Final = 1.15
 the number of arrays: their maps are summed as they are, and the clearest should count for more."""
 
 _DISCORD: Final = 0.4
-"""Where pairs disagree by less, most of what stands elsewhere on the lag axis is no noise but the sound's own side lobes,
-and the variance shrinks as the square. Typical are 0.05 in free field, and 0.5 and more where a room reverberates."""
+"""Where pairs disagree by less, most of what stands elsewhere on the lag axis is no noise but the sound's own side
+lobes, and the variance shrinks as the square. It is about 0.05 in free field, and 0.7 or more in a room."""
 
 _FINEST_M: Final = 0.005
 """Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
@@ -190,8 +190,8 @@ def _discord(evidence: Sequence[HeardBy], terms: Sequence[PairTerms], axes: int)
     """How far the pairs disagree about a place with so many free axes, as a share of what stands elsewhere; at most 1.
 
     They have more delays than the place has coordinates, and where they do not agree their slopes R' there are not 0:
-    the mean square slope, with the delays that the place has used up allowed for, over s^2 kappa. s^2 is the mean square
-    of the GCCs away from the peak and kappa = sum (-R'') / sum R the mean square angular frequency.
+    the mean square slope, with the delays that the place has used up allowed for, over s^2 kappa. s^2 is the mean
+    square of the GCCs away from the peak and kappa = sum (-R'') / sum R the mean square angular frequency.
     """
     slope, noise, delays = 0.0, 0.0, 0
     for heard, term in zip(evidence, terms, strict=True):

@@ -59,7 +59,9 @@ def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def cross_spectra(spectra, low, pairs, weights, phases, whitened, levels):  # type: ignore[no-untyped-def]
+def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    spectra, low, pairs, weights, phases, whitened, levels
+):
     """Whitened cross spectra, weighed and summed over frames, and the microphones' own sums."""
     microphones, bins = spectra.shape[1], whitened.shape[1]
     real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
