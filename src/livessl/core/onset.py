@@ -9,8 +9,10 @@ microphones is gamma = S / (S + I), and their phases weigh
 
 the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma
 where the textbook would estimate it from long averages, which reverberation spoils. The GCC is
-sum_t w conj(U_i) U_k, U = X/|X|, summed over the band and *not* normalised: a moment or a band with more evidence
-counts for more, and sums over frames make a window or an event. It knows no geometry and no other array.
+sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* normalised: a moment or a band with more evidence
+counts for more, and sums over frames make a window or an event. Whitened by the power that the microphones have on
+average, a microphone that is drowned by noise counts for less than its phase alone would. It knows no geometry and no
+other array.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ PAST_S: Final = 0.1
 """Time constant of the past's decay; between 0.06 and 0.2 s little changes."""
 
 _WINDOW_LAGS: Final = 8
-"""A window is at least so many times as long as the array's largest delay, which would else move sound out of it."""
+"""A window is at least so many times as long as the array's largest delay, which would else move sound out of it. Where
+that makes it longer, one microphone may be much nearer to a source than another, and phases alone count."""
 
 _STRONGEST: Final = np.float32(10.0)
 """Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
@@ -65,7 +68,7 @@ class OnsetGCC:
     lags : (P, C) float32, or complex64 where the envelope is used
         Weighted sums at the near-Nyquist lags of `LagSampling`.
     levels : (K,) float64
-        What each microphone with itself would give at lag 0.
+        What each microphone with itself would give at lag 0: the sum of the weights times its share of the power.
     """
 
     lags: ComplexArray | Float32Array
