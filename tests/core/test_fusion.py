@@ -700,7 +700,7 @@ class Ear:
 
     def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
         self.heard.append((int(samples[0, 0]), quiet))
-        return OnsetGCC(np.array([[samples[0, 0]]], np.float32), 1.0)
+        return OnsetGCC(np.array([[samples[0, 0]]], np.float32), np.ones(1))
 
     def reset(self) -> None:
         self.heard.append(None)

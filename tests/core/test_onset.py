@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 from operator import add
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from livessl.core import estimators
 from livessl.core.estimators import Onset, Sound
-from livessl.core.gcc import LagSampling
+from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
@@ -176,3 +177,50 @@ def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.Mo
     without = estimator.locate({name: sounds[name] for name in ("north", "south")})
     assert found.position_m.tobytes() == without.position_m.tobytes()
     assert found.outvoted == without.outvoted
+
+
+def test_gains_of_microphones_do_not_matter() -> None:
+    gain = np.array([[1.0], [5.0], [0.3], [1.0]], np.float32)
+    even = {s.name: listened(s, echoing(s, 0.002), noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    odd = {s.name: listened(s, gain * echoing(s, 0.002), gain * noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    assert np.linalg.norm(located(odd) - SOURCE_M) < NEAR_M
+    pairs = microphone_pairs(4)
+    heights = []
+    for sounds in (even, odd):
+        onsets = sounds["north"].onsets[0]
+        heights.append((onsets.lags / onsets.heights(pairs)).max(axis=1))
+    np.testing.assert_allclose(heights[1], heights[0], rtol=0.2)  # as they are they would differ by up to 17 times
+
+
+def test_where_microphones_are_far_apart_each_counts_the_same() -> None:
+    wide = ArraySpec("wide", 10.0 * NORTH.microphones_m, BAND_HZ)
+    for spec, same in ((wide, True), (NORTH, False)):
+        ear = front_end(spec)
+        pushed(ear, noise(6400, 0.001), quiet=True)
+        found = pushed(ear, np.array([[5.0], [1.0], [1.0], [1.0]], np.float32) * echoing(NORTH, 0.001), quiet=False)
+        assert (found.levels.max() < 1.01 * found.levels.min()) == same
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_what_onsets_do_not_tell_whole_segments_do(ended: bool) -> None:
+    estimator = Onset([NORTH, SOUTH], GRID, C_M_S)
+    sounds = {}
+    for seed, spec in enumerate((NORTH, SOUTH)):
+        ear = front_end(spec)
+        pushed(ear, noise(6400, 0.01, seed), quiet=True)
+        only_noise = pushed(ear, noise(6400, 0.01, seed + 2), quiet=False)
+        segment = heard(spec, SOURCE_M, burst(9000)) + noise(9000, 0.01, seed + 4)
+        sounds[spec.name] = Sound((segment,), RATE_HZ, (only_noise,), ended=ended)
+    found = estimator.locate(sounds)
+    assert (found.refused is None) == ended
+    assert found.signs is not None
+    assert found.signs.whole == ended
+    if ended:
+        assert np.linalg.norm(found.position_m - SOURCE_M) < NEAR_M
+
+
+def test_of_what_onsets_are_sure_nobody_asks_the_segments() -> None:
+    sounds = {s.name: listened(s, echoing(s), noise(6400, 0.0)) for s in (NORTH, SOUTH)}
+    other = {name: replace(sound, segments=(noise(9000, 0.1),)) for name, sound in sounds.items()}
+    found = [Onset([NORTH, SOUTH], GRID, C_M_S).locate(each) for each in (sounds, other)]
+    np.testing.assert_array_equal(found[0].position_m, found[1].position_m)
