@@ -428,10 +428,6 @@ def _clearest(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
     return {name: sound for name, sound in in_order.items() if name in clearest}
 
 
-def _apart_m(one: agreement.Place, other: agreement.Place) -> float:
-    return float(np.linalg.norm(one.position_m - other.position_m))
-
-
 @dataclass(frozen=True, slots=True)
 class _Answer:
     """Of what evidence, who agrees on which place, what it is worth, and why it should not be relied on if so."""
@@ -451,6 +447,10 @@ def _judged(place: agreement.Place, grid: Grid, *, whole: bool = False) -> certa
     return certainty.judge(
         place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid, whole=whole
     )
+
+
+def _apart_m(one: agreement.Place, other: agreement.Place) -> float:
+    return float(np.linalg.norm(one.position_m - other.position_m))
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
