@@ -216,10 +216,8 @@ class Playing:
         after = self.get("arrays")
         if before is None or after is None:
             return False
-        taken = [
-            [array["counters"]["frames"] + array["counters"]["backfilled"] for array in both["arrays"]]
-            for both in (before, after)
-        ]
+        what = ("frames", "backfilled", "duplicates")  # what comes again may stand before what is new
+        taken = [[array["counters"][k] for array in both["arrays"] for k in what] for both in (before, after)]
         return {array["state"] for array in after["arrays"]} == {"healthy"} and taken[0] == taken[1]
 
     def events(self) -> list[Event]:
