@@ -16,7 +16,15 @@ import pytest
 from livessl import wire
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.link import Link
-from livessl.capture.node import MAX_PENDING, UndeliveredError, capture_device, capture_recordings, send_session
+from livessl.capture.node import (
+    AHEAD_NS,
+    MAX_PENDING,
+    STUCK_NS,
+    UndeliveredError,
+    capture_device,
+    capture_recordings,
+    send_session,
+)
 from livessl.capture.recorded import Part
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.config import Site
@@ -155,6 +163,39 @@ def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
         for array in ARRAYS:
             messages = there.messages(array)
             assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
+
+
+class Stuck(SystemClock):
+    """Time that passes while nothing is sent: a tenth of a second whenever somebody waits."""
+
+    def __init__(self) -> None:
+        self.waited_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return self.waited_ns
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        self.waited_ns += 100_000_000
+        return super().sleep_until_ns(time_ns)
+
+
+def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
+    """Nor ended before: the server may ask for what is remembered. But where it settles nothing it goes on."""
+    clock, reached = Stuck(), dict[int, int]()
+    with server() as there:
+        there.receiver.ingest.settled = dict.fromkeys(ARRAYS, FIRST + 20)
+
+        def note(end_ns: int) -> None:
+            reached[clock.waited_ns] = end_ns - START_NS
+            there.of(Left)  # take what has come
+
+        played = parts(samples=hiss(15.0, level=1e-3))
+        pace = UnpacedClock(START_NS)
+        send_session(there.site, there.receiver.endpoint, played, pace, clock, "run-1", never, note)
+    before, *_, after = (reached[waited_ns] for waited_ns in sorted(reached))
+    assert AHEAD_NS <= before - 20 * FRAME_NS < AHEAD_NS + FRAME_NS
+    assert STUCK_NS <= clock.waited_ns < STUCK_NS + 500_000_000
+    assert after == 15_000_000_000
 
 
 def test_recordings_arrive_whole() -> None:
