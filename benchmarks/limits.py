@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Final
 
@@ -90,7 +88,7 @@ def errors_m(
         shipped = [listener.push(every[:, at], quiet=not active[at.start // FRAME]) for at in frames]
         told = [known.push(every[:, at], straight[:, at]) for at in frames]
         for sounds, onsets in zip(heard, (shipped, told), strict=True):
-            sounds[spec.name] = Sound((every,), RATE_HZ, reduce(add, onsets))
+            sounds[spec.name] = Sound((every,), RATE_HZ, onsets)
     one, other = (float(np.linalg.norm(estimator.locate(sounds).position_m - source_m)) for sounds in heard)
     return one, other
 

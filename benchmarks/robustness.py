@@ -9,8 +9,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Final
 
@@ -88,7 +86,7 @@ def sounds_of(
         listener = estimator.listener(spec.name, RATE_HZ)
         moments = tuple(listener.push(part[:, k * FRAME : (k + 1) * FRAME], quiet=not active[k]) for k in frames)
         segment = part[:, frames[0] * FRAME : frames[-1] * FRAME + FRAME]
-        sounds[spec.name] = Sound((segment,), RATE_HZ, reduce(add, moments), moments=moments)
+        sounds[spec.name] = Sound((segment,), RATE_HZ, moments, sources=2)
     return sounds
 
 
@@ -150,7 +148,7 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
 def _judge(
     rows: list[tuple[float, bool, bool]], estimator: Onset, sounds: Mapping[str, Sound], source_m: FloatArray
 ) -> None:
-    alone = {name: replace(sound, moments=()) for name, sound in sounds.items()}
+    alone = {name: replace(sound, sources=1) for name, sound in sounds.items()}
     found = estimator.locate(alone)
     error_m = float(np.linalg.norm(found.position_m - source_m))
     rows.append((error_m, is_located(found), "c" in (found.outvoted or ())))

@@ -20,7 +20,7 @@ from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
 from livessl.core.fusion import Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.joint import joined
-from livessl.core.onset import OnsetGCC
+from livessl.core.onset import OnsetGCC, summed
 from livessl.core.streams import ArrayState, ArrayStatus
 from livessl.core.types import (
     FRAME_NS,
@@ -721,7 +721,7 @@ class Listening(Scripted):
         return Ear(self.heard)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        onsets = sounds["north"].onsets
+        onsets = summed(sounds["north"].onsets)
         assert onsets is not None
         self.sums.append((float(onsets.lags.sum()), onsets.weight))
         return replace(super().locate(sounds), refused=self.refused)
@@ -928,7 +928,7 @@ class Duet(Scripted):
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         found = super().locate(sounds)
-        if not all(sound.moments for sound in sounds.values()):
+        if not all(sound.sources > 1 for sound in sounds.values()):
             return found
         return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
 

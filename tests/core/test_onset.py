@@ -60,7 +60,7 @@ def located(sounds: dict[str, Sound]) -> FloatArray:
 def listened(spec: ArraySpec, samples: Float32Array, quiet: Float32Array) -> Sound:
     ear = front_end(spec)
     pushed(ear, quiet, quiet=True)
-    return Sound((samples,), RATE_HZ, pushed(ear, samples, quiet=False))
+    return Sound((samples,), RATE_HZ, [pushed(ear, samples, quiet=False)])
 
 
 @pytest.mark.parametrize("rms", [0.0, 0.002])

@@ -35,10 +35,7 @@ def sounds_of(estimator: Onset, sources: Sequence[tuple[FloatArray, float]], *, 
         silence = np.random.default_rng(9).normal(0.0, 1e-4, (4, 8 * frame)).astype(np.float32)
         front_end.push(silence, quiet=True)
         moments = tuple(front_end.push(part, quiet=False) for part in np.split(samples, 8, axis=1))
-        whole = moments[0]
-        for moment in moments[1:]:
-            whole = whole + moment
-        sounds[spec.name] = Sound((samples,), RATE_HZ, whole, moments=moments if apart else ())
+        sounds[spec.name] = Sound((samples,), RATE_HZ, moments, sources=2 if apart else 1)
     return sounds
 
 

@@ -14,7 +14,7 @@ from livessl.core.certainty import Signs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
 from livessl.core.gcc import GCCPhat, LagSampling, microphone_pairs, require_band, uses_envelope
 from livessl.core.geometry import Grid
-from livessl.core.onset import OnsetFrontEnd, OnsetGCC
+from livessl.core.onset import OnsetFrontEnd, OnsetGCC, summed
 from livessl.core.search import PeakSearch
 from livessl.core.srp import SRPFunctional, SRPMapper
 from livessl.core.steering import alias_free_hz
@@ -27,12 +27,17 @@ class Sound:
 
     segments: Sequence[Float32Array]
     sample_rate_hz: float
-    onsets: OnsetGCC | None = None
-    """What the estimator's listener made of its frames and those around them, where there is one."""
+    onsets: Sequence[OnsetGCC] = ()
+    """What the estimator's listener made of its frames and those around them, frame by frame, where there is one."""
     doubted: bool = False
     """Whether the array has disagreed with the others lately."""
-    moments: tuple[OnsetGCC, ...] = ()
-    """The onsets frame by frame, where a second source is to be looked for."""
+    sources: int = 1
+    """How many sources are to be looked for."""
+
+    @property
+    def clarity(self) -> float:
+        """How much there is in it of onsets."""
+        return sum(onset.weight for onset in self.onsets)
 
     def live(self, gcc: GCC) -> GCC:
         """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
@@ -62,6 +67,8 @@ class Localization:
     outvoted: Mapping[str, float] | None = None
     """Arrays that it was found without, for they disagree with the others, and by what angle in degrees; None where
     nobody asked."""
+    unneeded: Collection[str] = ()
+    """Arrays that it was found without, for enough others heard the sound more clearly."""
     others: tuple[Localization, ...] = ()
     """Other sources that sounded at the same time."""
 
@@ -277,10 +284,11 @@ class Onset(SrpPhat):
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Find the highest place of the summed maps, outvote who does not agree on it, and judge what is left."""
-        evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
-        doubted = [name for name, sound in sounds.items() if sound.doubted]
+        clearest = _clearest(sounds, MOST_ARRAYS)
+        evidence = tuple(self._heard(name, sound) for name, sound in clearest.items())
+        doubted = [name for name, sound in clearest.items() if sound.doubted]
         agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
-        second = self._second(agreed, evidence, sounds)
+        second = self._second(agreed, evidence, clearest)
         outvoted = agreed.outvoted if second is None else second[1].outvoted
         place = agreed.place if second is None else second[0]
         others = () if second is None else (second[1],)
@@ -297,7 +305,8 @@ class Onset(SrpPhat):
             judged.signs,
             refused,
             outvoted,
-            others,
+            sounds.keys() - clearest.keys(),
+            tuple(replace(other, unneeded=sounds.keys() - {h.spec.name for h in other.evidence}) for other in others),
         )
 
     def _second(
@@ -311,9 +320,10 @@ class Onset(SrpPhat):
         """
         divided = bool(agreed.outvoted) or agreed.refused is not None
         for all_of_them in (everyone, agreed.place.evidence) if divided else (everyone,):
-            evidence = _clearest(all_of_them, sounds)
+            telling = _clearest({heard.spec.name: sounds[heard.spec.name] for heard in all_of_them}, MOST_TELLING_APART)
+            evidence = tuple(heard for heard in all_of_them if heard.spec.name in telling)
             specs = [heard.spec for heard in evidence]
-            if len(specs) < 2 or not all(sounds[spec.name].moments for spec in specs):
+            if len(specs) < 2 or not all(sound.onsets and sound.sources > 1 for sound in telling.values()):
                 return None
             if any(uses_envelope(spec.band_hz) for spec in specs):
                 return None  # magnitudes do not add up
@@ -344,7 +354,7 @@ class Onset(SrpPhat):
 
     def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
-        return several.Moments.of(heard.spec, sampling, sound.moments, np.any(heard.gcc.values, axis=1))
+        return several.Moments.of(heard.spec, sampling, sound.onsets, np.any(heard.gcc.values, axis=1))
 
     def _place(self, evidence: Sequence[HeardBy]) -> agreement.Place:
         evidence = tuple(sorted(evidence, key=lambda heard: heard.spec.name))  # sums depend on the order
@@ -357,7 +367,7 @@ class Onset(SrpPhat):
         return agreement.Place(evidence, functional, position, power, rival_power, found[0].proven)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
-        onsets = sound.onsets
+        onsets = summed(sound.onsets)
         if onsets is None:
             onsets = self.listener(array, sound.sample_rate_hz).listen(sound.segments)
         sampling = self._sampling(array, sound.sample_rate_hz)
@@ -378,15 +388,13 @@ class Onset(SrpPhat):
         return sampling
 
 
-def _clearest(evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+def _clearest(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
     """Of many arrays those that heard the clearest onsets, in the order of their names."""
-    if len(evidence) <= MOST_TELLING_APART:
-        return evidence
-    weights = {
-        heard.spec.name: onsets.weight if (onsets := sounds[heard.spec.name].onsets) else 0.0 for heard in evidence
-    }
-    clearest = sorted(weights, key=lambda name: -weights[name])[:MOST_TELLING_APART]
-    return tuple(heard for heard in evidence if heard.spec.name in clearest)
+    in_order = {name: sounds[name] for name in sorted(sounds)}
+    if len(in_order) <= most:
+        return in_order
+    clearest = sorted(in_order, key=lambda name: -in_order[name].clarity)[:most]
+    return {name: sound for name, sound in in_order.items() if name in clearest}
 
 
 def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
@@ -405,6 +413,10 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
+
+MOST_ARRAYS: Final = 16
+"""Arrays that a place is told by: of more, those that heard it most clearly. The others hardly move it, and what an
+answer costs, and how soon it is there, no longer depends on how many there are."""
 
 MOST_TELLING_APART: Final = 8
 """Arrays that two sources at once are told apart by: their number is what it costs, and so many say it clearly."""

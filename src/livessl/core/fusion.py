@@ -18,7 +18,7 @@ from livessl.core.asking import MOST_ASKED_S, Asked, AskedSound, better, is_sure
 from livessl.core.clock_offsets import ClockOffsets
 from livessl.core.estimators import Estimator, Localization, PowerMaps, Sound
 from livessl.core.geometry import direction_deg
-from livessl.core.listening import Each, Ear, Listening, together
+from livessl.core.listening import Each, Ear, Listening
 from livessl.core.onset import OnsetGCC
 from livessl.core.streams import LEAST_VOTES, LOST_NS, VOTES, ArrayStatus, Stream, Votes, doubts
 from livessl.core.tracker import SILENCE_S, Tracker
@@ -49,8 +49,13 @@ LATEST_NS: Final = 500_000_000
 """Frames this far from the server's time come from a clock that is wrong: sound is never ahead of its time by more than
 two clocks that NTP keeps can differ, and what is older a node's buffer cannot hold."""
 
+_SOME: Final = 64
+
 JUMP_FRAMES: Final = 1200
 """A gap of a minute is skipped, not walked through."""
+
+WEAK_FRAMES: Final = 4
+"""One active frame in so many is looked at for microphones that hear nothing: they are told of after a second."""
 
 RANGE_UNKNOWN: Final = 0.25
 """Where the position's spread exceeds this share of the distance to the nearest array, only the direction is told."""
@@ -340,8 +345,8 @@ class Fusion:
         stream.counters["frames"] += 1
         if stream.watermark is None or frame.raster >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
-            stream.find_dead(self._now_ns, np.any(frame.samples, axis=1).tolist())
-            if frame.active and self._watches:
+            stream.find_dead(self._now_ns, _alive(frame.samples))
+            if frame.active and self._watches and frame.raster % WEAK_FRAMES == 0:
                 stream.find_weak(self._now_ns, frame.samples)
         return True
 
@@ -698,7 +703,7 @@ class Fusion:
         """Remember who agreed. Replaced, never changed, for other threads read it."""
         if found.outvoted is None or len(found.evidence) < LEAST_VOTES:
             return
-        for name in sounds:
+        for name in (name for name in sounds if name not in found.unneeded):
             before = [vote for vote in self._votes[name] if vote[0] != start]
             self._votes[name] = (*before, (start, found.outvoted.get(name)))[-VOTES:]
 
@@ -748,6 +753,12 @@ class _Segments(Sequence[Float32Array]):
         return len(self._pieces)
 
 
+def _alive(samples: Float32Array) -> list[bool]:
+    """Which channels have anything but zeros: a few samples of a live one tell."""
+    alive: list[bool] = np.asarray(np.any(samples[:, ::_SOME], axis=1)).tolist()
+    return alive if all(alive) else np.asarray(np.any(samples, axis=1)).tolist()
+
+
 def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
     """Whether what was found is a place, only a direction, or neither, and why.
 
@@ -783,9 +794,9 @@ class _Sounds(Mapping[str, Sound]):
         return Sound(
             _Segments(pieces),
             pieces[0][0].sample_rate_hz,
-            together(onsets),
+            onsets,
             array in self.doubted,
-            onsets if self.sources > 1 else (),
+            self.sources,
         )
 
     def __iter__(self) -> Iterator[str]:
@@ -816,7 +827,7 @@ class _Heard:
 
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
-    arrays = tuple(name for name in sounds if name not in (found.outvoted or ()))
+    arrays = tuple(name for name in sounds if name not in (found.outvoted or ()) and name not in found.unneeded)
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
@@ -830,7 +841,7 @@ def _contribution(
 ) -> Contribution:
     azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
     agrees: bool | None = None
-    if found.outvoted is not None and len(found.evidence) > 1:
+    if found.outvoted is not None and len(found.evidence) > 1 and spec.name not in found.unneeded:
         agrees = spec.name not in found.outvoted
     off_deg = (found.outvoted or {}).get(spec.name)
     return Contribution(

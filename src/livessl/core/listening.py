@@ -43,16 +43,6 @@ class Ear:
         return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
 
 
-def together(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
-    """The sum; None for nothing."""
-    if not heard:
-        return None
-    lags = heard[0].lags.copy()
-    for one in heard[1:]:
-        lags += one.lags
-    return OnsetGCC(lags, sum(one.weight for one in heard))
-
-
 Followed = tuple[str, Ear, Mapping[int, Frame]]
 """An array, how far it has been followed, and its frames by raster interval."""
 

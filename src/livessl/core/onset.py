@@ -15,7 +15,7 @@ counts for more, and sums over frames make a window or an event. It knows no geo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -76,6 +76,16 @@ class OnsetGCC:
         return OnsetGCC(self.lags + other.lags, self.weight + other.weight)
 
 
+def summed(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
+    """All together; None for nothing."""
+    if not heard:
+        return None
+    lags = heard[0].lags.copy()
+    for one in heard[1:]:
+        lags += one.lags
+    return OnsetGCC(lags, sum(one.weight for one in heard))
+
+
 class OnsetFrontEnd:
     """Listens to one array at one sampling rate, frame after frame, each transformed once.
 
@@ -95,7 +105,7 @@ class OnsetFrontEnd:
         self._envelope = uses_envelope(spec.band_hz)
         length = max(round(WINDOW_S * sample_rate_hz), _WINDOW_LAGS * sampling.room)
         self._hop = round(HOP_S / WINDOW_S * length)
-        self._n_fft = fast_length(length + max(length, sampling.room))
+        self._n_fft = fast_length(length + sampling.room)
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
         self._band = slice(*band_bins(self._n_fft, sample_rate_hz, spec.band_hz))
         self._least = np.float32(_LEAST_POWER * np.square(self._window).sum())

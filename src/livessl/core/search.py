@@ -25,7 +25,6 @@ from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
 from livessl.core.types import (
     GCC,
     ArraySpec,
-    BoolArray,
     Float32Array,
     FloatArray,
     HeardBy,
@@ -89,6 +88,10 @@ class PeakSearch:
         self._cell_places = np.zeros((tops, total, children), np.uint16)
         self._leaf_places = np.zeros((tops * children, total, 8 if self._halves else 0), np.uint16)
         self._top_places = np.zeros((total, tops), np.uint16)
+        self._top_bound = np.zeros(tops, np.float32)
+        self._cell_bound = np.zeros((tops, children), np.float32)
+        self._bounded = np.zeros(tops, np.bool_)
+        self._values, self._maxima = _Room(), _Room()
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Rows] = {}
 
@@ -132,7 +135,7 @@ class PeakSearch:
     def among(
         self, evidence: Sequence[HeardBy], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
     ) -> FindPeaks:
-        """What finds the peaks of some arrays' evidence; good until the next call with the same arrays.
+        """What finds the peaks of some arrays' evidence; good until the next call.
 
         Parameters
         ----------
@@ -143,20 +146,23 @@ class PeakSearch:
             For each peak: the search is then given up, and the peak not proven to be the highest.
         """
         rows = self._rows(tuple(heard.spec.name for heard in evidence))
+        values = self._values.of(len(rows.rows), rows.lags)
+        maxima = self._maxima.of(len(rows.rows), rows.runs)
         for array, heard in enumerate(evidence):
-            values = heard.gcc.values
-            rows.values[rows.first_row[array] : rows.first_row[array + 1], : values.shape[1]] = values
-        kernels.running_maxima(rows.values, rows.block, rows.maxima)
-        kernels.bounds(rows.maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), rows.top_bound)
-        rows.bounded[:] = False
+            own = slice(rows.first_row[array], rows.first_row[array + 1])
+            count = heard.gcc.values.shape[1]
+            values[own, :count], values[own, count:] = heard.gcc.values, 0.0
+        kernels.running_maxima(values, rows.block, maxima)
+        kernels.bounds(maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), self._top_bound)
+        self._bounded[:] = False
 
         def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
                 node, power, proven = kernels.highest(
-                    rows.values, rows.maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
-                    self._leaf_places, rows.top_bound, rows.cell_bound, rows.bounded,
+                    values, maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
+                    self._leaf_places, self._top_bound, self._cell_bound, self._bounded,
                     *self._axes, self._edge, CELLS_PER_TOP,
                     rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
                     np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
@@ -180,16 +186,11 @@ class PeakSearch:
         specs, places = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
         first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
         rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
-        length = max(one.count for one in places)
         most = 1 + int(self._top_places[rows].max())
-        tops = self._top_places.shape[1]
         return _Rows(
-            values=np.zeros((len(rows), length), np.float32),
+            lags=max(one.count for one in places),
+            runs=-(-most // vectorised.BLOCKS) * vectorised.BLOCKS,
             block=np.repeat([_block(one.count) for one in places], np.diff(first_row)),
-            maxima=np.zeros((len(rows), -(-most // vectorised.BLOCKS) * vectorised.BLOCKS), np.float32),
-            top_bound=np.zeros(tops, np.float32),
-            cell_bound=np.zeros((tops, CELLS_PER_TOP**3), np.float32),
-            bounded=np.zeros(tops, np.bool_),
             rows=rows,
             first_row=first_row,
             weight=np.array([pair_weight(len(spec.microphones_m)) for spec in specs], np.float32),
@@ -199,6 +200,19 @@ class PeakSearch:
             scale=np.array([one.scale for one in places]),
             offset=np.array([one.offset for one in places]),
         )
+
+
+class _Room:
+    """Memory to work in, the same for every set of arrays: as much as the largest asked for."""
+
+    def __init__(self) -> None:
+        self._all = np.empty(0, np.float32)
+
+    def of(self, rows: int, columns: int) -> Float32Array:
+        """An array (rows, columns) with anything in it."""
+        if self._all.size < rows * columns:
+            self._all = np.empty(rows * columns, np.float32)
+        return self._all[: rows * columns].reshape(rows, columns)
 
 
 def _block(lags: int) -> int:
@@ -237,14 +251,11 @@ _SETS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """What a search over one set of arrays needs, and the room it works in: see `vectorised.highest`."""
+    """What a search over one set of arrays needs: see `vectorised.highest`."""
 
-    values: Float32Array
+    lags: int
+    runs: int
     block: IntArray
-    maxima: Float32Array
-    top_bound: Float32Array
-    cell_bound: Float32Array
-    bounded: BoolArray
     rows: IntArray
     first_row: IntArray
     weight: Float32Array

@@ -10,8 +10,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import reduce
-from operator import add
 from typing import Any, Final
 
 import numpy as np
@@ -204,8 +202,8 @@ def heard(
         return Sound(segments, sample_rate_hz)
     loud = np.flatnonzero(active)
     frames = range(max(0, int(loud[0]) - PRE_ROLL_FRAMES), int(loud[-1]) + 1)
-    onsets = (listener.push(samples[:, k * frame : (k + 1) * frame], quiet=not active[k]) for k in frames)
-    return Sound(segments, sample_rate_hz, reduce(add, onsets))
+    onsets = [listener.push(samples[:, k * frame : (k + 1) * frame], quiet=not active[k]) for k in frames]
+    return Sound(segments, sample_rate_hz, onsets)
 
 
 def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float, float]:
