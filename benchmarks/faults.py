@@ -30,7 +30,7 @@ from fuzz import fuzz, lines_missed
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
-from soak import GROWTH, Sample, soak
+from soak import GROWTH, REFERENCE_HOURS, Sample, soak
 
 DEATH_SOUNDS = 30
 FUZZED_AT_A_TIME = 100_000
@@ -268,6 +268,8 @@ def main() -> int:
         deaths(arguments.out, arguments.fault or list(DEATHS))
         return 0
     if arguments.campaign == "soak":
+        if arguments.hours <= REFERENCE_HOURS:
+            parser.error(f"--hours: expected more than {REFERENCE_HOURS:g}, for the end is held against that hour")
         return soaked(arguments.hours, arguments.seed)
     if arguments.campaign == "wire":
         return damaged(arguments.count)
