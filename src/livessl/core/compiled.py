@@ -207,8 +207,9 @@ def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
         for level in range(1, maxima.shape[1] // BLOCKS):
             further = RUNS[level] - RUNS[level - 1]
             before, now = of_blocks[(level - 1) * BLOCKS : level * BLOCKS], of_blocks[level * BLOCKS :]
-            for b in range(BLOCKS - further):
-                now[b] = max(before[b], before[b + further])
+            shifted = before[further:]
+            for b in range(len(shifted)):
+                now[b] = max(before[b], shifted[b])
             for b in range(BLOCKS - further, BLOCKS):
                 now[b] = before[b]
 
