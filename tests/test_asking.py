@@ -259,3 +259,30 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
         assert other.estimate is not None
         assert event["arrays"] == ["north", "south"]
         np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)
+
+
+def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> None:
+    """A node stood still: its sound comes after the live event has asked it, and before it answers."""
+    loud = [
+        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        for part in parts()
+    ]
+    settling = Settling(site().make_fusion(live=True), ("north", "south"))
+    for name in ("north", "south"):
+        settling.greet(name, None, START_NS, answers=True)
+    held: list[Message] | None = []
+    asked = False
+    told: list[Output | Settled] = []
+    for now_ns, batch in played_messages(*lines_of(site(), loud), UnpacedClock()):
+        if held is not None:
+            held += [message for message in batch if message.array == "south"]
+            batch = [message for message in batch if message.array == "north"]
+            if asked:
+                batch, held = [*batch, *held], None
+        new = settling.step(batch, now_ns)
+        asked = asked or any(isinstance(output, Ask) for output in new)
+        told += [output for output in new if isinstance(output, Event | Settled)]
+    assert asked
+    assert isinstance(told[0], Settled)
+    assert [event.heard_by for event in settled(told)] == [("north", "south")] * SOUNDS
+    assert not [output for output in told if isinstance(output, Event)]
