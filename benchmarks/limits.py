@@ -55,8 +55,10 @@ class Known:
         rest += here._least
         weights = np.minimum(power**2 / (rest * (rest + 2.0 * power)), _STRONGEST).astype(np.float32)
         spectra_of_all = Spectra(whole, here._n_fft)
-        cross = CrossSpectra(spectra_of_all, here._pairs, here.sample_rate_hz, here._band_hz, weights)
-        return OnsetGCC(here._sampling.sample(cross), float(weights.sum()))
+        cross = CrossSpectra(
+            spectra_of_all, here._pairs, here.sample_rate_hz, here._band_hz, weights, phases=here._wide
+        )
+        return OnsetGCC(here._sampling.sample(cross), cross.levels)
 
 
 def _power(spectra: ComplexArray) -> Float32Array:

@@ -70,6 +70,34 @@ def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
     assert crossing_deg([east, west], beyond) == pytest.approx(0.0, abs=1e-3)
 
 
+def test_arrays_that_hear_only_noise_leave_it_unsure() -> None:
+    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).signs
+    one = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).signs
+    assert both.is_sure
+    assert one.shared < 2.0 < both.shared
+    assert not one.is_sure
+    assert not judged(heard_at(NORTH, 1.0)).signs.is_sure
+
+
+def test_pairs_that_disagree_widen_the_ellipsoid() -> None:
+    """Delays off by 10 us, 3 mm of sound: far below a lobe, so that the heights hardly fall."""
+    evidence = [heard_at(NORTH, 1.0, 0.0), heard_at(SOUTH, 1.0, 0.0)]
+    off_s = 1e-5 * np.random.default_rng(0).standard_normal((2, 6))
+    torn = [
+        HeardBy(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
+        for spec, off in zip((NORTH, SOUTH), off_s, strict=True)
+    ]
+    agreed, disagreed = (judged(*each).covariance_m2 for each in (evidence, torn))
+    np.testing.assert_allclose(agreed, 0.005**2 * np.eye(3), atol=1e-6)  # what is left however clear
+    assert np.trace(disagreed) > 1.5 * np.trace(agreed)  # half of it and more is what the pairs tell
+
+
+def test_one_array_has_no_delays_to_spare() -> None:
+    """Three delays, three coordinates: pairs that agree are no wonder, and the ellipsoid is as wide as without it."""
+    alone = judged(heard_at(NORTH, 1.0, 0.0)).covariance_m2
+    assert np.linalg.eigvalsh(alone)[-1] > 0.05**2
+
+
 def test_nothing_heard_is_refused_without_a_warning() -> None:
     silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (heard_at(NORTH, 1.0),)]
     nothing = judged(*silent)

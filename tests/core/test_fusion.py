@@ -700,7 +700,7 @@ class Ear:
 
     def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
         self.heard.append((int(samples[0, 0]), quiet))
-        return OnsetGCC(np.array([[samples[0, 0]]], np.float32), 1.0)
+        return OnsetGCC(np.array([[samples[0, 0]]], np.float32), np.ones(1))
 
     def reset(self) -> None:
         self.heard.append(None)
@@ -887,6 +887,23 @@ def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
     assert status_of(fusion, "east", 140).state is ArrayState.HEALTHY
     sound_at(fusion, 140)
     assert estimator.doubted[-1] == set()
+
+
+class Choosing(Voting):
+    """An estimator that needs no more than two arrays, and asks all of these."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        return replace(super().locate(sounds), unneeded={"north"}, outvoted={})
+
+
+def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None:
+    fusion = Fusion("site", [NORTH, SOUTH, EAST], Choosing())
+    (event,) = (output for output in sound_at(fusion, 0) if isinstance(output, Event))
+    assert event.heard_by == ("north", "south", "east")
+    assert event.estimate is not None
+    assert event.estimate.arrays == ("south", "east")
+    assert {c.array: c.agrees for c in event.contributions} == {"north": None, "south": True, "east": True}
+    assert [status_of(fusion, name, 20).agreed for name in ("north", "south", "east")] == [0, 1, 1]
 
 
 def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:

@@ -24,19 +24,30 @@ def spectra_of(frames: int, microphones: int = 3, seed: int = 0) -> ComplexArray
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-def test_cross_spectra_are_weighed_sums_of_phases(kernels: ModuleType) -> None:
+@pytest.mark.parametrize("phases", [True, False])
+def test_cross_spectra_are_weighed_sums_of_what_is_whitened(kernels: ModuleType, phases: bool) -> None:
     spectra = spectra_of(4)
+    spectra[:, 0] *= 3.0  # a louder microphone
     spectra[:, 1, LOW + 7] = 0.0  # where a channel is silent nothing is known
     weights = np.random.default_rng(1).random((4, BINS)).astype(np.float32)
     weights[2] = 0.0
-    pairs, whitened = microphone_pairs(3), np.empty((3, BINS), np.complex64)
-    kernels.cross_spectra(spectra, LOW, pairs, weights, whitened)
+    pairs, whitened, levels = microphone_pairs(3), np.empty((3, BINS), np.complex64), np.empty(3)
+    kernels.cross_spectra(spectra, LOW, pairs, weights, phases, whitened, levels)
     inside = spectra[:, :, LOW : LOW + BINS].astype(np.complex128)
-    unit = np.divide(inside, np.abs(inside), out=np.zeros_like(inside), where=inside != 0)
+    power = np.square(np.abs(inside))
+    if not phases:
+        padded = np.pad(power.mean(axis=1), ((0, 0), (1, 1)), mode="edge")
+        power = np.broadcast_to(((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / 3.0)[:, None], power.shape)
+    unit = np.divide(inside, np.sqrt(power), out=np.zeros_like(inside), where=inside != 0)
     for row, (i, k) in enumerate(pairs):
-        np.testing.assert_allclose(whitened[row], (weights * np.conj(unit[:, i]) * unit[:, k]).sum(axis=0), atol=1e-5)
+        np.testing.assert_allclose(whitened[row], (weights * np.conj(unit[:, i]) * unit[:, k]).sum(axis=0), atol=2e-5)
+    np.testing.assert_allclose(levels, (weights[:, None] * np.square(np.abs(unit))).sum(axis=(0, 2)), rtol=1e-5)
     assert np.abs(whitened.imag).max() > 0.5  # a sign that is turned is seen
     assert whitened[0, 7] == whitened[2, 7] == 0.0
+    if phases:
+        assert levels[0] == pytest.approx(weights.sum(), rel=1e-5)
+    else:
+        assert levels[0] > 5.0 * levels[2]
 
 
 def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array, ...]:

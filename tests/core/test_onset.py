@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 from operator import add
 
@@ -11,8 +12,9 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from livessl.core import estimators
 from livessl.core.estimators import Onset, Sound
-from livessl.core.gcc import LagSampling
+from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
@@ -153,3 +155,72 @@ def test_high_bands_go_by_the_envelope() -> None:
     assert np.iscomplexobj(front_end(high, 44100.0).nothing.lags)
     assert not np.iscomplexobj(front_end().nothing.lags)
     assert NORTH.band_hz == BAND_HZ
+
+
+def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    east = tetra("east", [3.9, 4.8, 1.2])
+    estimator = Onset([NORTH, SOUTH, east], GRID, C_M_S)
+    loudness = {"north": 1.0, "south": 1.0, "east": 0.02}
+    sounds = {
+        spec.name: listened(
+            spec, np.float32(loudness[spec.name]) * echoing(spec) + noise(12000, 0.002), noise(6400, 0.002)
+        )
+        for spec in (NORTH, SOUTH, east)
+    }
+    everyone = estimator.locate(sounds)
+    assert not everyone.unneeded
+    assert [heard.spec.name for heard in everyone.evidence] == ["east", "north", "south"]
+    monkeypatch.setattr(estimators, "MOST_ARRAYS", 2)
+    found = estimator.locate(sounds)
+    assert set(found.unneeded) == {"east"}
+    assert [heard.spec.name for heard in found.evidence] == ["north", "south"]
+    without = estimator.locate({name: sounds[name] for name in ("north", "south")})
+    assert found.position_m.tobytes() == without.position_m.tobytes()
+    assert found.outvoted == without.outvoted
+
+
+def test_gains_of_microphones_do_not_matter() -> None:
+    gain = np.array([[1.0], [5.0], [0.3], [1.0]], np.float32)
+    even = {s.name: listened(s, echoing(s, 0.002), noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    odd = {s.name: listened(s, gain * echoing(s, 0.002), gain * noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    assert np.linalg.norm(located(odd) - SOURCE_M) < NEAR_M
+    pairs = microphone_pairs(4)
+    heights = []
+    for sounds in (even, odd):
+        onsets = sounds["north"].onsets[0]
+        heights.append((onsets.lags / onsets.heights(pairs)).max(axis=1))
+    np.testing.assert_allclose(heights[1], heights[0], rtol=0.2)  # as they are they would differ by up to 17 times
+
+
+def test_where_microphones_are_far_apart_each_counts_the_same() -> None:
+    wide = ArraySpec("wide", 10.0 * NORTH.microphones_m, BAND_HZ)
+    for spec, same in ((wide, True), (NORTH, False)):
+        ear = front_end(spec)
+        pushed(ear, noise(6400, 0.001), quiet=True)
+        found = pushed(ear, np.array([[5.0], [1.0], [1.0], [1.0]], np.float32) * echoing(NORTH, 0.001), quiet=False)
+        assert (found.levels.max() < 1.01 * found.levels.min()) == same
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_what_onsets_do_not_tell_whole_segments_do(ended: bool) -> None:
+    estimator = Onset([NORTH, SOUTH], GRID, C_M_S)
+    sounds = {}
+    for seed, spec in enumerate((NORTH, SOUTH)):
+        ear = front_end(spec)
+        pushed(ear, noise(6400, 0.01, seed), quiet=True)
+        only_noise = pushed(ear, noise(6400, 0.01, seed + 2), quiet=False)
+        segment = heard(spec, SOURCE_M, burst(9000)) + noise(9000, 0.01, seed + 4)
+        sounds[spec.name] = Sound((segment,), RATE_HZ, (only_noise,), ended=ended)
+    found = estimator.locate(sounds)
+    assert (found.refused is None) == ended
+    assert found.signs is not None
+    assert found.signs.whole == ended
+    if ended:
+        assert np.linalg.norm(found.position_m - SOURCE_M) < NEAR_M
+
+
+def test_of_what_onsets_are_sure_nobody_asks_the_segments() -> None:
+    sounds = {s.name: listened(s, echoing(s), noise(6400, 0.0)) for s in (NORTH, SOUTH)}
+    other = {name: replace(sound, segments=(noise(9000, 0.1),)) for name, sound in sounds.items()}
+    found = [Onset([NORTH, SOUTH], GRID, C_M_S).locate(each) for each in (sounds, other)]
+    np.testing.assert_array_equal(found[0].position_m, found[1].position_m)

@@ -25,6 +25,15 @@ LEAST_CONFIDENCE: Final = 0.8
 _HEARD: Final = (-3.34, 2.69, 1.03)
 """Intercept, weights of margin and standing in the log-odds of a right place, of arrays that tell distance."""
 
+_HEARD_WHOLE: Final = (-3.56, 10.0, 0.82)
+"""The same of evidence that whole segments are part of, where onsets alone were not sure."""
+
+SURE: Final = 0.9
+"""From this confidence on, onsets alone will do, if two arrays hear them."""
+
+_HEARS: Final = 2.0
+"""Of one array, a standing from which on it surely hears something: noise alone stands as high as its rms."""
+
 _NOWHERE_ELSE: Final = (-0.04, 62.2)
 """Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
 side by side, many are."""
@@ -41,8 +50,13 @@ CROSSING_DEG: Final = 20.0
 _DELAYS: Final = 3.0
 """Independent delays of the arrays of four microphones that the numbers were fitted with."""
 
-_INFLATION: Final = 1.6
-"""What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance."""
+_INFLATION: Final = 1.15
+"""What noise and reflections elsewhere on the lag axis do not tell of the peak's own error, as variance, by the root of
+the number of arrays: their maps are summed as they are, and the clearest should count for more."""
+
+_DISCORD: Final = 0.4
+"""Where pairs disagree by less, most of what stands elsewhere on the lag axis is no noise but the sound's own side
+lobes, and the variance shrinks as the square. It is about 0.05 in free field, and 0.7 or more in a room."""
 
 _FINEST_M: Final = 0.005
 """Standard deviation along each axis that is left however clear the evidence: reflections close upon the direct sound,
@@ -62,11 +76,17 @@ class Signs:
         0, in proportion to its independent delays: an array that disagrees, or hears only noise, adds nothing.
     crossing_deg : float
         Largest angle at which lines from two arrays cross at the place, 0 to 90; 0 for one array.
+    shared : float
+        The second highest of the arrays' shares of the standing; 0 for one array.
+    whole : bool
+        Whether whole segments are part of the evidence.
     """
 
     margin: float
     standing: float
     crossing_deg: float = 0.0
+    shared: float = 0.0
+    whole: bool = False
 
     @property
     def confidence(self) -> float:
@@ -79,7 +99,12 @@ class Signs:
     @property
     def heard(self) -> float:
         """The same, where the arrays tell distance."""
-        return self._probability(_HEARD)
+        return self._probability(_HEARD_WHOLE if self.whole else _HEARD)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether another look at the sound is not worth its time."""
+        return self.confidence >= SURE and self.shared >= _HEARS
 
     @property
     def confidence_of_second(self) -> float:
@@ -120,6 +145,8 @@ def judge(
     power: float,
     rival_power: float,
     grid: Grid,
+    *,
+    whole: bool = False,
 ) -> Judgement:
     """Judge the place found.
 
@@ -133,11 +160,21 @@ def judge(
     power, rival_power : float
         The functional there, and the highest outside its `peaks.neighbourhood`.
     grid : Grid
+    whole : bool
+        Whether whole segments are part of the evidence.
     """
     terms = functional.pair_terms(position_m)
-    together = sum(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(peaks.margin(power, rival_power), together, crossing_deg([h.spec for h in evidence], position_m))
-    covariance_m2 = _INFLATION * peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    each = sorted(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
+    signs = Signs(
+        peaks.margin(power, rival_power),
+        sum(each),
+        crossing_deg([heard.spec for heard in evidence], position_m),
+        each[-2] if len(each) > 1 else 0.0,
+        whole,
+    )
+    covariance_m2 = peaks.laplace_covariance_m2(functional, evidence, position_m, grid)
+    covariance_m2 *= _INFLATION * np.sqrt(len(evidence))
+    covariance_m2 *= min(1.0, _discord(evidence, terms, len(grid.free_axes)) / _DISCORD) ** 2
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _FINEST_M**2
     refused = None
@@ -147,6 +184,27 @@ def judge(
             f"{LEAST_CONFIDENCE:g} wanted"
         )
     return Judgement(covariance_m2, signs, refused)
+
+
+def _discord(evidence: Sequence[HeardBy], terms: Sequence[PairTerms], axes: int) -> float:
+    """How far the pairs disagree about a place with so many free axes, as a share of what stands elsewhere; at most 1.
+
+    They have more delays than the place has coordinates, and where they do not agree their slopes R' there are not 0:
+    the mean square slope, with the delays that the place has used up allowed for, over s^2 kappa. s^2 is the mean
+    square of the GCCs away from the peak and kappa = sum (-R'') / sum R the mean square angular frequency.
+    """
+    slope, noise, delays = 0.0, 0.0, 0
+    for heard, term in zip(evidence, terms, strict=True):
+        live = np.any(heard.gcc.values, axis=1)
+        if live.any():
+            slope += float(np.square(term.slope[live]).mean())
+            noise += peaks.noise(heard, term, live)
+            delays += len(np.unique(heard.gcc.pairs[live])) - 1
+    height = sum(float(term.values.sum()) for term in terms)
+    hill = sum(float(np.maximum(-term.curvature, 0.0).sum()) for term in terms)
+    if delays <= axes or height <= 0.0 or noise * hill <= 0.0:
+        return 1.0
+    return min(1.0, slope / (noise * hill / height) * delays / (delays - axes))
 
 
 def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:

@@ -59,26 +59,38 @@ def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def cross_spectra(spectra, low, pairs, weights, whitened):  # type: ignore[no-untyped-def]
-    """Cross spectra of phases alone, weighed and summed over frames."""
+def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    spectra, low, pairs, weights, phases, whitened, levels
+):
+    """Whitened cross spectra, weighed and summed over frames, and the microphones' own sums."""
     microphones, bins = spectra.shape[1], whitened.shape[1]
     real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
-    power, summed = np.empty(bins, np.float32), np.zeros((2, len(pairs), bins), np.float32)
+    power, over = np.empty((microphones, bins), np.float32), np.empty(bins, np.float32)
+    own, summed = np.zeros((microphones, bins), np.float32), np.zeros((2, len(pairs), bins), np.float32)
+    together = np.zeros(bins + 2, np.float32)
+    one, zero = np.float32(1.0), np.float32(0.0)
     for t in range(len(spectra)):
         weight = weights[t]
         if not weight.any():
             continue
+        together[:] = zero
         for m in range(microphones):
-            spectrum, u, v = spectra[t, m, low : low + bins], real[m], imaginary[m]
+            spectrum, u, v, square = spectra[t, m, low : low + bins], real[m], imaginary[m], power[m]
             for b in range(bins):
                 u[b], v[b] = spectrum[b].real, spectrum[b].imag
-                power[b] = u[b] * u[b] + v[b] * v[b]
-            floor = SILENT_POWER * power.max()
+                square[b] = u[b] * u[b] + v[b] * v[b]
+                together[b + 1] += square[b]
+        together[0], together[bins + 1] = together[1], together[bins]
+        for b in range(bins):
+            over[b] = one / np.sqrt((together[b] + together[b + 1] + together[b + 2]) / np.float32(3 * microphones))
+        for m in range(microphones):
+            u, v, square, floor = real[m], imaginary[m], power[m], SILENT_POWER * power[m].max()
             for b in range(bins):
-                over = np.float32(1.0) / np.sqrt(power[b])
-                over = over if power[b] > floor else np.float32(0.0)
-                u[b] *= over
-                v[b] *= over
+                factor = one / np.sqrt(square[b]) if phases else over[b]
+                factor = factor if square[b] > floor else zero
+                u[b] *= factor
+                v[b] *= factor
+                own[m, b] += weight[b] * (u[b] * u[b] + v[b] * v[b])
         for p in range(len(pairs)):
             u_i, v_i, u_k, v_k = real[pairs[p, 0]], imaginary[pairs[p, 0]], real[pairs[p, 1]], imaginary[pairs[p, 1]]
             of_real, of_imaginary = summed[0, p], summed[1, p]
@@ -88,6 +100,8 @@ def cross_spectra(spectra, low, pairs, weights, whitened):  # type: ignore[no-un
     for p in range(len(pairs)):
         for b in range(bins):
             whitened[p, b] = complex(summed[0, p, b], summed[1, p, b])
+    for m in range(microphones):
+        levels[m] = own[m].sum()
 
 
 @_compiled

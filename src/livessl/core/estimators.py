@@ -33,6 +33,8 @@ class Sound:
     """Whether the array has disagreed with the others lately."""
     sources: int = 1
     """How many sources are to be looked for."""
+    ended: bool = True
+    """Whether this is all of it; what goes on will be heard again, and is not worth a second look."""
 
     @property
     def clarity(self) -> float:
@@ -287,27 +289,46 @@ class Onset(SrpPhat):
         clearest = _clearest(sounds, MOST_ARRAYS)
         evidence = tuple(self._heard(name, sound) for name, sound in clearest.items())
         doubted = [name for name, sound in clearest.items() if sound.doubted]
-        agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
-        second = self._second(agreed, evidence, clearest)
-        outvoted = agreed.outvoted if second is None else second[1].outvoted
-        place = agreed.place if second is None else second[0]
+        found = self._answer(evidence, doubted)
+        second = self._second(found.agreed, evidence, clearest)
         others = () if second is None else (second[1],)
-        judged = _judged(place, self._grid)
-        refused = judged.refused if second is not None else agreed.refused or judged.refused
-        if not place.proven:
-            refused = "nothing stands out: the search for the place was given up"
+        if second is not None:
+            place, other = second
+            judged = _judged(place, self._grid)
+            found = _Answer(evidence, agreement.Agreed(place, other.outvoted or {}), judged, judged.refused)
+        elif not found.is_sure and all(sound.ended for sound in clearest.values()):
+            again = self._answer(self._with_whole(evidence, clearest), doubted, whole=True)
+            found = max(found, again, key=lambda answer: (answer.refused is None, answer.judged.signs.confidence))
+        place = found.agreed.place
         return Localization(
             place.position_m,
-            judged.covariance_m2,
-            judged.signs.confidence,
-            evidence,
+            found.judged.covariance_m2,
+            found.judged.signs.confidence,
+            found.evidence,
             place.proven,
-            judged.signs,
-            refused,
-            outvoted,
+            found.judged.signs,
+            found.refused if place.proven else "nothing stands out: the search for the place was given up",
+            found.agreed.outvoted,
             sounds.keys() - clearest.keys(),
             tuple(replace(other, unneeded=sounds.keys() - {h.spec.name for h in other.evidence}) for other in others),
         )
+
+    def _answer(self, evidence: tuple[HeardBy, ...], doubted: Collection[str], *, whole: bool = False) -> _Answer:
+        agreed = agreement.agreed(evidence, doubted, self._search, self._grid, self._place)
+        judged = _judged(agreed.place, self._grid, whole=whole)
+        return _Answer(evidence, agreed, judged, agreed.refused or judged.refused)
+
+    def _with_whole(self, evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+        """The evidence and that of whole segments: what goes on steadily counts as much as what begins."""
+        telling = _clearest(sounds, MOST_TELLING_APART)
+        return tuple(
+            self._plus_whole(heard, telling[heard.spec.name]) if heard.spec.name in telling else heard
+            for heard in evidence
+        )
+
+    def _plus_whole(self, heard: HeardBy, sound: Sound) -> HeardBy:
+        whole = super()._heard(heard.spec.name, sound).gcc
+        return HeardBy(heard.spec, replace(heard.gcc, values=heard.gcc.values + whole.values))
 
     def _second(
         self, agreed: agreement.Agreed, everyone: tuple[HeardBy, ...], sounds: Mapping[str, Sound]
@@ -371,9 +392,9 @@ class Onset(SrpPhat):
         if onsets is None:
             onsets = self.listener(array, sound.sample_rate_hz).listen(sound.segments)
         sampling = self._sampling(array, sound.sample_rate_hz)
-        values = sampling.fine(onsets.lags / np.float32(max(onsets.weight, 1.0)))
         spec = self._arrays[array]
-        gcc = GCC(microphone_pairs(len(spec.microphones_m)), sampling.fine_lags_s, values)
+        pairs = microphone_pairs(len(spec.microphones_m))
+        gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
         return HeardBy(spec, sound.live(gcc))
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
@@ -397,8 +418,25 @@ def _clearest(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
     return {name: sound for name, sound in in_order.items() if name in clearest}
 
 
-def _judged(place: agreement.Place, grid: Grid) -> certainty.Judgement:
-    return certainty.judge(place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid)
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """Of what evidence, who agrees on which place, what it is worth, and why it should not be relied on if so."""
+
+    evidence: tuple[HeardBy, ...]
+    agreed: agreement.Agreed
+    judged: certainty.Judgement
+    refused: str | None
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether a second look is not worth its time."""
+        return self.refused is None and self.judged.signs.is_sure
+
+
+def _judged(place: agreement.Place, grid: Grid, *, whole: bool = False) -> certainty.Judgement:
+    return certainty.judge(
+        place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid, whole=whole
+    )
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
@@ -419,7 +457,8 @@ MOST_ARRAYS: Final = 16
 answer costs, and how soon it is there, no longer depends on how many there are."""
 
 MOST_TELLING_APART: Final = 8
-"""Arrays that two sources at once are told apart by: their number is what it costs, and so many say it clearly."""
+"""Arrays that two sources at once are told apart by, and that are listened to twice where an answer is not sure: their
+number is what it costs, and so many say it clearly."""
 
 MAP_SPACING_M: Final = 0.1
 """Maps are not drawn finer than this: a screen shows no more of a room."""

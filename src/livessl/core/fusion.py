@@ -477,7 +477,7 @@ class Fusion:
 
     def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
         window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
-        sounds = _Sounds(self._parameters.live_sources)
+        sounds = _Sounds(self._parameters.live_sources, ended=False)
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
             pieces, there = stream.segments([r for r in window if stream.has_active(r)])
@@ -788,8 +788,9 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
 class _Sounds(Mapping[str, Sound]):
     """What the arrays heard."""
 
-    def __init__(self, sources: int, doubted: Collection[str] = ()) -> None:
+    def __init__(self, sources: int, doubted: Collection[str] = (), *, ended: bool = True) -> None:
         self.doubted = doubted
+        self.ended = ended
         self.sources = sources
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
         self.onsets: dict[str, tuple[OnsetGCC, ...]] = {}
@@ -803,6 +804,7 @@ class _Sounds(Mapping[str, Sound]):
             onsets,
             array in self.doubted,
             self.sources,
+            self.ended,
         )
 
     def __iter__(self) -> Iterator[str]:

@@ -123,6 +123,13 @@ class CrossSpectra:
     band_hz : (float, float)
     weights : (L, B) float32 or None
         Of each frame's bins in the band; the correlations are then sums and no means.
+    phases : bool
+        Whether each microphone is whitened for itself, so that only phases are left; else all by their mean power.
+
+    Attributes
+    ----------
+    levels : (K,) float64
+        What the correlation of each microphone with itself would be at lag 0, as a sum.
     """
 
     def __init__(
@@ -132,6 +139,8 @@ class CrossSpectra:
         sample_rate_hz: float,
         band_hz: tuple[float, float],
         weights: Float32Array | None = None,
+        *,
+        phases: bool = True,
     ) -> None:
         self.n_fft = spectra.n_fft
         self.sample_rate_hz = sample_rate_hz
@@ -142,7 +151,8 @@ class CrossSpectra:
         if weights is None:
             self.share = max(1, bins) * max(1, frames)
             weights = np.ones((frames, bins), dtype=np.float32)
-        kernels.cross_spectra(spectra.values, self.low, pairs, weights, self.whitened)
+        self.levels = np.zeros(spectra.values.shape[1])
+        kernels.cross_spectra(spectra.values, self.low, pairs, weights, phases, self.whitened, self.levels)
 
     def bins_below(self, cut_off_hz: float) -> int:
         """How many of the band's bins lie at or below a cut-off."""

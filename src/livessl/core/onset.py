@@ -9,8 +9,10 @@ microphones is gamma = S / (S + I), and their phases weigh
 
 the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma
 where the textbook would estimate it from long averages, which reverberation spoils. The GCC is
-sum_t w conj(U_i) U_k, U = X/|X|, summed over the band and *not* normalised: a moment or a band with more evidence
-counts for more, and sums over frames make a window or an event. It knows no geometry and no other array.
+sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* normalised: a moment or a band with more evidence
+counts for more, and sums over frames make a window or an event. Whitened by the power that the microphones have on
+average, a microphone that is drowned by noise counts for less than its phase alone would. It knows no geometry and no
+other array.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from livessl.core.activity import band_bins
 from livessl.core.frontends import Spectra, fast_length
 from livessl.core.gcc import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
 from livessl.core.kernels import kernels
-from livessl.core.types import ArraySpec, ComplexArray, Float32Array
+from livessl.core.types import ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 WINDOW_S: Final = 0.032
 """Length of the Hann window; 16 ms and 64 ms did no better, and 16 ms less well for tones in noise."""
@@ -38,7 +40,8 @@ PAST_S: Final = 0.1
 """Time constant of the past's decay; between 0.06 and 0.2 s little changes."""
 
 _WINDOW_LAGS: Final = 8
-"""A window is at least so many times as long as the array's largest delay, which would else move sound out of it."""
+"""A window is at least so many times as long as the array's largest delay, which would else move sound out of it. Where
+that makes it longer, one microphone may be much nearer to a source than another, and phases alone count."""
 
 _STRONGEST: Final = np.float32(10.0)
 """Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
@@ -64,26 +67,37 @@ class OnsetGCC:
     ----------
     lags : (P, C) float32, or complex64 where the envelope is used
         Weighted sums at the near-Nyquist lags of `LagSampling`.
-    weight : float
-        Sum of the weights: a single direct sound in all of them gives `lags` of this height.
+    levels : (K,) float64
+        What each microphone with itself would give at lag 0: the sum of the weights times its share of the power.
     """
 
     lags: ComplexArray | Float32Array
-    weight: float
+    levels: FloatArray
 
     def __add__(self, other: OnsetGCC) -> OnsetGCC:
         """Both together."""
-        return OnsetGCC(self.lags + other.lags, self.weight + other.weight)
+        return OnsetGCC(self.lags + other.lags, self.levels + other.levels)
+
+    @property
+    def weight(self) -> float:
+        """Sum of the weights: a single direct sound in all of them gives `lags` of about this height."""
+        return float(self.levels.mean())
+
+    def heights(self, pairs: IntArray) -> Float32Array:
+        """What a single direct sound gives each of the pairs (P, 2), however loud their microphones: (P, 1)."""
+        heights = np.sqrt(self.levels[pairs].prod(axis=1, keepdims=True))
+        return np.asarray(np.maximum(heights, 1.0), dtype=np.float32)
 
 
 def summed(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
     """All together; None for nothing."""
     if not heard:
         return None
-    lags = heard[0].lags.copy()
+    lags, levels = heard[0].lags.copy(), heard[0].levels.copy()
     for one in heard[1:]:
         lags += one.lags
-    return OnsetGCC(lags, sum(one.weight for one in heard))
+        levels += one.levels
+    return OnsetGCC(lags, levels)
 
 
 class OnsetFrontEnd:
@@ -103,7 +117,8 @@ class OnsetFrontEnd:
         self._band_hz = spec.band_hz
         self._pairs = microphone_pairs(len(spec.microphones_m))
         self._envelope = uses_envelope(spec.band_hz)
-        length = max(round(WINDOW_S * sample_rate_hz), _WINDOW_LAGS * sampling.room)
+        usual, least = round(WINDOW_S * sample_rate_hz), _WINDOW_LAGS * sampling.room
+        self._wide, length = least > usual, max(least, usual)
         self._hop = round(HOP_S / WINDOW_S * length)
         self._n_fft = fast_length(length + sampling.room)
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
@@ -122,7 +137,8 @@ class OnsetFrontEnd:
     def nothing(self) -> OnsetGCC:
         """The sum of no frames."""
         shape = (len(self._pairs), self._sampling.count)
-        return OnsetGCC(np.zeros(shape, np.complex64) if self._envelope else np.zeros(shape, np.float32), 0.0)
+        lags = np.zeros(shape, np.complex64) if self._envelope else np.zeros(shape, np.float32)
+        return OnsetGCC(lags, np.zeros(len(self._tail)))
 
     def reset(self) -> None:
         """Forget all: samples are missing, and what comes does not continue what was."""
@@ -153,8 +169,10 @@ class OnsetFrontEnd:
             spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,
             _LOUD, _STRONGEST, self._noise, self._past, weights,
         )  # fmt: skip
-        cross = CrossSpectra(Spectra(spectra, self._n_fft), self._pairs, self.sample_rate_hz, self._band_hz, weights)
-        return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), float(weights.sum()))
+        cross = CrossSpectra(
+            Spectra(spectra, self._n_fft), self._pairs, self.sample_rate_hz, self._band_hz, weights, phases=self._wide
+        )
+        return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels)
 
     def listen(self, pieces: Iterable[Float32Array]) -> OnsetGCC:
         """Sum over pieces (K, n) of sound without their context: each is taken to begin out of silence."""

@@ -13,7 +13,7 @@ from livessl.core.gcc import mean_square_angular_frequency
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.srp import PairTerms, SRPFunctional, pair_weight
-from livessl.core.types import Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import BoolArray, Float32Array, FloatArray, HeardBy, IntArray
 
 CANDIDATES: Final = 2
 """Nodes followed to the top: between two nodes a lower one on the grid may be the higher one in truth."""
@@ -193,8 +193,13 @@ def laplace_covariance_m2(
     return covariance
 
 
-def _scale(heard: HeardBy, term: PairTerms) -> float:
+def noise(heard: HeardBy, term: PairTerms, live: BoolArray) -> float:
+    """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
     lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
-    noise = kernels.mean_square(heard.gcc.values, heard.gcc.lags_s, term.lags_s, lobe_s)
+    return float(kernels.mean_square(heard.gcc.values[live], heard.gcc.lags_s, term.lags_s[live], lobe_s))
+
+
+def _scale(heard: HeardBy, term: PairTerms) -> float:
+    elsewhere = noise(heard, term, np.ones(len(heard.gcc.values), dtype=np.bool_))
     height = float(term.values.mean())
-    return max(height, 0.0) / noise if noise > 0 else 0.0
+    return max(height, 0.0) / elsewhere if elsewhere > 0 else 0.0

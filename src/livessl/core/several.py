@@ -55,7 +55,9 @@ class Moments:
         """From what a listener made of an array's frames, no envelopes; pairs that are not `live` (P,) are silent."""
         size = -(-len(frames) // MOST_MOMENTS)
         together = [reduce(add, frames[first : first + size]) for first in range(0, len(frames), size)]
-        coarse = np.asarray(np.stack([one.lags for one in together]).real * live[:, None], dtype=np.float32)
+        whole = reduce(add, together)
+        even = live[:, None] * np.float32(whole.weight) / whole.heights(microphone_pairs(len(spec.microphones_m)))
+        coarse = np.asarray(np.stack([one.lags for one in together]).real * even, dtype=np.float32)
         fine = sampling.fine(coarse.reshape(-1, coarse.shape[2])).reshape(*coarse.shape[:2], -1)
         return cls(spec, sampling.fine_lags_s, fine, np.array([one.weight for one in together]))
 

@@ -54,9 +54,17 @@ def cut_windows(samples: Float32Array, hop: int, window: Float32Array, windows: 
 
 
 def cross_spectra(
-    spectra: ComplexArray, low: int, pairs: IntArray, weights: Float32Array, whitened: ComplexArray
+    spectra: ComplexArray,
+    low: int,
+    pairs: IntArray,
+    weights: Float32Array,
+    phases: bool,
+    whitened: ComplexArray,
+    levels: FloatArray,
 ) -> None:
-    """Cross spectra of phases alone, sum_t w conj(U_i) U_k with U = X/|X|.
+    """Whitened cross spectra, sum_t w conj(U_i) U_k, and the microphones' own sums over all bins, sum_t,f w |U_m|^2.
+
+    Whitened is each microphone by its own magnitude, U = X/|X|, or all by their mean power P: U = X/sqrt(P).
 
     Parameters
     ----------
@@ -68,15 +76,22 @@ def cross_spectra(
         Microphones (i, k).
     weights : (T, B) float32
         Of each frame's bins in the band.
+    phases : bool
+        Whether each microphone is whitened for itself, so that only phases are left.
     whitened : (P, B) complex64
         The answer.
+    levels : (K,) float64
+        The microphones' own sums.
     """
-    whitened[:] = 0.0
+    whitened[:], levels[:] = 0.0, 0.0
     first, second = pairs.T
     for spectrum, weight in zip(spectra[:, :, low : low + whitened.shape[1]], weights, strict=True):
         power = spectrum.real**2 + spectrum.imag**2
         heard = power > SILENT_POWER * power.max(axis=1, initial=0.0, keepdims=True)
+        if not phases:
+            power = np.broadcast_to(_smoothed(power.mean(axis=0)[None]), power.shape)
         unit = np.divide(spectrum, np.sqrt(power), out=np.zeros_like(spectrum), where=heard)
+        levels += np.square(np.abs(unit)) @ weight
         whitened += (np.conj(unit) * weight)[first] * unit[second]
 
 
