@@ -72,6 +72,20 @@ def test_two_arrays_that_do_not_meet_are_refused() -> None:
     assert found.outvoted == {}
 
 
+def test_a_little_is_outvoted_by_two_and_not_refused_of_two() -> None:
+    """Five degrees at 2.5 m are 0.2 m, which drags the place along: three can leave it out, two must live with it."""
+    aside = turned(EAST, 5.0)
+    found = locate([NORTH, SOUTH, aside], SOUNDS)
+    assert found.outvoted is not None
+    assert list(found.outvoted) == ["east"]
+    assert error_m(found) < NEAR_M
+    two = locate([NORTH, aside], SOUNDS)
+    assert (two.refused, two.outvoted) == (None, {})
+    assert error_m(two) > NEAR_M
+    agree = locate([NORTH, SOUTH, turned(EAST, 2.0)], SOUNDS)
+    assert (agree.refused, agree.outvoted) == (None, {})
+
+
 def test_one_array_has_nobody_to_disagree_with() -> None:
     assert locate([NORTH], SOUNDS).outvoted == {}
 

@@ -21,8 +21,8 @@ def at_ns(time_s: float) -> int:
     return START_NS + round(time_s * 1e9)
 
 
-def estimate(time_s: float, position_m: ArrayLike, std_m: float = STD_M) -> Estimate:
-    return Estimate(at_ns(time_s), np.array(position_m, dtype=np.float64), std_m**2 * np.eye(3), 0.5, ("north",))
+def estimate(time_s: float, position_m: ArrayLike, std_m: float = STD_M, confidence: float = 1.0) -> Estimate:
+    return Estimate(at_ns(time_s), np.array(position_m, dtype=np.float64), std_m**2 * np.eye(3), confidence, ("north",))
 
 
 def follow(tracker: Tracker, paths: Sequence[FloatArray], std_m: float = STD_M) -> list[list[Track]]:
@@ -113,7 +113,7 @@ def test_unsure_direction_moves_the_track_little_along_it() -> None:
     tracker = Tracker()
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
     covariance = np.diag([4.0, 0.0025, 0.0025])
-    found = Estimate(at_ns(3.0), np.array([1.6, 1.1, 1.0]), covariance, 0.5, ("north",))
+    found = Estimate(at_ns(3.0), np.array([1.6, 1.1, 1.0]), covariance, 1.0, ("north",))
     (track,) = tracker.step(at_ns(3.0), [found])
     x, y, _ = track.position_m - 1.0
     assert abs(x) < 0.02
@@ -206,3 +206,67 @@ def test_a_stray_estimate_is_told_of_nobody() -> None:
         assert {track.id for track in tracker.step(at_ns(time_s), [estimate(time_s, at_m)])} <= {1}
     (ended,) = tracker.step(at_ns(20.0))
     assert ended.id == 1
+
+
+def direction(time_s: float, position_m: ArrayLike) -> Estimate:
+    """Good across the line of sight, here x, and anywhere along it."""
+    return Estimate(at_ns(time_s), np.array(position_m), np.diag([4.0, 0.01, 0.01]), 0.9, ("north",))
+
+
+@pytest.mark.parametrize("back_m", [0.6, 1.6])
+def test_who_turns_round_in_a_pause_keeps_the_name(back_m: float) -> None:
+    """After 0.7 s the prediction has gone 0.7 m on: 0.6 m back it is 1.3 m off, and who walked is found again."""
+    tracker = Tracker()
+    path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
+    follow(tracker, [path])
+    turned_m = path[-1] - np.array([back_m, 0.0, 0.0])
+    first = tracker.step(at_ns(3.6), [estimate(3.6, turned_m, std_m=0.02)])
+    assert [track.id for track in first] == ([1] if back_m < GATE_M else [])
+    (second,) = tracker.step(at_ns(3.7), [estimate(3.7, turned_m - [0.1, 0.0, 0.0], std_m=0.02)])
+    assert second.id == (1 if back_m < GATE_M else 2)
+    if back_m < GATE_M:
+        assert np.linalg.norm(second.position_m - turned_m) < 0.2  # and not where it was going
+
+
+def test_a_direction_makes_no_source_of_a_stray_estimate() -> None:
+    for after, ids in ((direction(3.1, [3.2, 1.1, 1.0]), {1}), (estimate(3.1, [3.2, 1.0, 1.0]), {1, 2})):
+        tracker = Tracker()
+        follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+        told = tracker.step(at_ns(3.0), [estimate(3.0, [3.0, 1.0, 1.0])]) + tracker.step(at_ns(3.1), [after])
+        again = tracker.step(at_ns(3.2), [estimate(3.2, [1.0, 1.0, 1.0])])
+        assert {track.id for track in told + again} == ids
+
+
+def test_a_direction_alone_is_followed_where_nobody_is() -> None:
+    tracker = Tracker()
+    (first,) = tracker.step(at_ns(0.0), [direction(0.0, [3.0, 1.0, 1.0])])
+    (second,) = tracker.step(at_ns(0.1), [direction(0.1, [3.5, 1.0, 1.0])])
+    assert (first.id, second.id) == (1, 1)
+
+
+def test_a_doubtful_estimate_moves_the_track_less() -> None:
+    moved_m = []
+    for confidence in (0.8, 0.9, 1.0):
+        tracker = Tracker()
+        follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+        (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.5, 1.0, 1.0], confidence=confidence)])
+        moved_m.append(float(track.position_m[0]) - 1.0)
+    assert 0.0 < moved_m[0] < 0.75 * moved_m[1] < 0.75 * 0.75 * moved_m[2]
+    tracker = Tracker()  # where the confidence is no probability it says nothing of that
+    follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
+    (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [1.5, 1.0, 1.0], confidence=0.2)], probable=False)
+    assert float(track.position_m[0]) - 1.0 == pytest.approx(moved_m[2])
+
+
+def test_who_turned_while_only_a_direction_was_told_keeps_the_name() -> None:
+    """Then, too, it is the last place that counts, and not where it would be along the line of sight."""
+    tracker = Tracker()
+    path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
+    follow(tracker, [path])
+    for k in range(30, 37):  # it has turned round, which along the line of sight nobody hears
+        (track,) = tracker.step(at_ns(k * STEP_S), [direction(k * STEP_S, [4.5, 5.0, 1.5])])
+        assert track.id == 1
+    assert track.position_m[0] > 4.4
+    (again,) = tracker.step(at_ns(3.7), [estimate(3.7, [3.1, 5.0, 1.5], std_m=0.02)])
+    assert again.id == 1
+    assert abs(again.position_m[0] - 3.1) < 0.1

@@ -38,12 +38,6 @@ _NOWHERE_ELSE: Final = (-0.04, 62.2)
 """Intercept and weight of the margin in the log-odds that no place further along is as good: of one array, or of arrays
 side by side, many are."""
 
-LEAST_CONFIDENCE_OF_SECOND: Final = 0.5
-"""Below it a second source is not told of."""
-
-_LOGISTIC_OF_SECOND: Final = (-9.3, 1.01, 1.98)
-"""As `_HEARD`, of the best place left when the first source is taken out: is there a second, and is it there?"""
-
 CROSSING_DEG: Final = 20.0
 """Where arrays' lines of sight cross at a larger angle they tell how far away a place is, whatever the margin."""
 
@@ -99,7 +93,8 @@ class Signs:
     @property
     def heard(self) -> float:
         """The same, where the arrays tell distance."""
-        return self._probability(_HEARD_WHOLE if self.whole else _HEARD)
+        intercept, of_margin, of_standing = _HEARD_WHOLE if self.whole else _HEARD
+        return _likely(intercept + of_margin * self.margin + of_standing * self.standing)
 
     @property
     def is_sure(self) -> bool:
@@ -107,18 +102,9 @@ class Signs:
         return self.confidence >= SURE and self.shared >= _HEARS
 
     @property
-    def confidence_of_second(self) -> float:
-        """Probability that there is a second source and the place right, where the first has been taken out."""
-        return self._probability(_LOGISTIC_OF_SECOND)
-
-    @property
     def tell_direction(self) -> bool:
         """Whether there is anything at the place, be it only a direction: noise alone stands as high as its rms."""
         return self.standing >= 1.0
-
-    def _probability(self, logistic: tuple[float, float, float]) -> float:
-        intercept, of_margin, of_standing = logistic
-        return _likely(intercept + of_margin * self.margin + of_standing * self.standing)
 
 
 @dataclass(frozen=True, slots=True)

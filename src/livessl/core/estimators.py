@@ -333,14 +333,14 @@ class Onset(SrpPhat):
     def _second(
         self, agreed: agreement.Agreed, everyone: tuple[HeardBy, ...], sounds: Mapping[str, Sound]
     ) -> tuple[agreement.Place, Localization] | None:
-        """The first place as it is without a second source, and the second; None where there is none.
+        """The first place, and the second; None where there is none.
 
         What the first explains is taken out, and the second looked for; without that the first is looked for again, and
         then the second once more. Arrays may disagree because one hears another source best: where each of them hears
         something at both places, none is outvoted.
         """
-        divided = bool(agreed.outvoted) or agreed.refused is not None
-        for all_of_them in (everyone, agreed.place.evidence) if divided else (everyone,):
+        for all_of_them in (everyone, agreed.place.evidence) if agreed.outvoted else (everyone,):
+            divided = agreed.refused is not None or len(all_of_them) > len(agreed.place.evidence)
             telling = _clearest({heard.spec.name: sounds[heard.spec.name] for heard in all_of_them}, MOST_TELLING_APART)
             evidence = tuple(heard for heard in all_of_them if heard.spec.name in telling)
             specs = [heard.spec for heard in evidence]
@@ -349,21 +349,21 @@ class Onset(SrpPhat):
             if any(uses_envelope(spec.band_hz) for spec in specs):
                 return None  # magnitudes do not add up
             moments = [self._moments(heard, sounds[heard.spec.name]) for heard in evidence]
-            places = [replace(agreed.place, evidence=evidence, functional=SRPFunctional(evidence, self._c_m_s))]
-            for _ in range(3):
-                terms = places[-1].functional.pair_terms(places[-1].position_m)
-                left = [each.without(term.lags_s) for each, term in zip(moments, terms, strict=True)]
-                places.append(self._place(left))
-            again, second = places[-2:]
-            judged = _judged(second, self._grid)
-            confidence = judged.signs.confidence_of_second
-            apart_m = float(np.linalg.norm(again.position_m - second.position_m))
-            if confidence < certainty.LEAST_CONFIDENCE_OF_SECOND or apart_m < several.APART_M or not second.proven:
+            first = replace(agreed.place, evidence=evidence, functional=SRPFunctional(evidence, self._c_m_s))
+            second, prospect = self._beside(first, moments)
+            if prospect < several.LEAST_PROSPECT:
+                continue
+            again, _ = self._beside(second, moments)
+            second, confidence = self._beside(again, moments)
+            if confidence < several.LEAST_CONFIDENCE or not second.proven or _apart_m(again, second) < several.APART_M:
                 continue
             if divided and not (again.is_heard_by_all and second.is_heard_by_all):
                 continue
+            judged = _judged(second, self._grid)
             outvoted = {name: off for name, off in agreed.outvoted.items() if name not in {s.name for s in specs}}
-            return again, Localization(
+            # a short sound hardly counts where another's moments were evened out, and may be surer as it was
+            firsts = [again] if divided or _apart_m(first, second) < several.APART_M else [again, agreed.place]
+            return max(firsts, key=lambda place: _judged(place, self._grid).signs.confidence), Localization(
                 second.position_m,
                 judged.covariance_m2,
                 confidence,
@@ -372,6 +372,16 @@ class Onset(SrpPhat):
                 outvoted=outvoted,
             )
         return None
+
+    def _beside(self, place: agreement.Place, moments: Sequence[several.Moments]) -> tuple[agreement.Place, float]:
+        """The highest place when one is taken out, and how likely it is that a source is there, too."""
+        delays_s = [term.lags_s for term in place.functional.pair_terms(place.position_m)]
+        other = self._place([each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True)])
+        terms = other.functional.pair_terms(other.position_m)
+        clearness = [
+            each.clearness(term.lags_s, taken_s) for each, term, taken_s in zip(moments, terms, delays_s, strict=True)
+        ]
+        return other, several.confidence(clearness)
 
     def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
@@ -437,6 +447,10 @@ def _judged(place: agreement.Place, grid: Grid, *, whole: bool = False) -> certa
     return certainty.judge(
         place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid, whole=whole
     )
+
+
+def _apart_m(one: agreement.Place, other: agreement.Place) -> float:
+    return float(np.linalg.norm(one.position_m - other.position_m))
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:

@@ -497,7 +497,7 @@ class Fusion:
         others = self._others(found, middle_ns, sounds)
         update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns, others)
         trusted = [*([] if status is Status.REFUSED else [estimate]), *others]
-        tracks: list[Track] = self._tracker.step(middle_ns, trusted)
+        tracks: list[Track] = self._tracker.step(middle_ns, trusted, probable=found.signs is not None)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
