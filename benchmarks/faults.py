@@ -30,7 +30,7 @@ from fuzz import fuzz, lines_missed
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
-from soak import GROWTH, Sample, soak
+from soak import GROWTH, REFERENCE_HOURS, Sample, soak
 
 DEATH_SOUNDS = 30
 FUZZED_AT_A_TIME = 100_000
@@ -106,6 +106,19 @@ def links_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
         cable.narrow(100_000)
 
 
+def cable_pulled_then_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
+    """A cable out for up to 30 s, and a third of the bandwidth that sound needs when it is in again; four times."""
+    for k in range(4):
+        cable = site.cables[rng.choice(list(NODES))]
+        site.sleep_until(10.0 + k * end_s / 4)
+        cable.narrow(100_000)
+        cable.pull()
+        site.sleep_until(10.0 + k * end_s / 4 + rng.uniform(1.0, 30.0))
+        cable.narrow(700)
+        cable.plug()
+    site.sleep_until(end_s)
+
+
 def stopped(site: Playing, rng: random.Random, end_s: float) -> None:
     """Server and nodes with SIGSTOP for up to 5 s, 30 times, and torn connections."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(30)):
@@ -125,10 +138,11 @@ PROCESSES = {
     "processes stopped, connections torn": stopped,
     "cables loose and pulled": cables_pulled,
     "links narrow": links_narrow,
+    "cable pulled, then narrow": cable_pulled_then_narrow,
 }
 
 
-CABLED = {"cables loose and pulled", "links narrow"}
+CABLED = {"cables loose and pulled", "links narrow", "cable pulled, then narrow"}
 """Those with nodes in network namespaces instead of behind proxies."""
 
 
@@ -254,6 +268,8 @@ def main() -> int:
         deaths(arguments.out, arguments.fault or list(DEATHS))
         return 0
     if arguments.campaign == "soak":
+        if arguments.hours <= REFERENCE_HOURS:
+            parser.error(f"--hours: expected more than {REFERENCE_HOURS:g}, for the end is held against that hour")
         return soaked(arguments.hours, arguments.seed)
     if arguments.campaign == "wire":
         return damaged(arguments.count)

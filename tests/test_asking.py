@@ -52,11 +52,12 @@ def recorded(array: str) -> Any:
     return render(weaker, site().array(array).microphones_m, seed=3 + len(array))
 
 
-def parts(start_ns: int = START_NS, ahead_ns: int = 0) -> list[Part]:
-    """North hears the scene well; south, whose clock may be ahead, faintly."""
+def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[Part]:
+    """North hears the scene, so many times, well; south, whose clock may be ahead, faintly."""
     begin = {"north": start_ns, "south": start_ns + ahead_ns}
+    heard = {name: np.tile(recorded(name), (1, times)) for name in begin}
     return [
-        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), recorded(name)), begin[name]), (1, 2, 3, 4))
+        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard[name]), begin[name]), (1, 2, 3, 4))
         for name in begin
     ]
 
@@ -238,11 +239,18 @@ def test_frames_that_nobody_asked_for_change_nothing() -> None:
     assert fusion.status(START_NS)[1].counters["frames"] == 0
 
 
-def test_a_session_played_to_a_server_gives_the_same_answers() -> None:
-    expected = offline()
+@pytest.mark.parametrize("speed", [4.0, None])
+def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None) -> None:
+    """At four times real time, and as fast as it goes: longer than what a node remembers, or it could not forget."""
+    times = 1 if speed else 4
+    played = parts(times=times)
+    assert speed or played[0].placed.recording.duration_s > 2 * RECENT_S
+    outputs = replay.run(site(), played, UnpacedClock())
+    expected = [output for output in outputs if isinstance(output, Event)]
+    assert [event.estimate and event.estimate.arrays for event in expected] == [("north", "south")] * SOUNDS * times
     with running_server(site_of({**NODES, "server.bind": "tcp://127.0.0.1:*"})) as server:
-        pace = PacedClock(START_NS, 4.0)
-        send_session(site(), server.engine.endpoint, parts(), pace, SystemClock(), "run-1", lambda: False)
+        pace = PacedClock(START_NS, speed) if speed else UnpacedClock(START_NS)
+        send_session(site(), server.engine.endpoint, played, pace, SystemClock(), "run-1", lambda: False)
         server.engine.wait_idle()
         with urllib.request.urlopen(f"{server.url}/api/v1/events") as answer:
             found = json.load(answer)["events"][::-1]
@@ -251,3 +259,30 @@ def test_a_session_played_to_a_server_gives_the_same_answers() -> None:
         assert other.estimate is not None
         assert event["arrays"] == ["north", "south"]
         np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)
+
+
+def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> None:
+    """A node stood still: its sound comes after the live event has asked it, and before it answers."""
+    loud = [
+        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        for part in parts()
+    ]
+    settling = Settling(site().make_fusion(live=True), ("north", "south"))
+    for name in ("north", "south"):
+        settling.greet(name, None, START_NS, answers=True)
+    held: list[Message] | None = []
+    asked = False
+    told: list[Output | Settled] = []
+    for now_ns, batch in played_messages(*lines_of(site(), loud), UnpacedClock()):
+        if held is not None:
+            held += [message for message in batch if message.array == "south"]
+            batch = [message for message in batch if message.array == "north"]
+            if asked:
+                batch, held = [*batch, *held], None
+        new = settling.step(batch, now_ns)
+        asked = asked or any(isinstance(output, Ask) for output in new)
+        told += [output for output in new if isinstance(output, Event | Settled)]
+    assert asked
+    assert isinstance(told[0], Settled)
+    assert [event.heard_by for event in settled(told)] == [("north", "south")] * SOUNDS
+    assert not [output for output in told if isinstance(output, Event)]

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from livessl import wire
-from livessl.capture.link import BACKLOG_FRAMES, SILENT_NS, Link
+from livessl.capture.link import BACKLOG_FRAMES, BEHIND_NS, SILENT_NS, Dealer, Link
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
 from livessl.core.types import Ask, Frame, Mark, Message
@@ -221,6 +221,56 @@ def test_only_the_newest_mark_waits_for_the_server() -> None:
             # marks are not sent again: they say how things were
             router.ack(north=101, south=100)
             together(link, router, lambda: link.pending == 0, "the acknowledgement")
+
+
+class Narrow(Dealer):
+    """A connection that takes nothing while it is full."""
+
+    def __init__(self) -> None:
+        self.full = False
+        self.sent: list[wire.WireMessage] = []
+        self.coming: list[bytes] = []
+
+    def broken(self) -> bool:
+        return False
+
+    def send(self, data: bytes) -> bool:
+        if not self.full:
+            self.sent.append(wire.decode(data))
+        return not self.full
+
+    def receive(self) -> bytes | None:
+        return self.coming.pop(0) if self.coming else None
+
+    def close(self, linger_ms: int) -> None:
+        self.full = True
+
+
+def test_a_mark_that_frames_follow_is_not_sent_after_them() -> None:
+    """It says how many frames were before it. The server would miss those that it does not know of yet, and ask."""
+    clock, dealer = HandClock(), Narrow()
+    link = Link("", HELLO, clock, dealer=dealer)
+    for _ in range(2):
+        link.service()
+        dealer.coming.append(wire.encode(wire.Ack("run-1", {})))
+    link.service()
+    dealer.full = True
+    link.send([mark(1), frame(2), mark(2, array="south")])
+    for _ in range(6):
+        clock.time_ns += BEHIND_NS // 5
+        dealer.coming.append(wire.encode(wire.Ack("run-1", {})))
+        link.service()
+    dealer.full = False
+    link.service()
+    [hello, quiet, sound, _] = dealer.sent[-4:]
+    assert isinstance(hello, wire.Hello)
+    assert hello.backlog == {"north": (FIRST_RASTER + 2, FIRST_RASTER + 3)}
+    assert isinstance(quiet, Mark)
+    assert quiet.array == "south"
+    assert isinstance(sound, Frame)
+    assert sound.sequence == 2
+    assert not [m for m in dealer.sent if isinstance(m, Mark) and m.array == "north"]
+    link.close(bye=False)
 
 
 def test_spool_is_bounded_and_counts_what_it_drops() -> None:

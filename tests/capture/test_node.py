@@ -16,7 +16,15 @@ import pytest
 from livessl import wire
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.link import Link
-from livessl.capture.node import MAX_PENDING, UndeliveredError, capture_device, capture_recordings, send_session
+from livessl.capture.node import (
+    AHEAD_NS,
+    MAX_PENDING,
+    STUCK_NS,
+    UndeliveredError,
+    capture_device,
+    capture_recordings,
+    send_session,
+)
 from livessl.capture.recorded import Part
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.config import Site
@@ -28,6 +36,18 @@ START_NS = 1_767_225_600_000_000_000
 FIRST = START_NS // FRAME_NS
 ARRAYS = ("north", "south")
 CLOCK = SystemClock()
+
+
+class PatientClock(SystemClock):
+    """A node by this clock never takes the server for gone.
+
+    By another it does where the machine stands still for two seconds, and sends again what the server has: frames come
+    twice then, and rightly.
+    """
+
+    def monotonic_ns(self) -> int:
+        """No interval passes."""
+        return 0
 
 
 @dataclass
@@ -79,7 +99,7 @@ def never() -> bool:
 
 def replay(there: There, played: list[Part], progress: Callable[[int], None] | None = None) -> None:
     pace = UnpacedClock(START_NS)
-    send_session(there.site, there.receiver.endpoint, played, pace, CLOCK, "run-1", never, progress)
+    send_session(there.site, there.receiver.endpoint, played, pace, PatientClock(), "run-1", never, progress)
 
 
 def assert_whole(there: There, first: int = FIRST) -> None:
@@ -109,7 +129,7 @@ def test_session_waits_for_a_server_that_comes_later() -> None:
         site = site_of({"server.bind": there.receiver.endpoint})
     played = Thread(
         target=send_session,
-        args=(site, site.server.bind, parts(), UnpacedClock(START_NS), CLOCK, "run-1", never),
+        args=(site, site.server.bind, parts(), UnpacedClock(START_NS), PatientClock(), "run-1", never),
     )
     played.start()
     receiver = Receiver(site, CLOCK)
@@ -145,11 +165,44 @@ def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
             assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
 
 
+class Stuck(SystemClock):
+    """Time that passes while nothing is sent: a tenth of a second whenever somebody waits."""
+
+    def __init__(self) -> None:
+        self.waited_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return self.waited_ns
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        self.waited_ns += 100_000_000
+        return super().sleep_until_ns(time_ns)
+
+
+def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
+    """Nor ended before: the server may ask for what is remembered. But where it settles nothing it goes on."""
+    clock, reached = Stuck(), dict[int, int]()
+    with server() as there:
+        there.receiver.ingest.settled = dict.fromkeys(ARRAYS, FIRST + 20)
+
+        def note(end_ns: int) -> None:
+            reached[clock.waited_ns] = end_ns - START_NS
+            there.of(Left)  # take what has come
+
+        played = parts(samples=hiss(15.0, level=1e-3))
+        pace = UnpacedClock(START_NS)
+        send_session(there.site, there.receiver.endpoint, played, pace, clock, "run-1", never, note)
+    before, *_, after = (reached[waited_ns] for waited_ns in sorted(reached))
+    assert AHEAD_NS <= before - 20 * FRAME_NS < AHEAD_NS + FRAME_NS
+    assert STUCK_NS <= clock.waited_ns < STUCK_NS + 500_000_000
+    assert after == 15_000_000_000
+
+
 def test_recordings_arrive_whole() -> None:
     """At real speed; they began a little ago, so that there is nothing to wait for."""
     with server() as there:
         first = CLOCK.now_ns() // FRAME_NS - 30
-        capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), CLOCK, "run-1", never)
+        capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), PatientClock(), "run-1", never)
         wait_until(lambda: there.of(Left), "the good-bye")
         assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
         for array in ARRAYS:

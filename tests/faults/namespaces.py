@@ -6,6 +6,7 @@ import os
 import random
 import subprocess
 import time
+from ipaddress import IPv4Address
 from types import TracebackType
 from typing import Final, Self
 
@@ -13,23 +14,26 @@ from typing import Final, Self
 class Cable:
     """From the host to a network namespace; made with the context, and gone with it.
 
+    `host` is this end's address, as the other end sees it.
+
     Parameters
     ----------
     number : int
-        0 to 255: a cable's own network.
+        0 to 7: each cable of a process has a network of its own, of those that are set apart for tests (RFC 2544).
     """
 
     def __init__(self, number: int) -> None:
         self._namespace = f"livessl-{os.getpid()}-{number}"
         self._here, self._there = (f"lv{os.getpid() % 1_000_000}{end}{number}" for end in "ht")
-        self._network = f"10.213.{number}"
+        network = IPv4Address("198.18.0.0") + 4 * ((8 * os.getpid() + number) % 2**15)
+        self.host, self._node = str(network + 1), str(network + 2)
 
     def __enter__(self) -> Self:
         _ip("netns", "add", self._namespace)
         try:
             _ip("link", "add", self._here, "type", "veth", "peer", "name", self._there, "netns", self._namespace)
             _ip("address", "add", f"{self.host}/30", "dev", self._here)
-            _ip("-n", self._namespace, "address", "add", f"{self._network}.2/30", "dev", self._there)
+            _ip("-n", self._namespace, "address", "add", f"{self._node}/30", "dev", self._there)
             _ip("-n", self._namespace, "link", "set", self._there, "up")
             self.plug()
         except OSError:
@@ -42,11 +46,6 @@ class Cable:
     ) -> None:
         _ip("link", "delete", self._here)  # the namespace goes in its own time, and the next cable may come before
         _ip("netns", "delete", self._namespace)
-
-    @property
-    def host(self) -> str:
-        """The host's address, as the other end sees it."""
-        return f"{self._network}.1"
 
     @property
     def inside(self) -> list[str]:
@@ -79,7 +78,7 @@ class Cable:
 def why_not() -> str | None:
     """Why namespaces are not to be had here; None where they are."""
     try:
-        with Cable(255):
+        with Cable(7):
             return None
     except OSError as error:
         return str(error)

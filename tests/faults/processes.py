@@ -210,17 +210,14 @@ class Playing:
         return time.time() - self.start_ns / 1e9
 
     def is_settled(self) -> bool:
-        """Whether both nodes are well again, and all that they had kept has been taken in."""
+        """Whether both nodes are well again, and all that they had kept has come: late, again or out of order."""
         before = self.get("arrays")
         time.sleep(3.0)
         after = self.get("arrays")
         if before is None or after is None:
             return False
-        taken = [
-            [array["counters"]["frames"] + array["counters"]["backfilled"] for array in both["arrays"]]
-            for both in (before, after)
-        ]
-        return {array["state"] for array in after["arrays"]} == {"healthy"} and taken[0] == taken[1]
+        counted = [[array["counters"] | {"marks": 0} for array in both["arrays"]] for both in (before, after)]
+        return {array["state"] for array in after["arrays"]} == {"healthy"} and counted[0] == counted[1]
 
     def events(self) -> list[Event]:
         """What is stored, oldest first, whether or not a server runs; `at_s` counts from the recordings' start."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 
 from world import Event, World
@@ -51,6 +52,20 @@ def links_narrow(world: World) -> None:
     while world.raster < world.end:
         world.bytes_per_tick = world.rng.choice([40, 80, 150, 300, 600])
         world.run(world.rng.choice([20, 100, 400, 800]))
+
+
+def cut_then_narrow(world: World) -> None:
+    """What was kept while a link was cut has to follow over one that hardly carries what is heard."""
+    while world.raster < world.end:
+        world.bytes_per_tick = inf
+        world.run(world.rng.randint(1, 60))
+        names = world.rng.choice([["a"], ["b"], ["a", "b"]])
+        world.cut.update(names)
+        world.run(world.rng.choice([5, 20, 45, 60, 120, 300]))
+        world.bytes_per_tick = world.rng.choice([40, 80, 150, 300, 600])
+        for name in names:
+            world.heal(name)
+        world.run(world.rng.choice([20, 60, 100, 200, 400]))
 
 
 def nodes_stopped(world: World) -> None:
@@ -119,6 +134,7 @@ HARMLESS: dict[str, Fault] = {
     "connections reset": connections_reset,
     "stalls": stalls,
     "links narrow": links_narrow,
+    "links cut, then narrow": cut_then_narrow,
     "nodes stopped": nodes_stopped,
     "disk full": disk_full,
     "everything": everything,

@@ -70,6 +70,9 @@ PLACES = {
 GROWTH = 0.05
 """Of the memory after the first hour, at most."""
 
+REFERENCE_HOURS = 1.0
+"""After so long everything has been used."""
+
 AT_REST = 200
 """Frames that nodes keep at most while nobody is away: of the sound that goes on, and those on their way."""
 
@@ -518,7 +521,7 @@ class Outcome:
 def soak(
     directory: Path,
     hours: float,
-    reference_hours: float = 1.0,
+    reference_hours: float = REFERENCE_HOURS,
     seed: int = 0,
     sample_s: float = 600.0,
     tell: Tell = lambda sample: None,

@@ -85,6 +85,26 @@ def test_cables_pulled(recordings: Path, undisturbed: list[Event], tmp_path: Pat
     assert events[2]["late"]
 
 
+def test_cable_pulled_and_then_narrow(recordings: Path, undisturbed: list[Event], tmp_path: Path) -> None:
+    """A third of the bandwidth that sound needs: what was kept is on its way for long after the last sound."""
+    reason = why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+
+    def pulls(site: Playing, rng: random.Random, end_s: float) -> None:
+        site.sleep_until(undisturbed[0]["at_s"] + 0.5)
+        site.cables["a"].pull()
+        site.sleep_until(undisturbed[1]["at_s"] + 1.0)
+        for cable in site.cables.values():
+            cable.narrow(700)
+        site.cables["a"].plug()
+        site.sleep_until(end_s)
+
+    events = play(recordings, tmp_path, pulls, cabled=True)
+    assert_same(events, undisturbed)
+    assert events[1]["late"]
+
+
 def array_state(site: Playing, name: str) -> dict[str, Any]:
     answer = site.get("arrays")
     found: dict[str, Any] = next((a for a in answer["arrays"] if a["name"] == name), {}) if answer else {}

@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from scenarios import HARMLESS, difference, nodes_killed, undisturbed
+from scenarios import HARMLESS, difference, links_narrow, nodes_killed, undisturbed
 from world import Event, World
 
 SEEDS = range(4)
@@ -56,6 +56,17 @@ def test_lost_frame_would_be_seen() -> None:
         world.heal("a")
 
     assert difference(0, forgets, expected(0)) is not None
+
+
+def test_a_narrow_link_carries_nothing_twice() -> None:
+    """Where nothing breaks nothing is lost: the server misses no frame, and gets none again."""
+    world = World(1)
+    links_narrow(world)
+    world.recover()
+    assert world.server is not None
+    arrays = world.server.arrays()
+    assert sum(array["counters"]["backfilled"] for array in arrays) > 200
+    assert [array["counters"][what] for array in arrays for what in ("sequence_gaps", "duplicates")] == [0] * 4
 
 
 def test_late_events_are_marked_and_name_what_they_replace() -> None:

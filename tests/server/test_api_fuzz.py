@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
@@ -57,3 +58,14 @@ def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:
             case.call_and_validate(headers=headers, excluded_checks=TOO_STRICT)
 
         answers_as_described()
+
+
+def test_a_body_that_is_no_text_is_refused_as_described(api: Any, headers: dict[str, str]) -> None:
+    path = "/api/v1/arrays/{name}/enabled"
+    answer = httpx.put(
+        api.location.replace("/api/v1/openapi.json", path.format(name="north")),
+        headers={**headers, "Content-Type": "application/json"},
+        content=b"\x11\xff",
+    )
+    assert answer.status_code == 400
+    assert "400" in api.raw_schema["paths"][path]["put"]["responses"]

@@ -122,35 +122,49 @@ def test_what_is_sent_cannot_be_read_on_the_way(folder: Path) -> None:
             assert plain not in said
 
 
-def pretenders(folder: Path) -> dict[str, tuple[NodeKeys | None, str]]:
-    """Everyone who is not enrolled, and the reason that is counted."""
+NOT_ENROLLED = "its key is not enrolled"
+WITHOUT_KEYS = "without keys, or with another server's"
+BROKE_OFF = "broke off the handshake"
+
+
+def pretenders(folder: Path) -> dict[str, tuple[NodeKeys | None, set[str]]]:
+    """Everyone who is not enrolled, and the reasons one of which is counted."""
     good = keys_of(folder, "lab-pc")
     other = KeyPair(*(z85.decode(half) for half in zmq.curve_keypair()))
     return {
-        "not enrolled": (keys_of(folder, "stranger"), "its key is not enrolled"),
-        "a new pair": (replace(good, own=other), "its key is not enrolled"),
-        "no keys": (None, "without keys, or with another server's"),
-        "wrong server": (replace(good, server=other.public), "without keys, or with another server's"),
-        "half a pair": (
-            replace(good, own=KeyPair(good.own.public, other.secret)),
-            "without keys, or with another server's",
-        ),
+        "not enrolled": (keys_of(folder, "stranger"), {NOT_ENROLLED}),
+        "a new pair": (replace(good, own=other), {NOT_ENROLLED}),
+        "no keys": (None, {WITHOUT_KEYS, BROKE_OFF}),  # whoever reads the other's greeting first hangs up
+        "wrong server": (replace(good, server=other.public), {WITHOUT_KEYS}),
+        "half a pair": (replace(good, own=KeyPair(good.own.public, other.secret)), {WITHOUT_KEYS}),
     }
 
 
 @pytest.mark.parametrize("who", ["not enrolled", "a new pair", "no keys", "wrong server", "half a pair"])
 def test_pretender_is_not_heard(folder: Path, who: str, caplog: pytest.LogCaptureFixture) -> None:
-    held, reason = pretenders(folder)[who]
+    held, reasons = pretenders(folder)[who]
     with receiving(folder) as receiver, caplog.at_level(logging.WARNING):
         with linked(receiver.endpoint, held) as link:
             link.send([frame(k) for k in range(1, 20)])
-            until(link, lambda: ("nodes", reason) in receiver.refusals.counts(), "the refusal")
+            until(link, receiver.refusals.counts, "the refusal")
             assert not link.connected
-        assert receiver.refusals.counts().keys() == {("nodes", reason)}
+        [(door, reason)] = receiver.refusals.counts()
+        assert door == "nodes"
+        assert reason in reasons
         assert taken(receiver) == []
         assert receiver.ingest.live_nodes(CLOCK.monotonic_ns()) == []
         assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
     assert len([r for r in caplog.records if f"was refused: {reason}" in r.getMessage()]) == 1
+
+
+@pytest.mark.parametrize(("stays", "reason"), [(True, WITHOUT_KEYS), (False, BROKE_OFF)])
+def test_whoever_hangs_up_first_without_keys_is_told_apart(folder: Path, *, stays: bool, reason: str) -> None:
+    """The greeting of ZMTP 3.1 whose mechanism is NULL, as of a node without keys: whole, or only begun."""
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+    with receiving(folder) as receiver:
+        say(receiver, greeting if stays else greeting[:11], wait_s=10.0 if stays else 0.2)
+        wait_until(receiver.refusals.counts, "the refusal")
+        assert receiver.refusals.counts() == {("nodes", reason): 1}
 
 
 @pytest.mark.parametrize(

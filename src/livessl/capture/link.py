@@ -174,6 +174,7 @@ class Link:
         self._answers: deque[Message] = deque(maxlen=MOST_ANSWERS)
         self._live_sent: deque[Kept] = deque()
         self._received: dict[str, int] = {}
+        self._settled: int | None = None
         self._backlog_ns = 0
         self._heard_ns = self._hello_ns = self._sent_ns = -SILENT_NS
         self._greeted = self._missed = self._owes_hello = False
@@ -195,6 +196,11 @@ class Link:
         """Messages that the server has not got yet."""
         sent = len(self._live_sent) + len(self._backlog_sent)
         return len(self._live) + len(self._marks) + len(self._backlog) + sent
+
+    @property
+    def settled(self) -> int | None:
+        """Before this raster interval the server needs nothing more, by its last word; None where it has not said."""
+        return self._settled
 
     @property
     def kept(self) -> int:
@@ -356,7 +362,7 @@ class Link:
             return
         self._heard_ns = self._clock.monotonic_ns()
         self._complaint = None
-        self._received = ack.received
+        self._received, self._settled = ack.received, ack.settled
         for array, received in ack.received.items():
             if ack.settled is not None:
                 self._spool.forget(array, min(ack.settled, received + 1))
@@ -441,5 +447,11 @@ def _spans(frames: Iterable[Kept]) -> dict[str, tuple[int, int]]:
 
 
 def _newest_marks(waiting: Iterable[tuple[int, Kept | Mark]]) -> dict[str, Mark]:
-    """Of each array the last mark among messages that wait."""
-    return {message.array: message for _, message in waiting if isinstance(message, Mark)}
+    """Of each array that falls silent in the end the last mark: a frame after a mark says that things have changed."""
+    newest: dict[str, Mark] = {}
+    for _, message in waiting:
+        if isinstance(message, Mark):
+            newest[message.array] = message
+        else:
+            newest.pop(message.array, None)
+    return newest

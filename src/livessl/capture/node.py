@@ -14,7 +14,8 @@ from livessl.capture.recorded import Part, lines_of
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.config import NodeConfig, Site
-from livessl.core.types import Ask, Message
+from livessl.core.segmenter import RECENT_S
+from livessl.core.types import FRAME_NS, Ask, Message
 from livessl.errors import RunError
 from livessl.keys import node_keys
 
@@ -25,6 +26,15 @@ WAIT_NS: Final = 20_000_000
 
 MAX_PENDING: Final = 400
 """A replay faster than real time waits while so many messages are on their way."""
+
+AHEAD_NS: Final = round((RECENT_S - 4.0) * 1e9)
+"""Recorded time by which such a replay is ahead of its server at most: what is asked for is then remembered yet."""
+
+END_NS: Final = 1_000_000_000
+"""More than the run-up to a next sound, which is never settled: when only so much is left all sounds have been told."""
+
+STUCK_NS: Final = 1_000_000_000
+"""It goes on all the same where nothing has been settled for so long: one array is silent, or a sound does not end."""
 
 _log = logging.getLogger(__name__)
 
@@ -108,12 +118,34 @@ def send_session(
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
         raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
+    lead = _Lead(link, clock)
+    end_ns = 0
     for end_ns in _sent(link, lines, placed, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
-        while link.pending > MAX_PENDING and not (stop() or link.refused):
+        while (link.pending > MAX_PENDING or lead.exceeds(AHEAD_NS, end_ns)) and not (stop() or link.refused):
             _pause(link, clock)
+    while lead.exceeds(END_NS, end_ns) and not (stop() or link.refused):  # it may ask about the last sounds yet
+        _pause(link, clock)
     _finish(link, clock, stop)
+
+
+class _Lead:
+    """How far a replay is ahead of its server, in recorded time."""
+
+    def __init__(self, link: Link, clock: Clock) -> None:
+        self._link = link
+        self._clock = clock
+        self._settled = link.settled
+        self._since_ns = clock.monotonic_ns()
+
+    def exceeds(self, most_ns: int, end_ns: int) -> bool:
+        """Whether the server has more than `most_ns` before `end_ns` to settle yet, and is getting on with it."""
+        if self._link.settled != self._settled:
+            self._settled, self._since_ns = self._link.settled, self._clock.monotonic_ns()
+        if self._settled is None or end_ns - self._settled * FRAME_NS <= most_ns:
+            return False
+        return self._clock.monotonic_ns() - self._since_ns < STUCK_NS
 
 
 def _spool(site: Site, name: str) -> Spool:

@@ -528,9 +528,13 @@ class Fusion:
             self._heard_until += onward
             self._next = max(self._next, self._heard_until)
 
+    def _is_left_out(self, event: _OpenEvent) -> bool:
+        """Whether another fusion tells of it, by now."""
+        return event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until)
+
     def _told(self, event: _OpenEvent) -> list[Output]:
         """What those that heard an event say of it; nothing where another fusion tells it."""
-        if event.last_active < self._told_until or (event.ended and event.closed <= self._closing_until):
+        if self._is_left_out(event):
             return []
         heard = event.heard = self._heard(event)
         if not heard.sounds:
@@ -674,6 +678,8 @@ class Fusion:
 
     def _reconsidered(self, event: _OpenEvent, told: list[Output]) -> list[Output]:
         """The answer with those that were asked, where it is better with all or one of them."""
+        if self._is_left_out(event):
+            return []  # it has been told meanwhile
         best: list[Event] = [output for output in told if isinstance(output, Event)]
         if not best or event.heard is None:
             return told

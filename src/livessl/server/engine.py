@@ -313,6 +313,7 @@ class Engine:
                 self._begin(hello.arrays, None)
             else:
                 self._begin_live()
+            self._receiver.ingest.settled = self._settling.settled_of  # not what was settled of another time
             self._replay_now_ns = 0 if hello.replay else None
             self._replaying = hello.replay
             self._replay_heard_ns = self._clock.monotonic_ns()

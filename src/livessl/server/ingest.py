@@ -15,7 +15,7 @@ ACK_NS: Final = 250_000_000
 """Every node hears from us at least this often."""
 
 SOON_NS: Final = 20_000_000
-"""A node that sends what it has kept hears from us this often: it sends a few frames ahead of our word for them."""
+"""A node that sends what it has kept, or a recording, hears from us this often: it runs a little ahead of our word."""
 
 GONE_NS: Final = 2_000_000_000
 """A node silent for so long no longer holds its name and its arrays."""
@@ -179,7 +179,8 @@ class Ingest:
         }
         due = []
         for peer in self._peers.values():
-            if now_ns - peer.acked_ns >= (SOON_NS if soon and peer.hello.backlog else ACK_NS):
+            waits = peer.hello.replay or (soon and peer.hello.backlog)
+            if now_ns - peer.acked_ns >= (SOON_NS if waits else ACK_NS):
                 peer.acked_ns = now_ns
                 due.append((peer.routing_id, self._ack(peer)))
         return due

@@ -212,7 +212,11 @@ def _add_switch_route(app: FastAPI, site: Site, engine: Engine) -> None:
     @app.put(
         "/api/v1/arrays/{name}/enabled",
         tags=["state"],
-        responses={404: {"description": "no such array"}, 503: {"description": "the event database takes nothing"}},
+        responses={
+            400: {"description": "the body is no text"},
+            404: {"description": "no such array"},
+            503: {"description": "the event database takes nothing"},
+        },
     )
     def put_enabled(name: str, switch: Switch, request: Request) -> JsonObject:
         """Disable an array that does harm, or enable it again; for operators."""
