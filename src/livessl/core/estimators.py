@@ -39,7 +39,7 @@ class Sound:
     @property
     def clarity(self) -> float:
         """How much there is in it of onsets."""
-        return sum(onset.weight for onset in self.onsets)
+        return float(np.mean([onset.levels for onset in self.onsets])) * len(self.onsets) if self.onsets else 0.0
 
     def live(self, gcc: GCC) -> GCC:
         """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""

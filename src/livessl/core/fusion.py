@@ -49,10 +49,11 @@ LATEST_NS: Final = 500_000_000
 """Frames this far from the server's time come from a clock that is wrong: sound is never ahead of its time by more than
 two clocks that NTP keeps can differ, and what is older a node's buffer cannot hold."""
 
-_SOME: Final = 64
-
 JUMP_FRAMES: Final = 1200
 """A gap of a minute is skipped, not walked through."""
+
+_SOME: Final = 64
+"""One sample in so many of a channel tells nearly always that it is not all zeros."""
 
 WEAK_FRAMES: Final = 4
 """One active frame in so many is looked at for microphones that hear nothing: they are told of after a second."""
