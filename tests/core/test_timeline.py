@@ -216,6 +216,24 @@ def test_step_of_the_clock_is_seen_after_some_blocks(step_ns: int) -> None:
     assert cuts_after[0].samples[0, 0] - before[-1].samples[0, -1] <= 3 * 800
 
 
+def test_leap_second_smeared_over_a_day_is_no_step() -> None:
+    """The system's clock runs 11.6 ppm slow for a day, from some moment on: five minutes before it and ten after."""
+    slow = 1.0 / 86_400.0
+    begins = round(300.0 * RATE_HZ)
+    framer = Framer(RATE_HZ)
+    smeared = stream(18_000, lambda index: ideal_ns(index) - round(max(0, index - begins) / RATE_HZ * slow * 1e9), 800)
+    cuts = cut_all(framer, smeared)
+    assert framer.timeline.steps == framer.lost_frames == 0
+    assert state_of(framer) is ClockState.LOCKED
+    assert_contiguous(cuts)
+    # after ten memories the line runs as slow as the clock does, up to the prior's share and what is left of before
+    assert framer.timeline.drift_ppm == pytest.approx(1e6 * slow, rel=0.1)
+    for cut in cuts:
+        index = int(cut.samples[0, 0])
+        right_ns = ideal_ns(index) - max(0, index - begins) / RATE_HZ * slow * 1e9
+        assert abs(cut.time_ns - right_ns) < 700_000  # of 6.9 ms: 11.6 ppm for a memory of a minute
+
+
 def test_late_callbacks_are_no_step() -> None:
     framer = Framer(RATE_HZ)
     late = {100 * 480, 150 * 480, 151 * 480}
