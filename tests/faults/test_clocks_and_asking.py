@@ -24,6 +24,7 @@ LOUD, FAINT = 4, 2
 AHEAD_S = 0.137
 WEAKER_DB = 39.0
 NEAR_M = 0.5
+SAME_M = 0.001
 
 
 def scene() -> Scene:
@@ -88,8 +89,9 @@ def test_a_clock_that_is_off_and_sounds_that_one_array_hears(tmp_path: Path) -> 
         assert math.dist(event["position_m"], source.position_m) < NEAR_M
         assert [contribution["asked"] for contribution in event["contributions"]] == [False, k >= LOUD]
         assert event["heard_by"] == (["north"] if k >= LOUD else ["north", "south"])
-        assert event["position_m"] == other["position_m"]
-        assert event["confidence"] == other["confidence"]
+        # live and offline the same sound is cut into frames at other samples
+        assert math.dist(event["position_m"], other["position_m"]) < SAME_M
+        assert event["confidence"] == pytest.approx(other["confidence"], abs=0.001)
         assert event["at_s"] == pytest.approx(other["start_s"], abs=1e-6)
     assert south["state"] == "degraded"
     assert "ahead of that of 'a'" in south["reason"]
