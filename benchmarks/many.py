@@ -19,13 +19,15 @@ import numpy as np
 from livessl.bench import load
 from livessl.config import Site, parse_site
 from livessl.core import estimators
-from livessl.core.estimators import ESTIMATORS, Estimator, Sound
-from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray
+from livessl.core.estimators import ESTIMATORS
+from livessl.core.types import FRAME_S, Float32Array, FloatArray
+from livessl.evaluate.localizer import heard
 from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
 
 RATE_HZ: Final = 16_000.0
 QUIET_S: Final = 0.5
 SOUND_S: Final = 1.0
+DURATION_S: Final = 2.0
 LEVEL_DBFS: Final = -15.0
 MOST: Final = (4, 8, 16, 32, 64)
 
@@ -33,9 +35,8 @@ MOST: Final = (4, 8, 16, 32, 64)
 def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed: int) -> dict[str, Float32Array]:
     """What every array hears of a voice, with white noise so far below the mean power of it over all arrays."""
     voice = dict(synthesised_sounds(RATE_HZ, seed=seed))["voice"][: round(SOUND_S * RATE_HZ)]
-    duration_s = QUIET_S + SOUND_S + 0.5
     source = Source("voice", QUIET_S, place_m, voice)
-    scene = Scene(site.room.size_m, rt60_s, site.c_m_s, RATE_HZ, (source,), duration_s, level_dbfs=LEVEL_DBFS)
+    scene = Scene(site.room.size_m, rt60_s, site.c_m_s, RATE_HZ, (source,), DURATION_S, level_dbfs=LEVEL_DBFS)
     clean = {spec.name: render(scene, spec.microphones_m, seed=seed) for spec in site.specs}
     begin = round(QUIET_S * RATE_HZ)
     power = np.mean([np.square(samples[:, begin:]).mean() for samples in clean.values()])
@@ -47,30 +48,20 @@ def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed
     }
 
 
-def listened(estimator: Estimator, spec: ArraySpec, samples: Float32Array) -> Sound:
-    """What one array's listener makes of it."""
-    frame, begin = round(FRAME_S * RATE_HZ), round(QUIET_S * RATE_HZ)
-    listener = estimator.listener(spec.name, RATE_HZ)
-    if listener is None:
-        raise SystemExit("the estimator listens to nothing")
-    firsts = range(0, samples.shape[1] - frame + 1, frame)
-    onsets = [listener.push(samples[:, first : first + frame], quiet=first < begin) for first in firsts]
-    return Sound((samples[:, begin:],), RATE_HZ, onsets)
-
-
 def compare(arrays: int, sounds: int, rt60_s: float, snr_db: float, most: Sequence[int]) -> dict[int, FloatArray]:
     """By how many arrays may have a part: error in metres and time in seconds of every sound's answer, (sounds, 2)."""
     site = parse_site(load.site_text(arrays, 0.1, "tcp://127.0.0.1:5570", 8000))
     estimator = ESTIMATORS["onset"](site.specs, site.search_grid(), site.c_m_s)
     rng = np.random.default_rng(3)
     x, y, _ = site.room.size_m
+    active = np.arange(round(DURATION_S / FRAME_S)) >= round(QUIET_S / FRAME_S)
     rows: dict[int, list[tuple[float, float]]] = {count: [] for count in most}
     shipped = estimators.MOST_ARRAYS
     try:
         for number in range(sounds):
             place_m = rng.uniform((0.8, 0.8, 0.8), (x - 0.8, y - 0.8, 1.8))
             samples = heard_at(site, place_m, rt60_s, snr_db, seed=number)
-            told = {spec.name: listened(estimator, spec, samples[spec.name]) for spec in site.specs}
+            told = {spec.name: heard(estimator, spec, samples[spec.name], active, RATE_HZ) for spec in site.specs}
             for count in most:
                 estimators.MOST_ARRAYS = count  # type: ignore[misc]
                 estimator.locate(told)

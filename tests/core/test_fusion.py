@@ -722,7 +722,6 @@ class Listening(Scripted):
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         onsets = summed(sounds["north"].onsets)
-        assert onsets is not None
         self.sums.append((float(onsets.lags.sum()), onsets.weight))
         return replace(super().locate(sounds), refused=self.refused)
 

@@ -71,6 +71,10 @@ class Place:
         each = (standing(heard, array_power(heard, term)) for heard, term in zip(self.evidence, terms, strict=True))
         return min(each) >= 1.0
 
+    def apart_m(self, other: Place) -> float:
+        """How far it is from another."""
+        return float(np.linalg.norm(self.position_m - other.position_m))
+
 
 @dataclass(frozen=True, slots=True)
 class Agreed:
@@ -138,7 +142,7 @@ def agreed(
         if sum(lost.values()) - losses[best] <= MOST_LOST:
             break
         rivals = (
-            float(np.linalg.norm(other.position_m - places[best].position_m)) > NEAR_M
+            other.apart_m(places[best]) > NEAR_M
             for other, loss in zip(places, losses, strict=True)
             if loss - losses[best] < LEAST_LEAD
         )

@@ -355,14 +355,14 @@ class Onset(SrpPhat):
                 continue
             again, _ = self._beside(second, moments)
             second, confidence = self._beside(again, moments)
-            if confidence < several.LEAST_CONFIDENCE or not second.proven or _apart_m(again, second) < several.APART_M:
+            if confidence < several.LEAST_CONFIDENCE or not second.proven or again.apart_m(second) < several.APART_M:
                 continue
             if divided and not (again.is_heard_by_all and second.is_heard_by_all):
                 continue
             judged = _judged(second, self._grid)
             outvoted = {name: off for name, off in agreed.outvoted.items() if name not in {s.name for s in specs}}
             # a short sound hardly counts where another's moments were evened out, and may be surer as it was
-            firsts = [again] if divided or _apart_m(first, second) < several.APART_M else [again, agreed.place]
+            firsts = [again] if divided or first.apart_m(second) < several.APART_M else [again, agreed.place]
             return max(firsts, key=lambda place: _judged(place, self._grid).signs.confidence), Localization(
                 second.position_m,
                 judged.covariance_m2,
@@ -398,8 +398,9 @@ class Onset(SrpPhat):
         return agreement.Place(evidence, functional, position, power, rival_power, found[0].proven)
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
-        onsets = summed(sound.onsets)
-        if onsets is None:
+        if sound.onsets:
+            onsets = summed(sound.onsets)
+        else:
             onsets = self.listener(array, sound.sample_rate_hz).listen(sound.segments)
         sampling = self._sampling(array, sound.sample_rate_hz)
         spec = self._arrays[array]
@@ -447,10 +448,6 @@ def _judged(place: agreement.Place, grid: Grid, *, whole: bool = False) -> certa
     return certainty.judge(
         place.functional, place.evidence, place.position_m, place.power, place.rival_power, grid, whole=whole
     )
-
-
-def _apart_m(one: agreement.Place, other: agreement.Place) -> float:
-    return float(np.linalg.norm(one.position_m - other.position_m))
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:

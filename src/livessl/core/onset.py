@@ -89,10 +89,8 @@ class OnsetGCC:
         return np.asarray(np.maximum(heights, 1.0), dtype=np.float32)
 
 
-def summed(heard: Sequence[OnsetGCC]) -> OnsetGCC | None:
-    """All together; None for nothing."""
-    if not heard:
-        return None
+def summed(heard: Sequence[OnsetGCC]) -> OnsetGCC:
+    """All together, one at least."""
     lags, levels = heard[0].lags.copy(), heard[0].levels.copy()
     for one in heard[1:]:
         lags += one.lags

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 from typing import Final
 
 import numpy as np
 
 from livessl.core.gcc import LagSampling, microphone_pairs
-from livessl.core.onset import OnsetGCC
+from livessl.core.onset import OnsetGCC, summed
 from livessl.core.types import GCC, ArraySpec, BoolArray, Float32Array, FloatArray, HeardBy, IntArray
 
 APART_M: Final = 1.0
@@ -74,8 +72,8 @@ class Moments:
     def of(cls, spec: ArraySpec, sampling: LagSampling, frames: Sequence[OnsetGCC], live: BoolArray) -> Moments:
         """From what a listener made of an array's frames, no envelopes; pairs that are not `live` (P,) are silent."""
         size = -(-len(frames) // MOST_MOMENTS)
-        together = [reduce(add, frames[first : first + size]) for first in range(0, len(frames), size)]
-        whole = reduce(add, together)
+        together = [summed(frames[first : first + size]) for first in range(0, len(frames), size)]
+        whole = summed(together)
         even = live[:, None] * np.float32(whole.weight) / whole.heights(microphone_pairs(len(spec.microphones_m)))
         coarse = np.asarray(np.stack([one.lags for one in together]).real * even, dtype=np.float32)
         fine = sampling.fine(coarse.reshape(-1, coarse.shape[2])).reshape(*coarse.shape[:2], -1)
