@@ -20,7 +20,7 @@ from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.onset import OnsetFrontEnd
-from livessl.core.peaks import FindPeaks, Peak, box_around
+from livessl.core.peaks import FindPeaks, Peak, box_around, laplace_covariance_m2
 from livessl.core.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
 from livessl.core.types import (
     GCC,
@@ -280,6 +280,7 @@ def warm_up() -> None:
     search.among([heard])(2)
     ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
     ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
-    kernels.mean_square(heard.gcc.values, lags_s, np.zeros(1), 0.0)
     SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
-    SRPFunctional([heard], 343.0).value(np.zeros((1, 3)))
+    functional = SRPFunctional([heard], 343.0)
+    functional.value(np.zeros((1, 3)))
+    laplace_covariance_m2(functional, [heard], np.array([0.5, 0.5, 0.5]), grid)
