@@ -34,7 +34,7 @@ from livessl.config import (
     load_site,
     open_doors,
 )
-from livessl.core.types import FRAME_NS, Event
+from livessl.core.types import Event
 from livessl.errors import RunError, UseError
 
 if TYPE_CHECKING:
@@ -377,8 +377,7 @@ def _show_demo(arguments: argparse.Namespace) -> int:
         directory = Path(name)
         site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
         truth = demo.read_truth(directory)
-        start_ns = (clock.now_ns() + demo.LEAD_NS) // FRAME_NS * FRAME_NS
-        with demo.running(directory, site, start_ns, loop=not arguments.once, clock=clock) as url:
+        with demo.running(directory, site, loop=not arguments.once, clock=clock) as (url, start_ns):
             print(f"dashboard: {url}", file=sys.stderr)
             if not arguments.once and not arguments.no_browser:
                 threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

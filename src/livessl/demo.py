@@ -18,6 +18,7 @@ from websockets.sync.client import connect
 from livessl import processes
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.config import Site, load_site, parse_site
+from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
 from livessl.messages import JsonObject
 from livessl.simulate.export import TRUTH_FILE, write_scene
@@ -91,8 +92,10 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
 
 
 @contextmanager
-def running(directory: Path, site: Site, start_ns: int, *, loop: bool, clock: Clock) -> Iterator[str]:
-    """Server and nodes as processes while the context lasts; yields the dashboard's address.
+def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[tuple[str, int]]:
+    """Server and nodes as processes while the context lasts; yields the dashboard's address and the scene's start, ns.
+
+    The scene starts when the server is there: the first time on a machine that takes some seconds.
 
     Raises
     ------
@@ -105,11 +108,12 @@ def running(directory: Path, site: Site, start_ns: int, *, loop: bool, clock: Cl
     started = [processes.start("serve", *common)]
     try:
         processes.wait_until_ready(url, started, clock)
+        start_ns = (clock.now_ns() + LEAD_NS) // FRAME_NS * FRAME_NS
         for node in site.nodes:
             extra = ["--loop"] if loop else []
             at = utc_text(start_ns)
             started.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
-        yield url
+        yield url, start_ns
     finally:
         processes.end(started)
 
