@@ -17,7 +17,6 @@ import scipy.fft
 
 from livessl.core.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.frontends import Spectra
-from livessl.core.gcc import CrossSpectra
 from livessl.core.onset import _STRONGEST, OnsetFrontEnd, OnsetGCC
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
 from livessl.evaluate.campaign import read_clips
@@ -54,10 +53,7 @@ class Known:
         power, rest = (_power(part[:, :, here._band]) for part in (straight, whole - straight))
         rest += here._least
         weights = np.minimum(power**2 / (rest * (rest + 2.0 * power)), _STRONGEST).astype(np.float32)
-        spectra_of_all = Spectra(whole, here._n_fft)
-        cross = CrossSpectra(
-            spectra_of_all, here._pairs, here.sample_rate_hz, here._band_hz, weights, phases=here._wide
-        )
+        cross = here._cross(Spectra(whole, here._n_fft), weights, np.broadcast_to(here._noise, weights.shape))
         return OnsetGCC(here._sampling.sample(cross), cross.levels)
 
 

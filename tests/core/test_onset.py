@@ -189,7 +189,7 @@ def test_gains_of_microphones_do_not_matter() -> None:
     for sounds in (even, odd):
         onsets = sounds["north"].onsets[0]
         heights.append((onsets.lags / onsets.heights(pairs)).max(axis=1))
-    np.testing.assert_allclose(heights[1], heights[0], rtol=0.2)  # as they are they would differ by up to 17 times
+    np.testing.assert_allclose(heights[1], heights[0], rtol=0.3)  # as they are they would differ by up to 17 times
 
 
 def test_where_microphones_are_far_apart_each_counts_the_same() -> None:

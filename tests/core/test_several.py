@@ -9,10 +9,10 @@ import pytest
 from free_field import C_M_S, RATE_HZ, band_mean_cos, burst, heard, tetra, true_lags_s
 
 from livessl.core.estimators import Localization, Onset, Sound
-from livessl.core.gcc import LagSampling
+from livessl.core.gcc import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
-from livessl.core.several import Moments, confidence
-from livessl.core.types import FRAME_S, ArraySpec, FloatArray
+from livessl.core.several import Moments, clearness, confidence
+from livessl.core.types import FRAME_S, GCC, ArraySpec, FloatArray, HeardBy
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
 NORTH = tetra("north", [2.7, 4.4, 1.1])
@@ -121,9 +121,31 @@ def test_a_source_is_clear_where_it_is_and_in_the_moment_it_has() -> None:
 
 
 def test_two_arrays_must_hear_a_second_source_clearly() -> None:
-    assert confidence([2.5, 2.5]) == confidence([2.5, 0.0, 2.5, 1.0]) > 0.9
-    assert confidence([3.0, 0.0]) < 0.5
-    assert confidence([1.0, 1.0, 1.0, 1.0, 1.0]) < 0.1
+    assert confidence(clearness([2.5, 2.5])) == confidence(clearness([2.5, 0.0, 2.5, 1.0])) > 0.9
+    assert confidence(clearness([3.0, 0.0])) < 0.5
+    assert confidence(clearness([1.0, 1.0, 1.0, 1.0, 1.0])) < 0.1
+
+
+def test_of_places_that_stand_high_the_one_that_is_clear_in_a_moment_is_told(estimator: Onset) -> None:
+    """In eight moments the first, and somewhere else what reverberation leaves; in one the second."""
+    left_m, evidence, moments = np.array([1.9, 1.1, 2.2]), [], []
+    for spec in (NORTH, SOUTH):
+        axis_s = LagSampling.shared(spec.band_hz, RATE_HZ, spec.aperture_m / C_M_S).fine_lags_s
+        first, second, left = (
+            band_mean_cos(axis_s - true_lags_s(spec.microphones_m, at_m)[:, None], spec.band_hz)
+            for at_m in (ONE_M, OTHER_M, left_m)
+        )
+        values = np.stack([first + 0.25 * left] * 8 + [second]).astype(np.float32)
+        moments.append(Moments(spec, axis_s, values, np.full(9, 1e3)))
+        evidence.append(HeardBy(spec, GCC(microphone_pairs(4), axis_s, values.mean(axis=0))))
+        estimator.listener(spec.name, RATE_HZ)
+    place = estimator._place(evidence)
+    assert np.linalg.norm(place.position_m - ONE_M) < 0.1
+    rest = estimator._place([each.without(true_lags_s(each.spec.microphones_m, ONE_M)) for each in moments])
+    assert np.linalg.norm(rest.position_m - left_m) < 0.1  # it stands highest
+    other, confidence = estimator._beside(place, moments)
+    assert np.linalg.norm(other.position_m - OTHER_M) < 0.1
+    assert confidence > 0.9
 
 
 def test_nobody_asked_for_a_second(estimator: Onset) -> None:

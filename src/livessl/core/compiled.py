@@ -60,12 +60,13 @@ def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
 
 @_compiled
 def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    spectra, low, pairs, weights, phases, whitened, levels
+    spectra, low, pairs, weights, noise, whitened, levels
 ):
     """Whitened cross spectra, weighed and summed over frames, and the microphones' own sums."""
     microphones, bins = spectra.shape[1], whitened.shape[1]
     real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
-    power, over = np.empty((microphones, bins), np.float32), np.empty(bins, np.float32)
+    power = np.empty((microphones, bins), np.float32)
+    mean, share = np.empty(bins, np.float32), np.empty(bins, np.float32)
     own, summed = np.zeros((microphones, bins), np.float32), np.zeros((2, len(pairs), bins), np.float32)
     together = np.zeros(bins + 2, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -82,12 +83,13 @@ def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
                 together[b + 1] += square[b]
         together[0], together[bins + 1] = together[1], together[bins]
         for b in range(bins):
-            over[b] = one / np.sqrt((together[b] + together[b + 1] + together[b + 2]) / np.float32(3 * microphones))
+            mean[b] = (together[b] + together[b + 1] + together[b + 2]) / np.float32(3 * microphones)
+            share[b] = min(noise[t, b], mean[b]) / mean[b] if mean[b] > zero else zero
         for m in range(microphones):
             u, v, square, floor = real[m], imaginary[m], power[m], SILENT_POWER * power[m].max()
             for b in range(bins):
-                factor = one / np.sqrt(square[b]) if phases else over[b]
-                factor = factor if square[b] > floor else zero
+                over = square[b] + share[b] * (mean[b] - square[b])
+                factor = one / np.sqrt(over) if square[b] > floor else zero
                 u[b] *= factor
                 v[b] *= factor
                 own[m, b] += weight[b] * (u[b] * u[b] + v[b] * v[b])
@@ -106,7 +108,7 @@ def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def onset_weights(  # type: ignore[no-untyped-def]
-    spectra, low, quiet, heard, least, decay, warm_up, noise_hops, loud, strongest, noise, past, weights,
+    spectra, low, quiet, heard, least, decay, warm_up, noise_hops, loud, strongest, noise, past, weights, noises,
 ):  # fmt: skip
     """Weights of the next windows by how direct they are."""
     microphones, bins = spectra.shape[1], len(noise)
@@ -132,6 +134,7 @@ def onset_weights(  # type: ignore[no-untyped-def]
                 weight[b] = min(direct * direct / (interference * (interference + two * direct)), strongest)
         else:
             weight[:] = zero
+        noises[t] = noise
         heard[0] += 1
         heard[1] += quiet
         share = one / np.float32(min(heard[1], noise_hops)) if quiet else one / every

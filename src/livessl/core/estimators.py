@@ -374,14 +374,33 @@ class Onset(SrpPhat):
         return None
 
     def _beside(self, place: agreement.Place, moments: Sequence[several.Moments]) -> tuple[agreement.Place, float]:
-        """The highest place when one is taken out, and how likely it is that a source is there, too."""
+        """The likeliest other place when one is taken out, and how likely it is that a source is there, too.
+
+        Of a few that stand high together, the one that is clear in a moment as well: by the product of the two.
+        """
         delays_s = [term.lags_s for term in place.functional.pair_terms(place.position_m)]
-        other = self._place([each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True)])
-        terms = other.functional.pair_terms(other.position_m)
-        clearness = [
-            each.clearness(term.lags_s, taken_s) for each, term, taken_s in zip(moments, terms, delays_s, strict=True)
-        ]
-        return other, several.confidence(clearness)
+        evidence = tuple(each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True))
+        find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
+        known = [peaks.neighbourhood(place.position_m, self._grid)]
+        best, chosen = 0.0, (place, 0.0)
+        for _ in range(several.CANDIDATES):
+            found = find(1, without=known)
+            if not found:
+                break
+            position_m, power = peaks.refine(functional, self._grid.node_m(found[0].node), self._grid)
+            terms = functional.pair_terms(position_m)
+            clearness = several.clearness(
+                [
+                    one.clearness(term.lags_s, taken_s)
+                    for one, term, taken_s in zip(moments, terms, delays_s, strict=True)
+                ]
+            )
+            if power * clearness > best:
+                candidate = agreement.Place(evidence, functional, position_m, power, power, found[0].proven)
+                best, chosen = power * clearness, (candidate, several.confidence(clearness))
+            known.append(peaks.box_around(self._grid, found[0].node, _CANDIDATES_APART))
+        other, confidence = chosen
+        return replace(other, rival_power=peaks.rival_power(find, self._grid, other.position_m)), confidence
 
     def _moments(self, heard: HeardBy, sound: Sound) -> several.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
@@ -462,6 +481,9 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
+
+_CANDIDATES_APART: Final = 5
+"""Nodes between places that may be a second source: half a metre."""
 
 MOST_ARRAYS: Final = 16
 """Arrays that a place is told by: of more, those that heard it most clearly. The others hardly move it, and what an

@@ -123,8 +123,8 @@ class CrossSpectra:
     band_hz : (float, float)
     weights : (L, B) float32 or None
         Of each frame's bins in the band; the correlations are then sums and no means.
-    phases : bool
-        Whether each microphone is whitened for itself, so that only phases are left; else all by their mean power.
+    noise : (L, B) float32 or None
+        Power in each frame's bins in the band up to which magnitudes count, too; without it only phases do.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class CrossSpectra:
         band_hz: tuple[float, float],
         weights: Float32Array | None = None,
         *,
-        phases: bool = True,
+        noise: Float32Array | None = None,
     ) -> None:
         self.n_fft = spectra.n_fft
         self.sample_rate_hz = sample_rate_hz
@@ -151,8 +151,10 @@ class CrossSpectra:
         if weights is None:
             self.share = max(1, bins) * max(1, frames)
             weights = np.ones((frames, bins), dtype=np.float32)
+        if noise is None:
+            noise = np.zeros((frames, bins), dtype=np.float32)
         self.levels = np.zeros(spectra.values.shape[1])
-        kernels.cross_spectra(spectra.values, self.low, pairs, weights, phases, self.whitened, self.levels)
+        kernels.cross_spectra(spectra.values, self.low, pairs, weights, noise, self.whitened, self.levels)
 
     def bins_below(self, cut_off_hz: float) -> int:
         """How many of the band's bins lie at or below a cut-off."""

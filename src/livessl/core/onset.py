@@ -10,9 +10,10 @@ microphones is gamma = S / (S + I), and their phases weigh
 the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The precedence effect gives gamma
 where the textbook would estimate it from long averages, which reverberation spoils. The GCC is
 sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* normalised: a moment or a band with more evidence
-counts for more, and sums over frames make a window or an event. Whitened by the power that the microphones have on
-average, a microphone that is drowned by noise counts for less than its phase alone would. It knows no geometry and no
-other array.
+counts for more, and sums over frames make a window or an event. Where there is noise, P is the power that the
+microphones have on average: one that is drowned by noise then counts for less than its phase alone would. Where there
+is hardly any, P is each one's own, and only phases are left: else the louder of two sources would hide the other. It
+knows no geometry and no other array.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ that makes it longer, one microphone may be much nearer to a source than another
 
 _STRONGEST: Final = np.float32(10.0)
 """Largest weight: above gamma = 0.95 it is the room that limits, not the noise."""
+
+_NOISY: Final = np.float32(30.0)
+"""Power below so many times the noise's is whitened by the microphones' mean: 15 dB. 10 and 20 dB did little else."""
 
 _WARM_UP_S: Final = 0.1
 """Quiet to be heard before the noise is known well enough to tell an onset from it."""
@@ -162,15 +166,17 @@ class OnsetFrontEnd:
         windows = np.empty((hops, len(samples), self._n_fft), dtype=np.float32)
         kernels.cut_windows(heard, self._hop, self._window, windows)
         spectra = np.asarray(scipy.fft.rfft(windows, axis=2), dtype=np.complex64)
-        weights = np.empty((hops, len(self._noise)), dtype=np.float32)
+        weights, noises = np.empty((2, hops, len(self._noise)), dtype=np.float32)
         kernels.onset_weights(
             spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,
-            _LOUD, _STRONGEST, self._noise, self._past, weights,
+            _LOUD, _STRONGEST, self._noise, self._past, weights, noises,
         )  # fmt: skip
-        cross = CrossSpectra(
-            Spectra(spectra, self._n_fft), self._pairs, self.sample_rate_hz, self._band_hz, weights, phases=self._wide
-        )
+        cross = self._cross(Spectra(spectra, self._n_fft), weights, noises)
         return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels)
+
+    def _cross(self, spectra: Spectra, weights: Float32Array, noises: Float32Array) -> CrossSpectra:
+        noisy = None if self._wide else _NOISY * noises
+        return CrossSpectra(spectra, self._pairs, self.sample_rate_hz, self._band_hz, weights, noise=noisy)
 
     def listen(self, pieces: Iterable[Float32Array]) -> OnsetGCC:
         """Sum over pieces (K, n) of sound without their context: each is taken to begin out of silence."""

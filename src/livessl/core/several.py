@@ -25,6 +25,9 @@ APART_M: Final = 1.0
 MOST_MOMENTS: Final = 40
 """Moments kept apart; those of a longer sound are put together, so that a long one takes no more room and time."""
 
+CANDIDATES: Final = 6
+"""Places looked at for each source; the right one is hardly ever further down."""
+
 LITTLE: Final = 200.0
 """Weight of a moment's onsets below which it is mostly noise, and counts the less: noise at 10 dB gives some 30, a
 source in a clear moment thousands."""
@@ -40,13 +43,15 @@ _LOGISTIC: Final = (-11.6, 6.9)
 and 800 single ones of the development half, of two arrays and of four, RT60 0.4 to 2 s at 20 and 10 dB."""
 
 
-def confidence(clearness: Sequence[float]) -> float:
-    """Probability that there is a second source, and at this place, by each array's `Moments.clearness`.
+def clearness(of_arrays: Sequence[float]) -> float:
+    """Of a place, by each array's `Moments.clearness`: two lines make it, so it is the mean of the two highest."""
+    return float(np.mean(sorted(of_arrays)[-2:]))
 
-    Two lines make a place: it goes by the two arrays at which it is clearest.
-    """
+
+def confidence(clearness: float) -> float:
+    """Probability that there is a second source, and at this place, by the place's `clearness`."""
     intercept, slope = _LOGISTIC
-    return float(1.0 / (1.0 + np.exp(-(intercept + slope * np.mean(sorted(clearness)[-2:])))))
+    return float(1.0 / (1.0 + np.exp(-(intercept + slope * clearness))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,13 +58,14 @@ def cross_spectra(
     low: int,
     pairs: IntArray,
     weights: Float32Array,
-    phases: bool,
+    noise: Float32Array,
     whitened: ComplexArray,
     levels: FloatArray,
 ) -> None:
     """Whitened cross spectra, sum_t w conj(U_i) U_k, and the microphones' own sums over all bins, sum_t,f w |U_m|^2.
 
-    Whitened is each microphone by its own magnitude, U = X/|X|, or all by their mean power P: U = X/sqrt(P).
+    Whitened is each microphone by its own magnitude, U = X/|X|, or, where there is noise, more and more by the mean
+    power P of all: U = X/sqrt((1 - k)|X|^2 + kP), k = min(1, noise/P).
 
     Parameters
     ----------
@@ -76,8 +77,8 @@ def cross_spectra(
         Microphones (i, k).
     weights : (T, B) float32
         Of each frame's bins in the band.
-    phases : bool
-        Whether each microphone is whitened for itself, so that only phases are left.
+    noise : (T, B) float32
+        Power up to which only the mean counts; zeros leave phases alone.
     whitened : (P, B) complex64
         The answer.
     levels : (K,) float64
@@ -85,11 +86,12 @@ def cross_spectra(
     """
     whitened[:], levels[:] = 0.0, 0.0
     first, second = pairs.T
-    for spectrum, weight in zip(spectra[:, :, low : low + whitened.shape[1]], weights, strict=True):
+    for spectrum, weight, below in zip(spectra[:, :, low : low + whitened.shape[1]], weights, noise, strict=True):
         power = spectrum.real**2 + spectrum.imag**2
         heard = power > SILENT_POWER * power.max(axis=1, initial=0.0, keepdims=True)
-        if not phases:
-            power = np.broadcast_to(_smoothed(power.mean(axis=0)[None]), power.shape)
+        mean = _smoothed(power.mean(axis=0)[None])
+        share = np.divide(np.minimum(below, mean), mean, out=np.zeros_like(mean), where=mean > 0.0)
+        power = power + share * (mean - power)
         unit = np.divide(spectrum, np.sqrt(power), out=np.zeros_like(spectrum), where=heard)
         levels += np.square(np.abs(unit)) @ weight
         whitened += (np.conj(unit) * weight)[first] * unit[second]
@@ -98,7 +100,7 @@ def cross_spectra(
 def onset_weights(
     spectra: ComplexArray, low: int, quiet: bool, heard: IntArray, least: np.float32, decay: np.float32,
     warm_up: int, noise_hops: int, loud: np.float32, strongest: np.float32, noise: Float32Array, past: Float32Array,
-    weights: Float32Array,
+    weights: Float32Array, noises: Float32Array,
 ) -> None:  # fmt: skip
     """Weights of the next windows of one array by how direct they are: `livessl.core.onset` says why.
 
@@ -119,19 +121,20 @@ def onset_weights(
         Quiet windows, and any windows, after which weights are given; the noise is a mean over `noise_hops`.
     noise, past : (B,) float32
         What is known of the array; changed.
-    weights : (T, B) float32
-        The answer.
+    weights, noises : (T, B) float32
+        The answer, and the noise as it was known before each window.
     """
     inside = spectra[:, :, low : low + len(noise)]
     powers = _smoothed((inside.real**2 + inside.imag**2).mean(axis=1))
     weights[:] = 0.0
-    for power, weight in zip(powers, weights, strict=True):
+    for power, weight, below in zip(powers, weights, noises, strict=True):
         if heard[0] == 0:
             noise[:], past[:] = power, power
         if heard[1] >= warm_up or heard[0] >= noise_hops:
             interference = np.maximum(np.maximum(noise, past), least)
             direct = np.maximum(power - interference, 0.0)
             weight[:] = np.minimum(direct**2 / (interference * (interference + 2.0 * direct)), strongest)
+        below[:] = noise
         past[:] = np.maximum(past * decay, power)
         heard += (1, quiet)
         if not quiet:
