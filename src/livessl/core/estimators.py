@@ -42,7 +42,12 @@ class Sound:
         return float(np.mean([onset.levels for onset in self.onsets])) * len(self.onsets) if self.onsets else 0.0
 
     def live(self, gcc: GCC) -> GCC:
-        """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
+        """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`).
+
+        Where none of its samples was kept nothing tells which these are.
+        """
+        if not self.segments:
+            return gcc
         dead = dead_channels(self.segments)
         if not dead.any():
             return gcc
