@@ -107,7 +107,8 @@ class GCCPhat:
         rounding.
         """
         count = len(self.pairs)
-        pairs = np.concatenate([self.pairs + first for first in range(0, sum(map(len, sounds)), len(sounds[0]))])
+        first_channels = len(sounds[0]) * np.arange(len(sounds))
+        pairs = (first_channels[:, None, None] + self.pairs).reshape(-1, 2)
         spectra = self._front_end(np.concatenate(sounds), self._rate_hz, self._sampling.room)
         cross = CrossSpectra(spectra, pairs, self._rate_hz, self._band_hz)
         values = self._sampling.fine(self._sampling.sample(cross, envelope=self._envelope))
@@ -115,15 +116,13 @@ class GCCPhat:
 
     def is_like(self, other: GCCPhat) -> bool:
         """Whether the two correlate by the same matrices."""
-        return (
-            self._sampling is other._sampling  # band and rate, then, are the same
-            and len(self.pairs) == len(other.pairs)
-            and self._front_end is other._front_end
-        )
+        if self._front_end is not other._front_end or len(self.pairs) != len(other.pairs):
+            return False
+        return self._sampling is other._sampling  # and so band and rate are the same
 
     def is_short(self, sound: Float32Array) -> bool:
         """Whether a sound (K, n) is better correlated together with others."""
-        return sound.shape[1] <= _TOGETHER_S * self._rate_hz
+        return bool(sound.shape[1] <= _TOGETHER_S * self._rate_hz)
 
     def below(self, segments: Sequence[Float32Array], cut_offs_hz: Sequence[float]) -> list[GCC]:
         """GCC of the whole band, and then of what of it lies below each cut-off, all over the whole band's B."""
