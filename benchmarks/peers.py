@@ -36,7 +36,7 @@ from livessl.clock import SystemClock
 from livessl.core import compiled, search, srp, vectorised
 from livessl.core.activity import band_bins
 from livessl.core.frontends import Spectra, whole_segment
-from livessl.core.gcc import GCCPhat, microphone_pairs
+from livessl.core.gcc import GCCPhat, correlated, microphone_pairs
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.peaks import Peak
 from livessl.core.search import PeakSearch
@@ -256,7 +256,8 @@ class Ours:
 
     def heard(self, sounds: Sounds) -> list[HeardBy]:
         """Every array's GCC."""
-        return [HeardBy(spec, self._gcc[spec.name]([x])) for spec, x in zip(self._specs, sounds, strict=True)]
+        gccs = correlated([(self._gcc[spec.name], [x]) for spec, x in zip(self._specs, sounds, strict=True)])
+        return [HeardBy(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
 
     def power(self, sounds: Sounds) -> Float32Array:
         """The summed map (G,), overwritten by the next call."""

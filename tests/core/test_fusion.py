@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from livessl.core.activity import band_power
 from livessl.core.estimators import Localization, PowerMaps, Sound, SrpPhat
-from livessl.core.fusion import Fusion, FusionParameters
+from livessl.core.fusion import LET_GO_FRAMES, MOST_KEPT, Fusion, FusionParameters
 from livessl.core.geometry import Grid
 from livessl.core.joint import joined
 from livessl.core.onset import OnsetGCC, summed
@@ -685,9 +685,67 @@ def test_memory_does_not_grow(arrays: tuple[str, ...]) -> None:
             scripted.calls.clear()
             sizes.append(len(pickle.dumps(fusion)))
             held = [reference for reference in held if reference() is not None]
-            # an event of 20 frames, and 15 for pre-roll, window and hang-over before it
-            assert len(held) <= len(arrays) * (20 + 15 + 2)
+            # an event of 20 frames, and 9 for pre-roll and window before it
+            assert len(held) <= len(arrays) * (20 + 9 + 2)
     assert max(sizes[1:]) <= sizes[0] + 200  # counters get longer
+
+
+class Gauge:
+    """Stands for a front end: it says of each frame how loud it was."""
+
+    sample_rate_hz = RATE_HZ
+
+    def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
+        assert samples.size
+        return OnsetGCC(np.zeros((1, 1), np.float32), np.full(4, np.abs(samples).max(), np.float64))
+
+    def reset(self) -> None:
+        raise AssertionError("all frames are there")
+
+
+class Gauged(Scripted):
+    """Listens."""
+
+    def listener(self, array: str, sample_rate_hz: float) -> Any:
+        return Gauge()
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
+        heard = tuple(HeardBy(spec, NOTHING) for spec in MANY if spec.name in sounds)
+        return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
+
+
+MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(MOST_KEPT + 6)]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) -> None:
+    """What comes of the others stays: they are heard, and have part in the event."""
+    gauged = Gauged()
+    fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+    held: dict[str, list[weakref.ref[Float32Array]]] = {spec.name: [] for spec in MANY}
+    most = dict.fromkeys(held, 0)
+    events: list[Output] = []
+    for raster in range(100):
+        for rank, spec in enumerate(MANY[::order]):
+            message: Message = mark(spec.name, raster)
+            if raster < 90:
+                samples = np.full((4, 20), 1e-3 * (1 + rank), np.float32)
+                message = frame(spec.name, raster, raster >= 10, 1e-2 if raster >= 10 else 1e-7, samples=samples)
+                held[spec.name].append(weakref.ref(message.samples))
+            events += fusion.step([message], now_ns(raster + 1))
+            del message
+        for name, references in held.items():
+            held[name] = [reference for reference in references if reference() is not None]
+            most[name] = max(most[name], len(held[name]))
+    (event,) = [output for output in events if isinstance(output, Event)]
+    assert set(event.heard_by) == set(most)
+    assert {c.array: c.active_s for c in event.contributions} == dict.fromkeys(most, 4.0)  # 80 frames
+    let_go = {spec.name for spec in MANY[::order][:6]}
+    for name, pieces in gauged.calls[-1].items():
+        assert (sum(pieces) < 20 * 20) if name in let_go else (pieces == [80 * 20]), name
+        # windows and a hang-over, and what has come since the last look; else all of it with the run-up
+        assert (most[name] <= 10 + LET_GO_FRAMES + 9) if name in let_go else (most[name] >= 88), name
 
 
 class Ear:

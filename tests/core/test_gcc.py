@@ -20,8 +20,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core import gcc as module
-from livessl.core.frontends import fast_length
-from livessl.core.gcc import OVERSAMPLING, GCCPhat, LagSampling, mean_square_angular_frequency, microphone_pairs
+from livessl.core.frontends import FrontEnd, averaged, cepstral, fast_length, whole_segment
+from livessl.core.gcc import (
+    OVERSAMPLING,
+    GCCPhat,
+    LagSampling,
+    correlated,
+    mean_square_angular_frequency,
+    microphone_pairs,
+)
 from livessl.core.geometry import line
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray
 
@@ -317,3 +324,48 @@ def test_curvature_is_the_ideal_peaks() -> None:
     below, at, above = band_mean_cos(np.array([-h_s, 0.0, h_s]), BAND_HZ)
     # the next term is (2 pi 6 kHz h)^2 / 20 = 7e-7; cancellation leaves 1e-16 / 5e-6 of the difference
     assert mean_square_angular_frequency(BAND_HZ) == pytest.approx((2 * at - below - above) / h_s**2, rel=1e-5)
+
+
+# --- several arrays at once
+
+
+def noises(count: int, samples: int = 2000, channels: int = 4) -> list[Float32Array]:
+    rng = np.random.default_rng(count)
+    return [10.0**-k * rng.standard_normal((channels, samples), dtype=np.float32) for k in range(count)]
+
+
+@pytest.mark.parametrize("front_end", [whole_segment, averaged, cepstral])
+@pytest.mark.parametrize("band_hz", [BAND_HZ, (6000.0, 7000.0)])
+def test_arrays_together_are_as_each_alone(front_end: FrontEnd, band_hz: tuple[float, float]) -> None:
+    """However differently loud they are. Rounding: sums of a thousand terms in single precision."""
+    specs = [ArraySpec(name, TETRA.microphones_m + k, band_hz) for k, name in enumerate(("north", "south", "east"))]
+    each = [GCCPhat(spec, RATE_HZ, C_M_S, front_end) for spec in specs]
+    sounds = noises(3)
+    together = correlated([(one, [sound]) for one, sound in zip(each, sounds, strict=True)])
+    for one, sound, gcc in zip(each, sounds, together, strict=True):
+        alone = one([sound])
+        np.testing.assert_allclose(gcc.values, alone.values, atol=1e-6)
+        assert np.abs(alone.values).max() > 0.05
+        assert np.array_equal(gcc.pairs, alone.pairs)
+        assert np.array_equal(gcc.lags_s, alone.lags_s)
+
+
+def test_arrays_that_are_not_alike_are_correlated_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(GCCPhat, "of_each", lambda *_: pytest.fail("these are not alike"))
+    tetrahedron, two = GCCPhat(TETRA, RATE_HZ, C_M_S), GCCPhat(pair(), RATE_HZ, C_M_S)
+    slower, other = GCCPhat(TETRA, 1.5 * RATE_HZ, C_M_S), GCCPhat(TETRA, RATE_HZ, C_M_S, averaged)
+    here, there = noises(2)
+    long = noises(2, int(RATE_HZ))
+    cases: list[list[tuple[GCCPhat, list[Float32Array]]]] = [
+        [(tetrahedron, [here])],
+        [(tetrahedron, [here]), (two, [there[:2]])],
+        [(tetrahedron, [here]), (slower, [there])],
+        [(tetrahedron, [here]), (other, [there])],
+        [(tetrahedron, [here]), (tetrahedron, [there[:, 1:]])],
+        [(tetrahedron, [here]), (tetrahedron, [here, there])],
+        [(tetrahedron, []), (tetrahedron, [])],
+        [(tetrahedron, [long[0]]), (tetrahedron, [long[1]])],
+    ]
+    for sounds in cases:
+        for (one, segments), gcc in zip(sounds, correlated(sounds), strict=True):
+            assert np.array_equal(gcc.values, one(segments).values)

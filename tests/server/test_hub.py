@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -245,3 +246,30 @@ def test_client_that_comes_back_is_told_what_is_gone() -> None:
     (gap,) = drained(hub.subscribe(Filter(), since_seq=10**6))
     assert gap["missed"] is None
     assert "number 1000000 has not been told" in gap["reason"]
+
+
+def test_the_past_of_many_arrays_is_small_and_told_word_for_word() -> None:
+    hub = Hub()
+    live = hub.subscribe(Filter())
+    texts = []
+    tracemalloc.start()
+    try:
+        for n in range(PAST):
+            contributions = [{"array": f"a{k}", "power_dbfs": -0.1 * k * n, "agrees": None} for k in range(64)]
+            hub.publish({**update(n), "contributions": contributions})
+            if n >= PAST - 5:
+                texts += asyncio.run(_texts(live))
+            else:
+                asyncio.run(_texts(live))
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 6e6  # as objects more than 30 MB
+    assert asyncio.run(_texts(hub.subscribe(Filter(), since_seq=PAST - 5))) == texts
+
+
+async def _texts(subscription: Subscription) -> list[str]:
+    texts = []
+    while subscription.lags or subscription.past:
+        texts.append((await subscription.next()).text)
+    return texts

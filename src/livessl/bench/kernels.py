@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from livessl.clock import Clock
 from livessl.core.estimators import Sound, SrpPhat
-from livessl.core.gcc import GCCPhat
+from livessl.core.gcc import GCCPhat, correlated
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.kernels import kernels
 from livessl.core.search import PeakSearch, Rule
@@ -229,7 +229,8 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[Case]
 
     def evidence(kind: str, number: int, count: int) -> list[HeardBy]:
         sounds = made[kind, number % 12]
-        return [HeardBy(s, correlate[s.name]([x])) for s, x in zip(most[:count], sounds, strict=False)]
+        gccs = correlated([(correlate[s.name], [x]) for s, x in zip(most[:count], sounds, strict=False)])
+        return [HeardBy(s, gcc) for s, gcc in zip(most, gccs, strict=False)]
 
     yield Case("GCC of a block, one array", lambda n: correlate[first.name]([made["voice", n % 12][0]]))
     yield Case("GCC of 1 s, one array", lambda n: correlate[first.name]([segments[n % 2]]))

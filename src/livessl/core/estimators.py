@@ -12,7 +12,7 @@ from livessl.core import agreement, certainty, peaks, several
 from livessl.core.activity import dead_channels
 from livessl.core.certainty import Signs
 from livessl.core.frontends import FrontEnd, averaged, cepstral, whole_segment
-from livessl.core.gcc import GCCPhat, LagSampling, microphone_pairs, require_band, uses_envelope
+from livessl.core.gcc import GCCPhat, LagSampling, correlated, microphone_pairs, require_band, uses_envelope
 from livessl.core.geometry import Grid
 from livessl.core.onset import OnsetFrontEnd, OnsetGCC, summed
 from livessl.core.search import PeakSearch
@@ -42,7 +42,12 @@ class Sound:
         return float(np.mean([onset.levels for onset in self.onsets])) * len(self.onsets) if self.onsets else 0.0
 
     def live(self, gcc: GCC) -> GCC:
-        """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`)."""
+        """Its GCC with nothing in the pairs of dead microphones (`livessl.core.activity.dead_channels`).
+
+        Where none of its samples was kept nothing tells which these are.
+        """
+        if not self.segments:
+            return gcc
         dead = dead_channels(self.segments)
         if not dead.any():
             return gcc
@@ -160,7 +165,7 @@ class SrpPhat:
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Find the highest places of the arrays' summed maps, refine them below the grid, take the best."""
         # float sums depend on the order: the answer must not
-        evidence = tuple(self._heard(name, sounds[name]) for name in sorted(sounds))
+        evidence = self._evidence({name: sounds[name] for name in sorted(sounds)})
         in_map = any(self._limited[name] for name in sounds)
         grid = self._map_grid if in_map else self._grid
         find = peaks.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
@@ -187,6 +192,17 @@ class SrpPhat:
             else:
                 mapper.add(fused, heard.gcc, *heard.below)
         return PowerMaps(self._map_grid, fused, arrays)
+
+    def _evidence(self, sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+        if any(self._limited[name] for name in sounds):
+            return tuple(self._heard(name, sound) for name, sound in sounds.items())
+        correlators = [self._correlator(name, sound.sample_rate_hz)[0] for name, sound in sounds.items()]
+        segments = [sound.segments for sound in sounds.values()]
+        gccs = correlated(list(zip(correlators, segments, strict=True)))
+        return tuple(
+            HeardBy(self._arrays[name], sound.live(gcc))
+            for (name, sound), gcc in zip(sounds.items(), gccs, strict=True)
+        )
 
     def _heard(self, array: str, sound: Sound) -> HeardBy:
         correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)

@@ -58,6 +58,13 @@ _SOME: Final = 64
 WEAK_FRAMES: Final = 4
 """One active frame in so many is looked at for microphones that hear nothing: they are told of after a second."""
 
+MOST_KEPT: Final = 24
+"""Arrays whose samples are kept while a sound goes on: those that have heard it most clearly so far, half as many again
+as any answer goes by. Of the others is kept what was made of them: 64 arrays send 45 MB a second."""
+
+LET_GO_FRAMES: Final = 10
+"""Between two looks which arrays these are."""
+
 RANGE_UNKNOWN: Final = 0.25
 """Where the position's spread exceeds this share of the distance to the nearest array, only the direction is told."""
 
@@ -112,6 +119,7 @@ class _OpenEvent:
     late_frames: int = 0
     ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
     became_quiet: bool = False
+    clarity: dict[str, float] = field(default_factory=dict)  # how clearly each array has heard it so far
     heard: _Heard | None = None
     told: list[Output] | None = None  # by those that heard it, while others are asked
     asked: dict[str, Asked] = field(default_factory=dict)
@@ -426,8 +434,27 @@ class Fusion:
             else:
                 outputs += self._update(event, raster)
         if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
-            outputs += self._end(event)
+            return outputs + self._end(event)
+        if (raster - event.start + 1) % LET_GO_FRAMES == 0:
+            self._let_go(event, raster)
         return outputs
+
+    def _let_go(self, event: _OpenEvent, raster: int) -> None:
+        """Let the samples go that no answer will be told by: those of arrays that hear the sound least clearly.
+
+        What windows may still be made of stays.
+        """
+        if len(self._streams) <= MOST_KEPT:
+            return
+        lately = range(raster - LET_GO_FRAMES + 1, raster + 1)
+        for name, stream in self._streams.items():
+            heard = sum(onsets.weight for onsets in stream.ear.at(lately))
+            event.clarity[name] = event.clarity.get(name, 0.0) + heard
+        clearest = sorted(event.clarity, key=lambda name: -event.clarity[name])
+        before = raster - round((self._parameters.window_s + self._parameters.hang_over_s) / FRAME_S)
+        for name in clearest[MOST_KEPT:]:
+            if self._streams[name].ear.onsets:
+                self._streams[name].let_go(before)
 
     def _open(self, raster: int) -> _OpenEvent:
         """Begin an event, and listen to its pre-roll afresh, so that it is the same whatever came before.
@@ -565,7 +592,7 @@ class Fusion:
             pieces, _ = stream.segments(rasters)
             if not pieces:
                 continue
-            if not stream.ear.has(there):  # some came late
+            if not stream.ear.has(there) and stream.keeps(there):  # some came late
                 self._hear_anew(stream, span)
             heard.sounds.pieces[name], heard.powers[name] = pieces, power[mask]
             heard.sounds.onsets[name] = stream.ear.at(range(span.start, rasters[-1] + 1))
@@ -700,7 +727,7 @@ class Fusion:
         if clocks is None or not self._learns or not clocks.tell_apart(estimate.arrays):
             return
         streams = [self._streams[name] for name in estimate.arrays]
-        whole = [(stream.spec, max(stream.segments(span)[0], key=len)) for stream in streams]
+        whole = [(s.spec, max(s.segments(span)[0], key=len)) for s in streams if s.keeps(span)]
         clocks.hear(time_ns, estimate.position_m, whole)
 
     def _judge(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
@@ -731,7 +758,7 @@ class Fusion:
 
     def _prune(self) -> None:
         assert self._next is not None
-        keep = max(self._parameters.pre_roll_s, self._parameters.window_s) + self._parameters.hang_over_s
+        keep = max(self._parameters.pre_roll_s, self._parameters.window_s)
         oldest = (self._next if self._event is None else self._event.start) - round(keep / FRAME_S) - 1
         for stream in self._streams.values():
             while stream.frames and (first := next(iter(stream.frames))) < oldest:
@@ -742,10 +769,14 @@ class Fusion:
 
 
 class _Segments(Sequence[Float32Array]):
-    """Runs of frames, each joined when it is looked at: of many arrays never all at once, and not if nobody looks."""
+    """Runs of frames, each joined when it is looked at: of many arrays never all at once, and not if nobody looks.
+
+    Frames whose samples were let go are left out: they are the first.
+    """
 
     def __init__(self, pieces: Sequence[Sequence[Frame]]) -> None:
-        self._pieces = pieces
+        kept = ([frame for frame in piece if frame.samples.size] for piece in pieces)
+        self._pieces = [piece for piece in kept if piece]
 
     @overload
     def __getitem__(self, index: int) -> Float32Array: ...

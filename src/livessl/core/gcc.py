@@ -35,6 +35,9 @@ _RIDGE: Final = 1e-10
 _PRODUCT_BINS: Final = 2048
 """Up to so many bins, a third of a second, lags come by a matrix that is kept; above it by a short inverse FFT."""
 
+_TOGETHER_S: Final = 0.25
+"""Sounds up to so long are correlated together: matrices are read once for all, and spectra still fit in the cache."""
+
 _ROUNDING: Final = 1e-6
 """Of a lag: arrays of one shape, turned this way and that, are equally wide but for their last digits."""
 
@@ -97,6 +100,30 @@ class GCCPhat:
         """
         return self.below(segments, ())[0]
 
+    def of_each(self, sounds: Sequence[Float32Array]) -> list[GCC]:
+        """GCC of each of several arrays' sounds (K, n) by one transform and one product of matrices.
+
+        The arrays are all alike (`is_like`), and their sounds equally long. Values differ from those of each alone by
+        rounding.
+        """
+        count = len(self.pairs)
+        first_channels = len(sounds[0]) * np.arange(len(sounds))
+        pairs = (first_channels[:, None, None] + self.pairs).reshape(-1, 2)
+        spectra = self._front_end(np.concatenate(sounds), self._rate_hz, self._sampling.room)
+        cross = CrossSpectra(spectra, pairs, self._rate_hz, self._band_hz)
+        values = self._sampling.fine(self._sampling.sample(cross, envelope=self._envelope))
+        return [GCC(self.pairs, self.lags_s, values[first : first + count]) for first in range(0, len(pairs), count)]
+
+    def is_like(self, other: GCCPhat) -> bool:
+        """Whether the two correlate by the same matrices."""
+        if self._front_end is not other._front_end or len(self.pairs) != len(other.pairs):
+            return False
+        return self._sampling is other._sampling  # and so band and rate are the same
+
+    def is_short(self, sound: Float32Array) -> bool:
+        """Whether a sound (K, n) is better correlated together with others."""
+        return bool(sound.shape[1] <= _TOGETHER_S * self._rate_hz)
+
     def below(self, segments: Sequence[Float32Array], cut_offs_hz: Sequence[float]) -> list[GCC]:
         """GCC of the whole band, and then of what of it lies below each cut-off, all over the whole band's B."""
         shape = (1 + len(cut_offs_hz), len(self.pairs), self._sampling.count)
@@ -109,6 +136,17 @@ class GCCPhat:
                 part += segment.shape[1] * self._sampling.sample(cross, cut_off_hz, envelope=self._envelope)
         total /= max(1, sum(segment.shape[1] for segment in segments))
         return [GCC(self.pairs, self.lags_s, self._sampling.fine(part)) for part in total]
+
+
+def correlated(sounds: Sequence[tuple[GCCPhat, Sequence[Float32Array]]]) -> list[GCC]:
+    """GCC of each array's segments by its correlator: of windows of arrays of one shape all at once."""
+    (first, segments), *others = sounds
+    alike = all(correlate.is_like(first) and len(each) == 1 for correlate, each in sounds)
+    if others and alike and first.is_short(segments[0]):
+        windows = [each[0] for _, each in sounds]
+        if all(window.shape == windows[0].shape for window in windows):
+            return first.of_each(windows)
+    return [correlate(each) for correlate, each in sounds]
 
 
 class CrossSpectra:

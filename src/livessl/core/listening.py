@@ -105,7 +105,7 @@ class Listening:
         if listener is not None:
             for raster in rasters:
                 frame = frames.get(raster)
-                if frame is None or frame.sample_rate_hz != sample_rate_hz:
+                if frame is None or not frame.samples.size or frame.sample_rate_hz != sample_rate_hz:
                     listener.reset()
                 else:
                     _push(listener, frame)

@@ -134,6 +134,16 @@ class Stream:
             there.append(raster)
         return pieces, there
 
+    def let_go(self, before: int) -> None:
+        """Let the samples of its frames before a raster interval go; what else is known of them stays."""
+        for raster, frame in self.frames.items():
+            if raster < before and frame.samples.size:
+                self.frames[raster] = replace(frame, samples=frame.samples[:, :0].copy())
+
+    def keeps(self, rasters: Iterable[int]) -> bool:
+        """Whether the samples of all of its frames at `rasters` are still there."""
+        return all(self.frames[raster].samples.size for raster in rasters if raster in self.frames)
+
     def move(self, frames: int) -> None:
         """Take it that its clock is ahead by so many frames more."""
         self.ahead += frames

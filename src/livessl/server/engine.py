@@ -22,6 +22,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.refusals import Refusals
+from livessl.server.resident import unmap_unused
 from livessl.server.store import Store, StoreError
 
 WAIT_S: Final = 0.02
@@ -32,6 +33,9 @@ BATCH: Final = 200
 
 STATUS_NS: Final = 500_000_000
 """Between two reports on the arrays."""
+
+COMPILER: Final = "libllvmlite.so"
+"""What compiles our kernels, and links those that are cached; once all of them are there, nothing calls it."""
 
 SAY_S: Final = 2.0
 """A start that waits longer than this for the compiler says so."""
@@ -464,6 +468,7 @@ def _warm_up() -> None:
         warm_up()
     finally:
         told.cancel()
+    unmap_unused(COMPILER)
 
 
 def _overlapped(old: JsonObject, events: Sequence[JsonObject]) -> JsonObject | None:

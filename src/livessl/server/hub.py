@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import zlib
 from collections import OrderedDict, deque
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +19,11 @@ BACKLOG: Final = 256
 """Messages a client may lag by. Beyond it the oldest are dropped, events last, and the client told."""
 
 PAST: Final = 2048
-"""Messages kept for clients that come back: a minute or more of one sound that never ends, about 3 MB."""
+"""Messages kept for clients that come back: a minute or more of one sound that never ends. They are kept as compressed
+text: as objects those of 64 arrays would take some 50 MB."""
+
+_LOOKED_AT: Final = ("seq", "kind", "confidence", "zones")
+"""What is asked of a message before it is sent again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,21 +62,31 @@ class Told:
         With its version and number.
     told_ns : int or None
         When it was told, by the clock that nobody sets, where its way to the clients is to be measured.
+    packed : bytes or None
+        Its text, compressed; the message then holds only what it is chosen by.
     """
 
-    __slots__ = ("_text", "message", "told_ns")
+    __slots__ = ("_packed", "_text", "message", "told_ns")
 
-    def __init__(self, message: JsonObject, told_ns: int | None = None) -> None:
+    def __init__(self, message: JsonObject, told_ns: int | None = None, packed: bytes | None = None) -> None:
         self.message = message
         self.told_ns = told_ns
+        self._packed = packed
         self._text: str | None = None
 
     @property
     def text(self) -> str:
         """The message as JSON."""
+        if self._packed is not None:
+            return zlib.decompress(self._packed).decode()
         if self._text is None:
             self._text = json_text(self.message)
         return self._text
+
+    def packed(self) -> Told:
+        """The same for those who come back, small; its delay is not that of the way to a client."""
+        chosen_by: JsonObject = {name: self.message[name] for name in _LOOKED_AT if name in self.message}
+        return Told(chosen_by, packed=zlib.compress(self.text.encode(), 1))
 
     @property
     def subject(self) -> Hashable | None:
@@ -192,7 +207,7 @@ class Hub:
         """Number a message and offer it to everyone."""
         self.last_seq += 1
         told = Told({"v": API_VERSION, "seq": self.last_seq, **message}, told_ns)
-        self._past.append(Told(told.message))  # its delay is not that of the way to a client
+        self._past.append(told.packed())
         for subscription in self._subscriptions:
             self.superseded += subscription.offer(self.last_seq, told)
 
