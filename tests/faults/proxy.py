@@ -100,7 +100,7 @@ class Proxy:
             while self.weather.cut:  # the handshake does not get through either
                 await asyncio.sleep(0.02)
             there_reader, there_writer = await asyncio.open_connection(*self._target)
-        except OSError:  # nobody listens
+        except (OSError, asyncio.CancelledError):  # nobody listens, or the proxy closes
             writer.transport.abort()
             self._tasks.discard(task)
             return
@@ -108,7 +108,7 @@ class Proxy:
         self._writers |= {writer, there_writer}
         try:
             await asyncio.gather(self._pump(reader, there_writer), self._pump(there_reader, writer))
-        except OSError:
+        except (OSError, asyncio.CancelledError):  # asyncio prints a handler that was cancelled as an error
             pass
         finally:
             for end in (writer, there_writer):

@@ -163,6 +163,12 @@ def test_live_with_a_token(secured: Secured, role: Role) -> None:
         assert live.subprotocol == "livessl"  # and never the one with the token
 
 
+@pytest.mark.parametrize("role", list(Role))
+def test_map_with_a_token(secured: Secured, role: Role) -> None:
+    with secured.live("map", additional_headers=secured.headers(role)) as watching:
+        assert watching.ping().wait(timeout=5)  # it is open, and stays so
+
+
 @pytest.mark.parametrize(
     "more",
     [
