@@ -95,6 +95,7 @@ def measure(folder: Path, parts: Iterable[str], *, brief: bool) -> None:
         "kernels": lambda: _measure_kernels(folder, 5 if brief else 200),
         "peers": lambda: _script("peers.py", folder, *(["--rounds", "2", "--search-rounds", "3"] if brief else [])),
         "exactness": lambda: _script("exactness.py", folder, *(["--sounds", "1"] if brief else [])),
+        "startup": lambda: _script("startup.py", folder, *(["--starts", "2"] if brief else [])),
         "live": lambda: _measure_live(folder, 3.0 if brief else 12.0),
     }
     for part in parts:
@@ -145,7 +146,8 @@ def document(folder: Path) -> str:
     ValueError
         Where they are of different machines, or some of the service's are missing.
     """
-    measured, peers, exact = (_read(folder / f"{name}.json") for name in ("kernels", "peers", "exactness"))
+    names = ("kernels", "peers", "exactness", "startup")
+    measured, peers, exact, startup = (_read(folder / f"{name}.json") for name in names)
     files = [folder / f"{_live_name(*demand)}.json" for demand in LIVE]
     missing = [file.name for file in files if not file.exists()]
     if 0 < len(missing) < len(files):
@@ -155,13 +157,14 @@ def document(folder: Path) -> str:
         )
     live = [] if missing else [_read(file) for file in files]
     sections = [
-        _head([measured, peers, exact, *live]),
+        _head([measured, peers, exact, startup, *live]),
         _ratios(peers, exact),
         _side_by_side(peers),
         _exactness(exact),
         _kernels(measured),
         _searches(peers),
         _service(live),
+        _startup(startup),
         _growth(peers, live),
         _purchase(peers, live),
     ]
@@ -365,6 +368,18 @@ def _service(live: Sequence[Json]) -> Iterator[str]:
     )  # fmt: skip
 
 
+def _startup(startup: Json) -> Iterator[str]:
+    took_s, processor_s = (np.asarray(startup[name]) for name in ("took_s", "processor_s"))
+    yield "## Starting"
+    yield ""
+    median_s, of_processor_s = float(np.median(took_s)), float(np.median(processor_s))
+    yield _paragraph(
+        f"`livessl serve` listens {_number(median_s)} s after it was called (median of {len(took_s)},",
+        f"{_number(took_s.min())} to {_number(took_s.max())} s; {_number(of_processor_s)} s of processor),",
+        "with two arrays in that room and a grid of 0.05 m. The very first start compiles, and says so.",
+    )
+
+
 def _service_fits(live: Sequence[Json]) -> dict[str, Fit]:
     """Processor and memory against arrays and against clients, of the runs on idle cores."""
     idle = [run for run in live if not run["demand"]["spin"]]
@@ -466,7 +481,7 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
 def main() -> int:
     """Perhaps measure; write the text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("kernels", "peers", "exactness", "live")
+    parts = ("kernels", "peers", "exactness", "startup", "live")
     parser.add_argument(
         "--measure", nargs="*", choices=parts, metavar="PART", help=f"all, or some of {', '.join(parts)}"
     )

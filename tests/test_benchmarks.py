@@ -15,6 +15,7 @@ import pytest
 import exactness
 import peers
 import performance
+import startup
 from livessl.bench import kernels
 from livessl.clock import SystemClock
 from livessl.core import compiled, search, srp, vectorised
@@ -155,6 +156,7 @@ def measured() -> dict[str, Json]:
             "machine": MACHINE, "maps": 540, "same": 540, "given_up": 2, "most_look_ups": 5_000_000, "most_arrays": 8,
             "cases": [{**case, "right_all_the_same": 1}],
         },
+        "startup": {"machine": MACHINE, "took_s": [1.2, 1.0, 1.3], "processor_s": [0.9, 0.8, 1.1]},
     }  # fmt: skip
 
 
@@ -172,6 +174,20 @@ def test_text_is_made_of_the_files(tmp_path: Path) -> None:
     assert "| the service's processor | arrays = 4, 8, 16, 32, 64 | 12.0 + 0.500 arrays % of a core | 0% |" in text
     # 16 servers of 64 arrays: (16 x 12 % + 1000 x 0.5 %) / 60 %, (16 x 100 MB + 1000 x 2 MB) / 60 %
     assert "| 1000 | 500 | 16 | 12 | 6.00 GB |" in text
+    assert "listens 1.20 s after it was called (median of 3, 1.00 to 1.30 s; 0.900 s of processor)" in text
+
+
+def test_a_start_is_timed_until_it_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["startup.py", "--out", str(tmp_path), "--starts", "1"])
+    assert startup.main() == 0
+    report = json.loads((tmp_path / "startup.json").read_text())
+    assert report["processor_s"][0] > 0.1
+    assert 0.1 < report["took_s"][0] < 60.0
+
+
+def test_a_start_that_fails_tells_what_was_said(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="No such file"):
+        startup.start(tmp_path / "nothing.yaml", SystemClock())
 
 
 def test_text_without_the_service_says_so(tmp_path: Path) -> None:

@@ -1,0 +1,86 @@
+"""How soon `livessl serve` listens: two arrays in the room of the other benchmarks, searched on a grid of 0.05 m.
+
+    python benchmarks/startup.py --out docs/performance
+
+Once so that what is compiled is in the cache, which is not counted, and then again and again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+import machine
+from livessl.clock import Clock, SystemClock
+from livessl.processes import free_port
+
+STARTS: Final = 15
+SITE: Final = """\
+site: startup
+room: {{size_m: [8, 10, 4]}}
+grid: {{spacing_m: 0.05}}
+arrays:
+  north: {{geometry: {{tetrahedron: {{edge_m: 0.5}}}}, position_m: [4, 7.5, 1.5]}}
+  south: {{geometry: {{tetrahedron: {{edge_m: 0.5}}}}, position_m: [4, 2.5, 1.5]}}
+nodes:
+  pc:
+    server: tcp://127.0.0.1:{frames}
+    device: {{name: any, sample_rate_hz: 44100}}
+    arrays: {{north: [1, 2, 3, 4], south: [5, 6, 7, 8]}}
+server:
+  bind: tcp://127.0.0.1:{frames}
+  http: {{host: 127.0.0.1, port: {http}}}
+  events_db: {folder}/events.db
+"""
+
+
+def start(site: Path, clock: Clock) -> tuple[float, float]:
+    """Start a server, wait for the line that tells that it listens, end it: seconds by the clock, and of processor.
+
+    Raises
+    ------
+    RuntimeError
+        Where it ends without that line.
+    """
+    began_ns = clock.monotonic_ns()
+    command = [sys.executable, "-m", "livessl", "serve", "--site", str(site)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:  # noqa: S603 - ours
+        assert server.stderr is not None
+        said = []
+        for line in server.stderr:
+            said.append(line)
+            if "listening" in line:
+                took_s = (clock.monotonic_ns() - began_ns) / 1e9
+                ticks = Path(f"/proc/{server.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
+                server.send_signal(signal.SIGTERM)
+                server.communicate()
+                return took_s, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+    raise RuntimeError(f"livessl serve: expected a line that it listens, got {''.join(said)!r}")
+
+
+def main() -> int:
+    """Measure, and write `startup.json`."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--starts", type=int, default=STARTS)
+    arguments = parser.parse_args()
+    about, clock = machine.describe(), SystemClock()
+    with tempfile.TemporaryDirectory() as folder:
+        site = Path(folder, "site.yaml")
+        site.write_text(SITE.format(frames=free_port(), http=free_port(), folder=folder), encoding="utf-8")
+        start(site, clock)
+        took_s, processor_s = zip(*(start(site, clock) for _ in range(arguments.starts)), strict=True)
+    report = {"machine": about, "took_s": took_s, "processor_s": processor_s}
+    (arguments.out / "startup.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
