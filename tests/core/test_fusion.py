@@ -748,6 +748,30 @@ def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) ->
         assert (most[name] <= 10 + LET_GO_FRAMES + 9) if name in let_go else (most[name] >= 88), name
 
 
+def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
+    """One by one, in another order, or all at once, as a recording's: the same pieces are left of every array."""
+    loudness = np.random.default_rng(1).uniform(0.5, 1.0, (len(MANY), 90)).astype(np.float32)
+    frames: list[Message] = [
+        frame(spec.name, raster, raster >= 10, samples=np.full((4, 20), loudness[k, raster], np.float32))
+        for raster in range(90)
+        for k, spec in enumerate(MANY)
+    ]
+    quiet: list[Message] = [mark(spec.name, raster) for raster in range(90, 100) for spec in MANY]
+    left = []
+    for steps in (
+        [[message] for message in frames + quiet],
+        [[message] for message in sorted(frames + quiet, key=lambda m: (m.raster, -int(m.array[1:])))],
+        [frames + quiet],
+    ):
+        gauged = Gauged()
+        fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+        said = [output for step in steps for output in fusion.step(step, now_ns(step[-1].raster - START + 1))]
+        assert sum(isinstance(output, Event) for output in said) == 1
+        left.append(gauged.calls[-1])
+    assert left[0] == left[1] == left[2]
+    assert len({sum(pieces) for pieces in left[0].values()}) > 2  # some went early, some late, some not at all
+
+
 class Ear:
     """Stands for a front end: it remembers what it heard, and says of each frame its number."""
 
