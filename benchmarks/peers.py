@@ -326,7 +326,7 @@ def side_by_side(rounds: int, progress: Callable[[int, int], None]) -> list[dict
     heard = [blocks.sound("voice", number) for number in range(12)]
     contenders = [*_contenders(specs, COARSE_M, None), *_contenders(specs, FINE_M, PART)]
     cases = [bench.Case(one.name, _each(one.run, heard)) for one in contenders]
-    taken_ms = bench.timed_ms(SystemClock(), cases, rounds, progress)
+    (taken_ms,) = bench.timed_ms(SystemClock(), cases, rounds, progress)
 
     plain = {one.spacing_m: one for one in contenders if one.name == REFERENCE}
     maps = {m: [np.array(one.power(sounds)) for sounds in heard[:CHECKED]] for m, one in plain.items() if one.power}
@@ -396,7 +396,7 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
                     | {"sounds": len(sounds), "given_up": given_up}
                 )
                 cases.append(bench.Case("peak", _each(find, some)))
-    return _with_times(rows, bench.timed_ms(SystemClock(), cases, rounds, progress))
+    return _with_times(rows, *bench.timed_ms(SystemClock(), cases, rounds, progress))
 
 
 def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[dict[str, Any]]]:
@@ -440,7 +440,7 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
         forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
         cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))
     cases.append(bench.bare_look_ups())
-    taken_ms = bench.timed_ms(SystemClock(), cases, rounds, progress)
+    (taken_ms,) = bench.timed_ms(SystemClock(), cases, rounds, progress)
     of_microphones, of_maps, of_forms, floor_ms = np.split(
         taken_ms, np.cumsum([len(microphones), len(maps), len(forms)])
     )

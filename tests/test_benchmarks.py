@@ -140,7 +140,14 @@ def measured() -> dict[str, Json]:
         for kind in kernels.KINDS
     ]
     case = {"spacing_m": 0.05, "arrays": 8, "kind": "noise", "rule": "sum", "maps": 6, "same": 6, "given_up": 2}
-    timing = {"name": "map, 2 arrays, 0.1 m", "ratio": 1.9, "median_ms": 2.0, "p99_ms": 3.0}
+    timing = {
+        "name": "map, 2 arrays, 0.1 m",
+        "ratio": 1.9,
+        "median_ms": 2.0,
+        "p99_ms": 3.0,
+        "again_median_ms": 1.5,
+        "again_p99_ms": 2.5,
+    }
     return {
         "kernels": {
             "machine": MACHINE, "kernels": "numba", "rounds": 9, "lookup_ns": 0.3, "timings": [timing]
