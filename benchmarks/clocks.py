@@ -21,11 +21,12 @@ from livessl.capture.devices import Placed, WavRecording
 from livessl.capture.line import played_messages
 from livessl.capture.recorded import Part, lines_of
 from livessl.clock import UnpacedClock
-from livessl.config import Site, load_site
+from livessl.config import Site
 from livessl.core.clock_offsets import ClockOffset
 from livessl.core.types import Block, Event, Output, Status
 from livessl.demo import SITE_FILE
 from livessl.simulate.scene import Scene, make_scene, read_sounds, render
+from livessl.site_file import load_site
 from recordings import CLASSES, DATA
 
 RATE_HZ: Final = 16000.0

@@ -21,11 +21,11 @@ from websockets.asyncio.client import connect
 
 from livessl.bench import load
 from livessl.clock import SystemClock
-from livessl.config import parse_site
 from livessl.core.types import Contribution, Estimate, Status, Update
 from livessl.messages import JsonObject, Messages, Stages
 from livessl.server.app import Server
 from livessl.server.hub import LAGGING
+from livessl.site_file import parse_site
 
 CLOCK = SystemClock()
 

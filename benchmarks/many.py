@@ -17,12 +17,13 @@ from typing import Final
 import numpy as np
 
 from livessl.bench import load
-from livessl.config import Site, parse_site
+from livessl.config import Site
 from livessl.core import estimators
 from livessl.core.estimators import ESTIMATORS
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
 from livessl.evaluate.localizer import heard
 from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
+from livessl.site_file import parse_site
 
 RATE_HZ: Final = 16_000.0
 QUIET_S: Final = 0.5

@@ -22,10 +22,11 @@ from livessl import replay
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.recorded import Part, parts_from_wavs
 from livessl.clock import UnpacedClock
-from livessl.config import Site, load_site, parse_site
+from livessl.config import Site
 from livessl.core.types import Event, Float32Array, FloatArray
 from livessl.demo import SITE_FILE
 from livessl.simulate.scene import NamedSound, make_scene, read_sounds, render
+from livessl.site_file import load_site, parse_site
 
 DATA: Final = Path(os.environ.get("LIVESSL_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

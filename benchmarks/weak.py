@@ -22,10 +22,11 @@ from livessl import replay
 from livessl.capture.devices import Placed, WavRecording
 from livessl.capture.recorded import Part
 from livessl.clock import UnpacedClock
-from livessl.config import Site, load_site
+from livessl.config import Site
 from livessl.core.types import Event, Status
 from livessl.demo import SITE_FILE
 from livessl.simulate.scene import Scene, render
+from livessl.site_file import load_site
 
 LOWER_DB: Final = (0.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 

@@ -18,10 +18,11 @@ import yaml
 from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.recorded import Part
 from livessl.clock import SystemClock
-from livessl.config import Site, parse_site
+from livessl.config import Site
 from livessl.core.types import Float32Array, Frame, Mark
 from livessl.server.app import Server
 from livessl.simulate.scene import Scene, make_scene, render
+from livessl.site_file import parse_site
 
 RATE_HZ = 16000
 SMALL: dict[str, Any] = {

@@ -14,8 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from livessl.config import ConfigError, Site, load_site, parse_site
+from livessl.config import ConfigError, Site
 from livessl.core.types import FloatArray
+from livessl.site_file import load_site, parse_site
 from small_site import SMALL, Changes, site_of, small, text_of, write_site
 
 SQUARE_M = [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]

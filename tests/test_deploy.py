@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from conftest import require
-from livessl.config import load_site
+from livessl.site_file import load_site
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"

@@ -14,8 +14,9 @@ import yaml
 
 from livessl import keys
 from livessl.cli import main
-from livessl.config import ConfigError, load_site, open_doors
+from livessl.config import ConfigError, open_doors
 from livessl.keys import Client, Role
+from livessl.site_file import load_site
 from small_site import Changes, site_of, write_site
 
 KEYED: Changes = {"keys": "keys", "server.http.tokens": "tokens.yaml"}

@@ -9,8 +9,9 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
-from livessl.config import ConfigError, parse_site
+from livessl.config import ConfigError
 from livessl.session import SESSION_FILE, piece, read_session, site_text, write_session
+from livessl.site_file import parse_site
 from small_site import Changes, site_of
 
 START_NS = 1_767_225_600_123_456_000

@@ -12,9 +12,10 @@ import yaml
 from numpy.testing import assert_allclose
 from pydantic import BaseModel
 
-from livessl.config import GeometryFile, Site, SoundDeviceConfig, load_site
+from livessl.config import GeometryFile, Site, SoundDeviceConfig
 from livessl.core.geometry import circle, tetrahedron
 from livessl.core.types import FloatArray
+from livessl.site_file import load_site
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "config").glob("*.yaml"))

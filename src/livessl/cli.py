@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from livessl import __version__, progress
+from livessl import __version__, argument, progress
 from livessl import keys as keyring
-from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock, utc_ns
+from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock
 from livessl.config import (
     METHODS,
     ConfigError,
@@ -30,12 +30,11 @@ from livessl.config import (
     Site,
     SoundDeviceConfig,
     StoreConfig,
-    check_endpoint,
-    load_site,
     open_doors,
 )
 from livessl.core.types import Event
 from livessl.errors import RunError, UseError
+from livessl.site_file import load_site
 
 if TYPE_CHECKING:
     from livessl.capture.recorded import Part
@@ -49,9 +48,6 @@ OK: Final = 0
 FAILED: Final = 1
 WRONG_USE: Final = 2
 INTERRUPTED: Final = 130
-
-MAX_RT60_S: Final = 5.0
-"""Images grow with the cube of the reverberation time: more would take hours, and few rooms ring longer."""
 
 WITHIN_M: Final = 0.5
 """The demo calls an event located if it is this near to the truth."""
@@ -129,7 +125,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     sub.add_argument("--once", action="store_true", help="run the scene once, print each event and its error")
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
     sub.add_argument("--port", type=int, default=8000, help="of the dashboard (default 8000)")
-    sub.add_argument("--events", type=_positive, default=8, help="sounds in the scene (default 8)")
+    sub.add_argument("--events", type=argument.positive, default=8, help="sounds in the scene (default 8)")
     sub.add_argument("--no-browser", action="store_true", help="do not open the dashboard")
 
     sub = command("serve", _serve, "run the fusion server with API and dashboard", "livessl serve --site site.yaml")
@@ -145,7 +141,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     sub.add_argument("--loop", action="store_true", help="play the files again and again")
     sub.add_argument(
         "--start-at",
-        type=_time,
+        type=argument.time,
         metavar="TIME",
         help="when the files begin, RFC 3339 (default: now, or with several nodes the next full 5 s of the clock)",
     )
@@ -167,9 +163,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         "directories", type=Path, metavar="DIR", nargs="+", help="made by record or simulate; one for each node"
     )
     sub.add_argument("--site", type=Path, help="site file (default: the session's own)")
-    sub.add_argument("--speed", type=_speed, default=1.0, help="times real time, or 'max' (default 1)")
+    sub.add_argument("--speed", type=argument.speed, default=1.0, help="times real time, or 'max' (default 1)")
     sub.add_argument(
-        "--server", type=_endpoint, metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570"
+        "--server", type=argument.endpoint, metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570"
     )
     sub.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
     sub.add_argument("--json", action="store_true", help="print one JSON object per event")
@@ -183,7 +179,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     sub.add_argument("--node", required=True, help="name of the node in the site file")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must not hold a session")
     sub.add_argument("--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV")
-    sub.add_argument("--duration", type=_above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)")
+    sub.add_argument(
+        "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)"
+    )
     _add_wav(sub, "record FILE at real speed instead of the device: a rehearsal")
 
     sub = command(
@@ -194,10 +192,12 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     _add_site(sub)
     sub.add_argument("--events", type=Path, metavar="DIR", help="WAV or FLAC files to play (default: our own sounds)")
-    sub.add_argument("--rt60", type=_rt60, default=0.7, metavar="S", help="reverberation time, 0 to 5 (default 0.7)")
+    sub.add_argument(
+        "--rt60", type=argument.rt60, default=0.7, metavar="S", help="reverberation time, 0 to 5 (default 0.7)"
+    )
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to; must hold no recording")
-    sub.add_argument("--count", type=_positive, default=8, help="sounds in the scene (default 8)")
-    sub.add_argument("--sample-rate", type=_positive, default=44100, metavar="HZ", help="default 44100")
+    sub.add_argument("--count", type=argument.positive, default=8, help="sounds in the scene (default 8)")
+    sub.add_argument("--sample-rate", type=argument.positive, default=44100, metavar="HZ", help="default 44100")
     sub.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
 
     sub = command(
@@ -241,12 +241,18 @@ def _add_bench(command: Callable[..., Any]) -> None:
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     )
     sub.add_argument("--live", action="store_true", help="a server under load, instead of the kernels alone")
-    sub.add_argument("--arrays", type=_positive, default=4, help="live: that sound all the time (default 4)")
-    sub.add_argument("--clients", type=_positive, default=4, help="live: that subscribe (default 4)")
-    sub.add_argument("--watchers", type=_count, default=0, help="live: that watch the power map (default none)")
-    sub.add_argument("--seconds", type=_above_zero, default=20.0, help="live: to measure, after a warm-up (default 20)")
-    sub.add_argument("--spacing", type=_above_zero, default=0.1, metavar="M", help="live: of the grid (default 0.1)")
-    sub.add_argument("--rt60", type=_rt60, default=0.3, metavar="S", help="live: of the simulated room (default 0.3)")
+    sub.add_argument("--arrays", type=argument.positive, default=4, help="live: that sound all the time (default 4)")
+    sub.add_argument("--clients", type=argument.positive, default=4, help="live: that subscribe (default 4)")
+    sub.add_argument("--watchers", type=argument.count, default=0, help="live: that watch the power map (default none)")
+    sub.add_argument(
+        "--seconds", type=argument.above_zero, default=20.0, help="live: to measure, after a warm-up (default 20)"
+    )
+    sub.add_argument(
+        "--spacing", type=argument.above_zero, default=0.1, metavar="M", help="live: of the grid (default 0.1)"
+    )
+    sub.add_argument(
+        "--rt60", type=argument.rt60, default=0.3, metavar="S", help="live: of the simulated room (default 0.3)"
+    )
     sub.add_argument("--spin", action="store_true", help="live: let a foreign process spin on each core")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -255,11 +261,15 @@ def _add_plan(sub: Any) -> None:
     from livessl.plan.design import CALIBRATION_M
 
     _add_site(sub)
-    sub.add_argument("--rt60", type=_not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)")
-    sub.add_argument("--height", type=_not_negative, metavar="M", help="of the sounds (default 1.5, if searched)")
+    sub.add_argument(
+        "--rt60", type=argument.not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)"
+    )
+    sub.add_argument(
+        "--height", type=argument.not_negative, metavar="M", help="of the sounds (default 1.5, if searched)"
+    )
     sub.add_argument(
         "--calibration",
-        type=_above_zero,
+        type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
         help=f"how well the microphones' places are known (default {CALIBRATION_M:g})",
@@ -284,10 +294,12 @@ def _add_keys(command: Callable[..., Any]) -> None:
     deed("server", _keys_server, "make the server's key pair", "server --site site.yaml")
     sub = deed("node", _keys_node, "make a node's key pair, on the node", "node lab-pc --site site.yaml --server 4f8a…")
     sub.add_argument("name", help="of the node in the site file; `replay` for who plays sessions to a server")
-    sub.add_argument("--server", type=_key, metavar="KEY", help="the server's public key, as `keys server` told it")
+    sub.add_argument(
+        "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` told it"
+    )
     sub = deed("enrol", _keys_enrol, "let a node in, on the server", "enrol lab-pc 9c01… --site site.yaml")
     sub.add_argument("name", help="of the node in the site file")
-    sub.add_argument("key", type=_key, help="the node's public key, as `keys node` told it")
+    sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` told it")
     sub = deed("token", _keys_token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
     sub.add_argument("--name", required=True, help="of the client, to revoke it by")
     sub.add_argument("--role", choices=[str(role) for role in keyring.Role], default="viewer", help="default viewer")
@@ -311,7 +323,7 @@ def _add_joint(parser: Any) -> None:
     parser.add_argument(
         "--joint",
         action="append",
-        type=_joint,
+        type=argument.joint,
         default=[],
         metavar="NAME=ARRAY,ARRAY,…",
         help="process arrays of one node as one of all their microphones, besides what the site file joins",
@@ -320,12 +332,18 @@ def _add_joint(parser: Any) -> None:
 
 def _add_wav(parser: Any, text: str, *, required: bool = False) -> None:
     parser.add_argument(
-        "--wav", action="append", type=_assignment, default=[], metavar="ARRAY=FILE", help=text, required=required
+        "--wav",
+        action="append",
+        type=argument.assignment,
+        default=[],
+        metavar="ARRAY=FILE",
+        help=text,
+        required=required,
     )
     parser.add_argument(
         "--channels",
         action="append",
-        type=_channels,
+        type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
         help="channels of the file, from 1, in microphone order",
@@ -852,86 +870,3 @@ def _once_each(pairs: Sequence[tuple[str, T]], option: str) -> dict[str, T]:
     if twice is not None:
         raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; take one away")])
     return dict(pairs)
-
-
-def _assignment(text: str) -> tuple[str, Path]:
-    name, equals, path = text.partition("=")
-    if not (name and equals and path):
-        raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
-    return name, Path(path)
-
-
-def _joint(text: str) -> tuple[str, list[str]]:
-    name, _, members = text.partition("=")
-    arrays = members.split(",")
-    if not (name and len(arrays) > 1 and all(arrays)):
-        raise argparse.ArgumentTypeError(f"expected NAME=ARRAY,ARRAY with two arrays or more, got {text!r}")
-    return name, arrays
-
-
-def _channels(text: str) -> tuple[str, list[int]]:
-    name, equals, numbers = text.partition("=")
-    try:
-        channels = [int(number) for number in numbers.split(",")]
-    except ValueError:
-        channels = []
-    if not (name and equals and channels):
-        raise argparse.ArgumentTypeError(f"expected ARRAY=1,2,3,4, got {text!r}")
-    return name, channels
-
-
-def _endpoint(text: str) -> str:
-    try:
-        return check_endpoint(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _key(text: str) -> bytes:
-    try:
-        return keyring.as_key(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _time(text: str) -> int:
-    try:
-        return utc_ns(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _positive(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number from 0 on"))
-
-
-def _rt60(text: str) -> float:
-    return _number(text, lambda value: 0 <= value <= MAX_RT60_S, f"seconds from 0 to {MAX_RT60_S:g}")
-
-
-def _not_negative(text: str) -> float:
-    return _number(text, lambda value: value >= 0, "a number >= 0")
-
-
-def _above_zero(text: str) -> float:
-    return _number(text, lambda value: value > 0, "a number > 0")
-
-
-def _speed(text: str) -> float:
-    return float("inf") if text == "max" else _number(text, lambda value: value > 0, "a number > 0 or 'max'")
-
-
-def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not (valid(value) and value < float("inf")):
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
-    return value

@@ -17,12 +17,13 @@ from websockets.sync.client import connect
 
 from livessl import processes
 from livessl.clock import Clock, utc_ns, utc_text
-from livessl.config import Site, load_site, parse_site
+from livessl.config import Site
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
 from livessl.messages import JsonObject
 from livessl.simulate.export import TRUTH_FILE, write_scene
 from livessl.simulate.scene import Scene, make_scene, synthesised_sounds
+from livessl.site_file import load_site, parse_site
 
 SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
 

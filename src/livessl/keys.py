@@ -18,7 +18,8 @@ import zmq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from zmq.utils import z85
 
-from livessl.config import ConfigError, Fault, Site, read_yaml
+from livessl.config import ConfigError, Fault, Site
+from livessl.site_file import read_yaml
 
 TOKEN_PREFIX: Final = "livessl_"  # noqa: S105 - what every token begins with, so that scanners for leaks find them
 TOKEN_BYTES: Final = 32

@@ -11,7 +11,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from livessl.clock import utc_ns, utc_text
-from livessl.config import ConfigError, Fault, Site, load_site, read_yaml
+from livessl.config import ConfigError, Fault, Site
+from livessl.site_file import load_site, read_yaml
 
 SESSION_FILE: Final = "session.yaml"
 SITE_FILE: Final = "site.yaml"

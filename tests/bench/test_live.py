@@ -16,10 +16,10 @@ from livessl.bench import kernels, live, load
 from livessl.bench.live import Demand, Outcome
 from livessl.cli import main
 from livessl.clock import SystemClock
-from livessl.config import parse_site
 from livessl.core.fusion import Fusion
 from livessl.core.types import FRAME_NS, Event, Update
 from livessl.processes import NotStartedError
+from livessl.site_file import parse_site
 
 DEMAND = Demand(arrays=2, clients=2, seconds=10.0, spacing_m=0.2, rt60_s=0.0)
 GOOD = Outcome(

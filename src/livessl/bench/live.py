@@ -21,9 +21,9 @@ from livessl import processes
 from livessl.bench import load
 from livessl.bench.listeners import Heard, listen
 from livessl.clock import Clock
-from livessl.config import parse_site
 from livessl.messages import JsonObject
 from livessl.processes import NotStartedError
+from livessl.site_file import parse_site
 
 READY_NS: Final = 120_000_000_000
 """For a server to work out its tables and hear every array."""

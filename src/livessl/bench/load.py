@@ -13,10 +13,11 @@ import yaml
 from livessl import wire
 from livessl.capture.link import Link
 from livessl.clock import Clock, SystemClock
-from livessl.config import Site, parse_site
+from livessl.config import Site
 from livessl.core.activity import band_power
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, Frame
 from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
+from livessl.site_file import parse_site
 
 SOUND_FRAMES: Final = 40
 """Two seconds of sound, then …"""

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from livessl.config import load_site
 from livessl.evaluate.layout import layout_of
 from livessl.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
 from livessl.evaluate.scenarios import ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
+from livessl.site_file import load_site
 
 HALVES: Final = ("development", "test")
 LOCALIZER: Final = "localizer"

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from livessl.capture.line import Line
-from livessl.config import Site, parse_site
+from livessl.config import Site
 from livessl.core.types import Block, Event, Float32Array, FloatArray, Output, Track, TrackState
 from livessl.evaluate.command import HALVES
 from livessl.evaluate.localizer import METHODS
@@ -25,6 +25,7 @@ from livessl.evaluate.scenarios import ARRAYS, SESSIONS, TWO, SessionCase
 from livessl.evaluate.unit import PEAK, Clips, Row, convolved
 from livessl.simulate.moving import place_on_way, render_moving
 from livessl.simulate.room import impulse_responses
+from livessl.site_file import parse_site
 
 POSITIONS: Final = 100
 
