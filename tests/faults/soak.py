@@ -462,12 +462,12 @@ class Crowd:
     def _poll(self) -> None:
         asked = ["health", "arrays", "events?limit=200", "tracks", "map", "../../metrics", "openapi.json"]
         for k in range(10**9):
-            if self._ended.wait(4.0):
-                return
             address = f"{self._url}/api/v1/{asked[k % len(asked)]}".replace("/api/v1/../..", "")
             with urllib.request.urlopen(address) as answer:
                 answer.read()
             self.heard["answers"] += 1
+            if self._ended.wait(4.0):
+                return
 
 
 def _hung_up(connection: socket.socket) -> bool:

@@ -398,6 +398,7 @@ class Onset(SrpPhat):
         evidence = tuple(each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True))
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [peaks.neighbourhood(place.position_m, self._grid)]
+        apart_nodes = round(_CANDIDATES_APART_M / self._grid.spacing_m)
         best, chosen = 0.0, (place, 0.0)
         for _ in range(several.CANDIDATES):
             found = find(1, without=known)
@@ -414,7 +415,7 @@ class Onset(SrpPhat):
             if power * clearness > best:
                 candidate = agreement.Place(evidence, functional, position_m, power, power, found[0].proven)
                 best, chosen = power * clearness, (candidate, several.confidence(clearness))
-            known.append(peaks.box_around(self._grid, found[0].node, _CANDIDATES_APART))
+            known.append(peaks.box_around(self._grid, found[0].node, apart_nodes))
         other, confidence = chosen
         return replace(other, rival_power=peaks.rival_power(find, self._grid, other.position_m)), confidence
 
@@ -498,8 +499,8 @@ SEARCH_SPACING_M: Final = 0.1
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
 
-_CANDIDATES_APART: Final = 5
-"""Nodes between places that may be a second source: half a metre."""
+_CANDIDATES_APART_M: Final = 0.5
+"""Between places that are looked at for a second source, along each axis."""
 
 MOST_ARRAYS: Final = 16
 """Arrays that a place is told by: of more, those that heard it most clearly. The others hardly move it, and what an
