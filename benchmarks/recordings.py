@@ -56,9 +56,10 @@ class Found:
     mahalanobis2: float | None
 
 
-def events_in(site: Site, parts: Sequence[Part]) -> list[Event]:
-    """Everything that the pipeline finds."""
-    return [output for output in replay.run(site, parts, UnpacedClock()) if isinstance(output, Event)]
+def events_in(site: Site, parts: Sequence[Part], method: str | None = None) -> list[Event]:
+    """Everything that the pipeline finds, by the site's method or another."""
+    outputs = replay.run(site, parts, UnpacedClock(), method=method)
+    return [output for output in outputs if isinstance(output, Event)]
 
 
 def wrapped_deg(angle_deg: float) -> float:
@@ -71,18 +72,19 @@ def field_truth_m(file: Path) -> FloatArray:
     return np.array([int(number) for number in re.findall(r"\d+", file.stem)[-2:]]) / 100.0
 
 
-def field_errors_m() -> dict[str, list[float]]:
+def field_errors_m(method: str | None = None) -> dict[str, list[float]]:
     """Horizontal error of every event, for each file of the field."""
     site = parse_site(yaml.safe_dump(FIELD))
     errors: dict[str, list[float]] = {}
     for file in sorted((DATA / "epo4_room_5mic").glob("*.wav")):
-        events = events_in(site, parts_from_wavs(site, {"field": file}, {"field": FIELD_CHANNELS}))
+        parts = parts_from_wavs(site, {"field": file}, {"field": FIELD_CHANNELS})
+        events = events_in(site, parts, method)
         places = [event.estimate.position_m[:2] for event in events if event.estimate is not None]
         errors[file.name] = [float(np.linalg.norm(place - field_truth_m(file))) for place in places]
     return errors
 
 
-def measured_room_errors_deg() -> tuple[list[float], int]:
+def measured_room_errors_deg(method: str | None = None) -> tuple[list[float], int]:
     """Azimuth error of every event in the measured rooms, and how many sounds were played.
 
     Each of seven measured rooms, each of its two interleaved squares of four microphones, every fourth sound.
@@ -97,20 +99,20 @@ def measured_room_errors_deg() -> tuple[list[float], int]:
             towards = measured["loc_loudspeaker"][0] - microphones.mean(axis=0)
             true_deg = float(np.degrees(np.arctan2(towards[1], towards[0])))
             heard = _played_in(measured["RIR"][:, square].T.astype(np.float32), sounds, 48000)
-            azimuths = _azimuths_deg(_one_array_site(microphones, [8.1, 6.8, 3.07]), heard, 48000.0)
+            azimuths = _azimuths_deg(_one_array_site(microphones, [8.1, 6.8, 3.07]), heard, 48000.0, method)
             errors += [abs(wrapped_deg(azimuth - true_deg)) for azimuth in azimuths]
             played += len(sounds)
     return errors, played
 
 
-def talker_errors_deg(take: str) -> list[float]:
+def talker_errors_deg(take: str, method: str | None = None) -> list[float]:
     """Azimuth error of every event of one take of a talker."""
     folder = DATA / "respeaker_4mic" / take
     tracks = [soundfile.read(folder / f"track{k}.wav", dtype="float32") for k in range(2, 6)]
     around = np.radians([0.0, 90.0, 180.0, 270.0])
     circle = 0.032 * np.column_stack([np.cos(around), np.sin(around), np.zeros(4)])
     site = _one_array_site(circle + np.array([2.5, 2.5, 1.0]), [5.0, 5.0, 2.5])
-    azimuths = _azimuths_deg(site, np.stack([samples for samples, _ in tracks]), float(tracks[0][1]))
+    azimuths = _azimuths_deg(site, np.stack([samples for samples, _ in tracks]), float(tracks[0][1]), method)
     return [abs(wrapped_deg(azimuth - TALKERS[take])) for azimuth in azimuths]
 
 
@@ -172,8 +174,8 @@ def _played_in(responses: Float32Array, sounds: Sequence[Float32Array], rate_hz:
     return np.asarray(whole + np.float32(1e-4) * noise, dtype=np.float32)
 
 
-def _azimuths_deg(site: Site, samples: Float32Array, rate_hz: float) -> list[float]:
+def _azimuths_deg(site: Site, samples: Float32Array, rate_hz: float, method: str | None) -> list[float]:
     """Azimuth of every event, as the array sees it."""
     recording = ArrayRecording("recorded", rate_hz, samples)
     part = Part("array", Placed(recording, 0), tuple(range(1, len(samples) + 1)))
-    return [event.contributions[0].azimuth_deg for event in events_in(site, [part])]
+    return [event.contributions[0].azimuth_deg for event in events_in(site, [part], method)]
