@@ -8,11 +8,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from livessl import keys as keyring
 from livessl.clock import utc_ns
 from livessl.config import check_endpoint
+
+T = TypeVar("T")
 
 MAX_RT60_S: Final = 5.0
 """Images grow with the cube of the reverberation time: more would take hours, and few rooms ring longer."""
@@ -49,26 +51,17 @@ def channels(text: str) -> tuple[str, list[int]]:
 
 def endpoint(text: str) -> str:
     """A ZeroMQ address that one can connect to."""
-    try:
-        return check_endpoint(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    return _read(text, check_endpoint)
 
 
 def key(text: str) -> bytes:
     """A public key of CURVE, as `livessl keys` tells it."""
-    try:
-        return keyring.as_key(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    return _read(text, keyring.as_key)
 
 
 def time(text: str) -> int:
     """RFC 3339: nanoseconds UTC."""
-    try:
-        return utc_ns(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    return _read(text, utc_ns)
 
 
 def positive(text: str) -> int:
@@ -101,6 +94,13 @@ def above_zero(text: str) -> float:
 def speed(text: str) -> float:
     """Times real time; 'max' is without end."""
     return float("inf") if text == "max" else _number(text, lambda value: value > 0, "a number > 0 or 'max'")
+
+
+def _read(text: str, read: Callable[[str], T]) -> T:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:

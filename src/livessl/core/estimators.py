@@ -398,7 +398,7 @@ class Onset(SrpPhat):
         evidence = tuple(each.without(taken_s) for each, taken_s in zip(moments, delays_s, strict=True))
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [peaks.neighbourhood(place.position_m, self._grid)]
-        apart_nodes = round(_CANDIDATES_APART_M / self._grid.spacing_m)
+        apart_nodes = round(several.CANDIDATES_APART_M / self._grid.spacing_m)
         best, chosen = 0.0, (place, 0.0)
         for _ in range(several.CANDIDATES):
             found = find(1, without=known)
@@ -498,9 +498,6 @@ SEARCH_SPACING_M: Final = 0.1
 
 _STARTS: Final = 3
 """Places looked at more closely: between two nodes a lower one may be the higher one in truth."""
-
-_CANDIDATES_APART_M: Final = 0.5
-"""Between places that are looked at for a second source, along each axis."""
 
 MOST_ARRAYS: Final = 16
 """Arrays that a place is told by: of more, those that heard it most clearly. The others hardly move it, and what an

@@ -28,6 +28,9 @@ MOST_MOMENTS: Final = 40
 CANDIDATES: Final = 6
 """Places looked at for each source; the right one is hardly ever further down."""
 
+CANDIDATES_APART_M: Final = 0.5
+"""Between these, along each axis."""
+
 LITTLE: Final = 200.0
 """Weight of a moment's onsets below which it is mostly noise, and counts the less: noise at 10 dB gives some 30, a
 source in a clear moment thousands."""
