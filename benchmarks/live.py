@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from livessl.bench import live
-from livessl.cli import main as livessl
+from livessl.cli.main import main as livessl
 from livessl.clock import SystemClock
-from livessl.core import estimators
-from livessl.core.estimators import Localization, PowerMaps, Sound
 from livessl.core.geometry import Grid
+from livessl.core.locate import estimators
+from livessl.core.locate.estimators import Localization, PowerMaps, Sound
 from livessl.core.types import ArraySpec, HeardBy
+from livessl.lab.bench import live
 from livessl.server.engine import Engine
 
 

@@ -2,10 +2,10 @@
 
     python benchmarks/peers.py --out docs/performance
 
-Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.bench.kernels`. The work is the whole way
-from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl does,
-so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map with
-that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
+Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.lab.bench.kernels`. The work is the whole
+way from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl
+does, so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map
+with that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
 
 On the fine grid the others are timed on a random part of the nodes, the time being scaled up with the nodes: all of
 them work node by node, and what they do once a block is below a hundredth of what they do on the part.
@@ -31,19 +31,20 @@ from threadpoolctl import threadpool_limits
 
 import machine
 from livessl import wire
-from livessl.bench import kernels as bench
+from livessl.cli.progress import counted
 from livessl.clock import SystemClock
-from livessl.core import compiled, search, srp, vectorised
-from livessl.core.activity import band_bins
-from livessl.core.frontends import Spectra, whole_segment
-from livessl.core.gcc import GCCPhat, correlated, microphone_pairs
+from livessl.core.correlate.band import band_bins
+from livessl.core.correlate.gcc_phat import GCCPhat, correlated, microphone_pairs
+from livessl.core.correlate.spectra import Spectra, whole_segment
 from livessl.core.geometry import Grid, posed, tetrahedron
-from livessl.core.peaks import Peak
-from livessl.core.search import PeakSearch
-from livessl.core.srp import SRPMapper, pair_weight
+from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.locate import peak_search, srp
+from livessl.core.locate.peak_search import PeakSearch
+from livessl.core.locate.refine import Peak
+from livessl.core.locate.srp import SRPMapper, pair_weight
 from livessl.core.steering import steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray, Frame, HeardBy, RealArray
-from livessl.progress import counted
+from livessl.lab.bench import kernels as bench
 
 COARSE_M: Final = 0.5
 FINE_M: Final = 0.1
@@ -221,13 +222,13 @@ PEERS: Final[dict[str, Callable[[Sequence[ArraySpec], FloatArray], Power]]] = {
 @contextmanager
 def using(form: ModuleType) -> Iterator[None]:
     """Build and run with one form of the kernels, `compiled` or `vectorised`."""
-    before = vars(search)["kernels"]
-    for module in (search, srp):
+    before = vars(peak_search)["kernels"]
+    for module in (peak_search, srp):
         setattr(module, "kernels", form)  # noqa: B010 - it is not exported, and mypy would say so
     try:
         yield
     finally:
-        for module in (search, srp):
+        for module in (peak_search, srp):
             setattr(module, "kernels", before)  # noqa: B010
 
 
@@ -306,7 +307,7 @@ def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) 
     def to_peak(power: Power) -> Callable[[Sounds], int]:
         return lambda sounds: int(power(sounds).argmax())
 
-    for form in (compiled, vectorised):
+    for form in (with_numba, with_numpy):
         ours = Ours(specs, grid, form)
         label = {"numba": "compiled", "NumPy": "NumPy"}[form.NAME]
         yield _Contender(f"livessl, map, {label}", spacing_m, grid.size, grid.size, to_peak(ours.power), at_part(ours))
@@ -420,7 +421,7 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
             place_m = np.concatenate([part.microphones_m for part in parts[own]])[:count]
             specs.append(ArraySpec(name, place_m, bench.BAND_HZ))
             heard.append(np.concatenate(sounds[own])[:count])
-        fine, display = Ours(specs, room_grid(0.05), compiled), Ours(specs, room_grid(FINE_M), compiled)
+        fine, display = Ours(specs, room_grid(0.05), with_numba), Ours(specs, room_grid(FINE_M), with_numba)
         microphones += [{"microphones": count, "what": what} for what in ("GCC", "peak", "map")]
         cases += [
             bench.Case("GCC", _each(fine.heard, [heard])),
@@ -431,11 +432,11 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
     block = bench.Blocks(specs).sound("voice", 0)
     maps: list[dict[str, Any]] = []
     for spacing_m in MAP_SPACINGS_M:
-        ours = Ours(specs, room_grid(spacing_m), compiled)
+        ours = Ours(specs, room_grid(spacing_m), with_numba)
         maps.append({"spacing_m": spacing_m, "nodes": room_grid(spacing_m).size})
         cases.append(bench.Case("map", _each(ours.power, [block])))
     forms: list[dict[str, Any]] = []
-    for form in (compiled, vectorised):
+    for form in (with_numba, with_numpy):
         ours = Ours(specs, room_grid(FINE_M), form)
         forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
         cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))

@@ -14,14 +14,15 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.activity import ActivityParameters, CausalActivity, band_power, exact_mask
-from livessl.core.estimators import Localization, Onset, Sound
-from livessl.core.fusion import Fusion, FusionParameters
+from livessl.core.correlate.band import band_power
 from livessl.core.geometry import Grid
+from livessl.core.locate.estimators import Localization, Onset, Sound
+from livessl.core.stream.activity import ActivityParameters, CausalActivity, exact_mask
+from livessl.core.stream.fusion import Fusion, FusionParameters
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame, Track
-from livessl.evaluate.campaign import read_clips
-from livessl.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
-from livessl.evaluate.unit import convolved
+from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
+from livessl.lab.evaluate.unit import convolved
 from livessl.simulate.moving import place_on_way, render_moving
 from livessl.simulate.room import impulse_responses
 

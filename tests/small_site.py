@@ -15,14 +15,14 @@ import numpy as np
 import soundfile
 import yaml
 
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.recorded import Part
 from livessl.clock import SystemClock
-from livessl.config import Site
 from livessl.core.types import Float32Array, Frame, Mark
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
 from livessl.simulate.scene import Scene, make_scene, render
-from livessl.site_file import parse_site
+from livessl.site.load import parse_site
+from livessl.site.models import Site
 
 RATE_HZ = 16000
 SMALL: dict[str, Any] = {

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from livessl import wire
-from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.link import Link
 from livessl.capture.node import (
     AHEAD_NS,
@@ -25,11 +24,12 @@ from livessl.capture.node import (
     capture_recordings,
     send_session,
 )
-from livessl.capture.recorded import Part
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.config import Site
 from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.receiver import Item, Joined, Left, Receiver
+from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, mark, site_of, wait_until
 
 START_NS = 1_767_225_600_000_000_000

@@ -32,17 +32,17 @@ from world import START, Event, HandClock, Microphones, Post, World
 
 from clients import Listener, Log, open_client
 from livessl import wire
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.line import played_messages
-from livessl.capture.recorded import Part, lines_of
 from livessl.clock import UnpacedClock, utc_ns
-from livessl.config import Site
 from livessl.core.types import FRAME_NS, Frame, Message
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
 from livessl.server.engine import Engine
 from livessl.server.latency import Arrival
 from livessl.server.refusals import Refusals
 from livessl.simulate.scene import make_scene, render
+from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
 
 SECOND = 20
@@ -146,7 +146,7 @@ def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
 def _by_interval(site: Site, part: Part) -> dict[int, list[Frame]]:
     found: dict[int, list[Frame]] = {}
     run_up: list[Frame] = []
-    for _, batch in played_messages(*lines_of(site, [part]), UnpacedClock()):
+    for _, batch in played_messages(*pipelines_of(site, [part]), UnpacedClock()):
         for message in batch:
             if isinstance(message, Frame):
                 run_up.append(message)

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import pytest
 from soak import GROWTH, READERS, Outcome, soak
 
-from livessl.core.settling import Settling
+from livessl.core.stream.final_pass import Settling
 from livessl.core.types import Message
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(120)]

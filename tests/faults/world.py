@@ -21,14 +21,14 @@ from livessl import wire
 from livessl.capture.link import Dealer, Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
-from livessl.config import Site
-from livessl.core.estimators import ESTIMATORS, Localization, PowerMaps, Sound
+from livessl.core.locate.estimators import ESTIMATORS, Localization, PowerMaps, Sound
 from livessl.core.types import FRAME_NS, Frame, HeardBy, Mark, Message
 from livessl.server.engine import Engine
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrivals
 from livessl.server.receiver import Greeted, Item, Joined, Left
 from livessl.server.store import Query, Store, StoreError
+from livessl.site.models import Site
 from small_site import RATE_HZ, site_of
 
 START = 20 * 1_767_225_600

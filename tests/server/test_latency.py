@@ -7,7 +7,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 from livessl.core.types import FRAME_NS, Estimate, Event, Status, Update
-from livessl.messages import Messages, Stages
+from livessl.server.api.encode import Messages, Stages
 from livessl.server.latency import KEPT, Arrival, Arrivals, Latency
 from small_site import site_of
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from livessl.clock import SystemClock
-from livessl.core.estimators import PowerMaps
 from livessl.core.geometry import Grid
+from livessl.core.locate.estimators import PowerMaps
 from livessl.core.types import GCC, ArraySpec, HeardBy, Window
 from livessl.server.maps import HEADER, INTERVAL_NS, Maps
 from small_site import wait_until

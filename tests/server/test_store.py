@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from livessl.core.types import FRAME_NS
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 
 START_NS = 1_767_225_600_000_000_000

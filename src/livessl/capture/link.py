@@ -18,7 +18,7 @@ from livessl import wire
 from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
 from livessl.core.types import Ask, Frame, Mark, Message
-from livessl.keys import NodeKeys
+from livessl.site.keys import NodeKeys
 
 BACKLOG_FRAMES: Final = 16
 """Kept frames on their way at a time: what live sound may have to wait behind, a quarter of a second at 3 MB/s."""

@@ -11,19 +11,20 @@ from typing import Final
 
 from livessl import wire
 from livessl.clock import Clock, utc_ns, utc_text
-from livessl.config import Site
-from livessl.core.search import warm_up
-from livessl.core.settling import Settled, Settling
-from livessl.core.streams import ArrayState, ArrayStatus
+from livessl.core.locate.peak_search import warm_up
+from livessl.core.stream.array_health import ArrayState, ArrayStatus
+from livessl.core.stream.final_pass import Settled, Settling
 from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
-from livessl.messages import JsonObject, Messages, Stages, array_status
-from livessl.server.helper import Helper
+from livessl.server.api.encode import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
+from livessl.server.parallel import Helper
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.refusals import Refusals
 from livessl.server.resident import unmap_unused
 from livessl.server.store import Store, StoreError
+from livessl.site.build.fusion import make_clock_offsets, make_fusion
+from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
 """How long the thread waits for sound before it looks at the clock again."""
@@ -240,10 +241,10 @@ class Engine:
         self, arrays: Iterable[str], settled: int | None, clocks: JsonObject | None = None, *, live: bool = False
     ) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._clocks = self._site.make_clock_offsets()
+        self._clocks = make_clock_offsets(self._site)
         if clocks is not None:
             self._clocks.restore(clocks)
-        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks, each=self._helper.each)
+        fusion = make_fusion(self._site, live=live, clock_offsets=self._clocks, each=self._helper.each)
         self._settling = Settling(fusion, arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from livessl import wire
-from livessl.config import Site
 from livessl.core.types import Ask, Frame, Mark, Message
+from livessl.site.models import Site
 
 ACK_NS: Final = 250_000_000
 """Every node hears from us at least this often."""

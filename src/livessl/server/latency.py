@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from prometheus_client import Histogram
 
 from livessl.core.types import FRAME_NS, Event, Update
-from livessl.messages import JsonObject, Stages
+from livessl.server.api.encode import JsonObject, Stages
 
 KEPT: Final = 1200
 """Raster intervals whose arrival is remembered: a minute."""

@@ -14,14 +14,14 @@ import zmq
 
 from livessl import wire
 from livessl.clock import Clock
-from livessl.config import Site
 from livessl.core.types import Ask, Message
 from livessl.errors import RunError
-from livessl.keys import server_keys
 from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrival, Arrivals
 from livessl.server.refusals import Refusals
+from livessl.site.keys import server_keys
+from livessl.site.models import Site
 
 POLL_MS: Final = 20
 """How long the thread waits for sound before it looks whether acknowledgements are due."""

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """About 10 MB. A file has no such limit."""
