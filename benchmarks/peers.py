@@ -43,7 +43,7 @@ from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.refine import Peak
 from livessl.core.locate.srp import SRPMapper, pair_weight
 from livessl.core.steering import steering_delays_s
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, Frame, HeardBy, RealArray
+from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray, Frame, RealArray
 from livessl.lab.bench import kernels as bench
 
 COARSE_M: Final = 0.5
@@ -255,16 +255,16 @@ class Ours:
             for spec in specs:
                 self._search.prepare(spec.name, self._gcc[spec.name].lags_s)
 
-    def heard(self, sounds: Sounds) -> list[HeardBy]:
+    def heard(self, sounds: Sounds) -> list[Evidence]:
         """Every array's GCC."""
         gccs = correlated([(self._gcc[spec.name], [x]) for spec, x in zip(self._specs, sounds, strict=True)])
-        return [HeardBy(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
+        return [Evidence(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
 
     def power(self, sounds: Sounds) -> Float32Array:
         """The summed map (G,), overwritten by the next call."""
         return self.mapped(self.heard(sounds))
 
-    def mapped(self, heard: Sequence[HeardBy]) -> Float32Array:
+    def mapped(self, heard: Sequence[Evidence]) -> Float32Array:
         """The same from the GCCs."""
         self._power[:] = 0.0
         with using(self._form):
@@ -368,9 +368,9 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
     gcc = [GCCPhat(spec, bench.RATE_HZ, bench.C_M_S) for spec in specs]
     lengths = {"block": bench.BLOCK, "1 s": bench.SEGMENT}
 
-    def evidence(kind: str, length: str, number: int) -> list[HeardBy]:
+    def evidence(kind: str, length: str, number: int) -> list[Evidence]:
         sounds = blocks.sound(kind, number, lengths[length])
-        return [HeardBy(spec, make([x])) for spec, make, x in zip(specs, gcc, sounds, strict=True)]
+        return [Evidence(spec, make([x])) for spec, make, x in zip(specs, gcc, sounds, strict=True)]
 
     heard = {
         (kind, length): [evidence(kind, length, number) for number in range({"block": 12, "1 s": 3}[length])]
@@ -378,7 +378,7 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
         for length in lengths
     }
 
-    def search_in(peaks: PeakSearch) -> Callable[[list[HeardBy]], Peak]:
+    def search_in(peaks: PeakSearch) -> Callable[[list[Evidence]], Peak]:
         return lambda one: peaks.among(one)(1)[0]
 
     rows: list[dict[str, Any]] = []

@@ -16,9 +16,9 @@ from livessl import offline
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
-from livessl.core.stream.final_pass import Settled, Settling
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.stream.segmenter import RECENT_S
-from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Ask, Event, Frame, Message, Output, Status
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import ArrayRecording, Placed
@@ -107,32 +107,32 @@ class Live:
 
     def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
         self.lines, self.placed = pipelines_of(site(), parts(ahead_ns=ahead_ns))
-        self.settling = Settling(make_fusion(site(), live=True), ("north", "south"))
+        self.settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
         self.way, self.deaf = way, deaf
-        self.asks: list[Ask] = []
+        self.asks: list[BackfillRequest] = []
 
-    def run(self) -> list[Output | Settled]:
-        outputs: list[Output | Settled] = []
+    def run(self) -> list[Output | FinalResults]:
+        outputs: list[Output | FinalResults] = []
         coming: list[tuple[int, list[Message]]] = []
         for k, (now_ns, batch) in enumerate(played_messages(self.lines, self.placed, UnpacedClock())):
             answers = [message for due, messages in coming if due <= k for message in messages]
             coming = [entry for entry in coming if entry[0] > k]
             new = self.settling.step([*batch, *answers], now_ns)
-            for ask in (output for output in new if isinstance(output, Ask)):
+            for ask in (output for output in new if isinstance(output, BackfillRequest)):
                 self.asks.append(ask)
                 if not self.deaf:
                     coming.append((k + self.way, self.answer(ask)))
             outputs += new
         return outputs + self.settling.flush(now_ns)
 
-    def answer(self, ask: Ask) -> list[Message]:
+    def answer(self, ask: BackfillRequest) -> list[Message]:
         return [message for line in self.lines for message in line.backfill(ask)]
 
 
-def settled(outputs: Sequence[Output | Settled]) -> list[Event]:
-    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+def settled(outputs: Sequence[Output | FinalResults]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
 @pytest.mark.parametrize("way", [1, 4, 8])
@@ -157,7 +157,7 @@ def test_old_nodes_are_asked_nothing() -> None:
 
 def test_disabled_arrays_are_asked_nothing() -> None:
     live = Live(1)
-    live.settling.spare({"south"})
+    live.settling.exclude({"south"})
     live.run()
     assert live.asks == []
 
@@ -179,7 +179,7 @@ def test_arrays_are_asked_by_their_own_clocks() -> None:
     assert clocks is not None
     for k in range(3):
         clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-    live.settling = Settling(live.settling.live, ("north", "south"))
+    live.settling = TwoPassFusion(live.settling.live, ("north", "south"))
     live.settling.greet("south", None, START_NS, answers=True)
     events = settled(live.run())
     expected = offline_events()
@@ -194,14 +194,14 @@ def test_nobody_is_asked_where_the_answer_is_sure() -> None:
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
-    fusion.askable = {"north", "south"}
+    fusion.can_backfill = {"north", "south"}
     outputs: list[Output] = []
     for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
     assert all(event.estimate is not None and event.estimate.confidence >= SURE for event in events)
-    assert not [output for output in outputs if isinstance(output, Ask)]
+    assert not [output for output in outputs if isinstance(output, BackfillRequest)]
 
 
 @cache
@@ -233,8 +233,8 @@ def test_the_nearest_are_asked() -> None:
 def test_frames_that_nobody_asked_for_change_nothing() -> None:
     fusion = make_fusion(site(), updates=False)
     samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
-    raster = START_NS // FRAME_NS
-    stray = Frame("south", 0, raster, START_NS, float(RATE_HZ), samples, 0.01, True)
+    frame_index = START_NS // FRAME_NS
+    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True)
     assert fusion.step([stray], START_NS) == []
     assert fusion.closed is None
     assert fusion.status(START_NS)[1].counters["frames"] == 0
@@ -268,12 +268,12 @@ def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> No
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
     ]
-    settling = Settling(make_fusion(site(), live=True), ("north", "south"))
+    settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
     for name in ("north", "south"):
         settling.greet(name, None, START_NS, answers=True)
     held: list[Message] | None = []
     asked = False
-    told: list[Output | Settled] = []
+    told: list[Output | FinalResults] = []
     for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
         if held is not None:
             held += [message for message in batch if message.array == "south"]
@@ -281,9 +281,9 @@ def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> No
             if asked:
                 batch, held = [*batch, *held], None
         new = settling.step(batch, now_ns)
-        asked = asked or any(isinstance(output, Ask) for output in new)
-        told += [output for output in new if isinstance(output, Event | Settled)]
+        asked = asked or any(isinstance(output, BackfillRequest) for output in new)
+        told += [output for output in new if isinstance(output, Event | FinalResults)]
     assert asked
-    assert isinstance(told[0], Settled)
+    assert isinstance(told[0], FinalResults)
     assert [event.heard_by for event in settled(told)] == [("north", "south")] * SOUNDS
     assert not [output for output in told if isinstance(output, Event)]

@@ -23,7 +23,7 @@ from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.locate import peak_search, srp
 from livessl.core.locate.peak_search import PeakSearch, Rule
 from livessl.core.locate.refine import FindPeaks
-from livessl.core.types import HeardBy
+from livessl.core.types import Evidence
 from livessl.lab.bench import kernels
 
 Json = dict[str, Any]
@@ -80,7 +80,7 @@ def test_fused_maps_are_what_the_search_is_held_against() -> None:
 def test_a_search_that_is_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     among = PeakSearch.among
 
-    def wrong(self: PeakSearch, evidence: Sequence[HeardBy], rule: Rule, *most: int) -> FindPeaks:
+    def wrong(self: PeakSearch, evidence: Sequence[Evidence], rule: Rule, *most: int) -> FindPeaks:
         find = among(self, evidence, rule, *most)
         return lambda count, *rest: [replace(peak, node=peak.node + 1) for peak in find(count, *rest)]
 

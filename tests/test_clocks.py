@@ -13,7 +13,7 @@ import pytest
 from livessl.clock import UnpacedClock
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset
-from livessl.core.stream.final_pass import Settled, Settling
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.stream.fusion import Fusion
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
 from livessl.recordings.assign import pipelines_of
@@ -138,17 +138,17 @@ def test_sounds_close_to_one_another_stay_apart() -> None:
     assert [event.heard_by for event in events] == [("north", "south")] * 2
 
 
-def _frame(array: str, raster: int) -> Frame:
-    samples = np.random.default_rng(raster).standard_normal((4, 800)).astype(np.float32)
-    return Frame(array, 1, raster, raster * FRAME_NS, float(RATE_HZ), samples, 0.01, True)
+def _frame(array: str, frame_index: int) -> Frame:
+    samples = np.random.default_rng(frame_index).standard_normal((4, 800)).astype(np.float32)
+    return Frame(array, 1, frame_index, frame_index * FRAME_NS, float(RATE_HZ), samples, 0.01, True)
 
 
-def settled_events(outputs: Iterable[Output | Settled]) -> list[Event]:
-    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+def settled_events(outputs: Iterable[Output | FinalResults]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
-def settling(fusion: Fusion | None = None, settled: int | None = None) -> Settling:
-    return Settling(fusion or make_fusion(site(), live=True), ("north", "south"), settled)
+def settling(fusion: Fusion | None = None, settled: int | None = None) -> TwoPassFusion:
+    return TwoPassFusion(fusion or make_fusion(site(), live=True), ("north", "south"), settled)
 
 
 @pytest.mark.parametrize("step", [1, 7, 100])
@@ -156,7 +156,7 @@ def settling(fusion: Fusion | None = None, settled: int | None = None) -> Settli
 def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
     """However many messages come at a time; and none of them only from the fusion that does not wait."""
     into = settling()
-    outputs: list[Output | Settled] = []
+    outputs: list[Output | FinalResults] = []
     all_batches = batches(ahead_s)
     for at in range(0, len(all_batches), step):
         some = all_batches[at : at + step]
@@ -188,18 +188,18 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
             again = settling(fusion, stored[0])
             for name in arrays:
                 if kept[name]:
-                    again.greet(name, (kept[name][0].raster, kept[name][-1].raster + 1), now_ns)
+                    again.greet(name, (kept[name][0].frame_index, kept[name][-1].frame_index + 1), now_ns)
             outputs += again.step([frame for name in arrays for frame in kept[name]], now_ns)
             for name in arrays:
                 again.greet(name, None, now_ns)
             into = again
         for output in outputs:
-            if isinstance(output, Settled):
+            if isinstance(output, FinalResults):
                 events += output.events
                 assert into.live.clock_offsets is not None
                 stored = output.until, into.live.clock_offsets.state()
         for name, settled in into.settled_of.items():
-            kept[name] = [frame for frame in kept[name] if frame.raster >= settled]
+            kept[name] = [frame for frame in kept[name] if frame.frame_index >= settled]
     events += settled_events(into.flush(now_ns))
     assert told(events) == expected
 

@@ -249,7 +249,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [piece.array for piece in read_session(session).pieces] == ["north", "south"]
     assert read_session(session).site().joint == {"both": ("north", "south")}
     capsys.readouterr()
-    # nothing but the raster of 50 ms, which a recording's beginning may cut otherwise, is not the same
+    # nothing but the grid of frames of 50 ms, which a recording's beginning may cut otherwise, is not the same
     replayed = told(capsys, "replay", session, "--once", "--speed", "max")
     assert [event["arrays"] for event in replayed] == [["both"], ["both"]]
     for one, other in zip(replayed, joint, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from livessl import wire
 from livessl.clock import Clock
-from livessl.core.types import Ask, Frame, Mark, Message, Output
+from livessl.core.types import BackfillRequest, Frame, Mark, Message, Output
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.site.build.fusion import make_fusion
@@ -34,12 +34,12 @@ def run(
     fusion = make_fusion(site, method, updates=False)
     pipelines, placed = pipelines_of(site, parts)
     if ask:
-        fusion.askable.update(array for pipeline in pipelines for array in pipeline.arrays)
+        fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
     now_ns = 0
     for now_ns, batch in played_messages(pipelines, placed, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
-        while asks := [output for output in outputs if isinstance(output, Ask)]:
-            yield from (output for output in outputs if not isinstance(output, Ask))
+        while asks := [output for output in outputs if isinstance(output, BackfillRequest)]:
+            yield from (output for output in outputs if not isinstance(output, BackfillRequest))
             answers = [message for ask in asks for pipeline in pipelines for message in pipeline.backfill(ask)]
             outputs = fusion.step(_over_the_wire(answers), now_ns)
         yield from outputs

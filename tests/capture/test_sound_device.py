@@ -545,7 +545,7 @@ def test_records_each_channel_of_a_card_in_its_place(card: VirtualCard, tmp_path
     assert recorded["samples"].shape == (4, count * BLOCK)
     assert not recorded["overflow"].any()
     assert_array_equal(recorded["first_index"], BLOCK * np.arange(count))
-    # Stamps serve to put frames on a raster of 50 ms, so most must lie nearer than that to an even run.
+    # Stamps serve to put frames on a frame index of 50 ms, so most must lie nearer than that to an even run.
     even_ns = recorded["stamp_ns"][0] + recorded["first_index"] / RATE_HZ * 1e9
     assert np.median(np.abs(recorded["stamp_ns"] - even_ns)) < FRAME_NS
 

@@ -69,10 +69,10 @@ def frames_of(made: Sequence[Message], array: str) -> list[Frame]:
 def test_burst_becomes_frames_and_quiet_marks() -> None:
     for array in BOTH:
         frames = frames_of(WHOLE, array)
-        active = [frame.raster - START_NS // FRAME_NS for frame in frames if frame.active]
+        active = [frame.frame_index - START_NS // FRAME_NS for frame in frames if frame.active]
         assert active == [24, 25, 26, 27]  # 1.2 s to 1.4 s
-        rasters = [frame.raster - START_NS // FRAME_NS for frame in frames]
-        assert rasters == list(range(24 - 8, 28 + 6))  # 0.4 s before, 0.3 s after
+        frame_indices = [frame.frame_index - START_NS // FRAME_NS for frame in frames]
+        assert frame_indices == list(range(24 - 8, 28 + 6))  # 0.4 s before, 0.3 s after
         marks = [message for message in WHOLE if isinstance(message, Mark) and message.array == array]
         assert len(marks) > 20
         messages = [message for message in WHOLE if message.array == array]
@@ -111,7 +111,7 @@ def test_played_messages_are_those_of_the_lines() -> None:
     for known_ns, batch in played_messages(lines, placed, clock):
         assert known_ns == clock.now_ns()
         for message in batch:
-            assert (message.raster + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
+            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
         made += batch
     assert known_ns == START_NS + 2_000_000_000
     for array in BOTH:

@@ -252,7 +252,7 @@ def test_live_and_replay_do_not_mix(first: wire.Hello, second: wire.Hello, reaso
 def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
     with running_server(site_of()) as server:
         link = connected(server, LIVE)
-        link.send([frame(1, raster=1000)])
+        link.send([frame(1, frame_index=1000)])
 
         def state() -> dict[str, Any]:
             link.service()

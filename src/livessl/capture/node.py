@@ -13,7 +13,7 @@ from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.stream.segmenter import RECENT_S
-from livessl.core.types import FRAME_NS, Ask, Message
+from livessl.core.types import FRAME_NS, BackfillRequest, Message
 from livessl.errors import RunError
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
@@ -173,7 +173,7 @@ def _link(
 ) -> Link:
     rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
 
-    def recent(ask: Ask) -> list[Message]:
+    def recent(ask: BackfillRequest) -> list[Message]:
         return [message for pipeline in pipelines for message in pipeline.backfill(ask)]
 
     hello = wire.Hello(name, run_id, rates, replay)

@@ -146,7 +146,7 @@ def parts_from_sessions(site: Site, sessions: Iterable[Session]) -> list[Part]:
 
 
 def common_start_ns(now_ns: int, nodes: int) -> int:
-    """When files that stand in for devices begin: on the time raster, so that frames are cut as they are offline.
+    """When files that stand in for devices begin: on the grid of frames, so that frames are cut as they are offline.
 
     With several nodes, each a process that knows nothing of the others, at the next full `TOGETHER_NS` of the clock:
     nodes started together begin together.

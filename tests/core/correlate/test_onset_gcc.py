@@ -176,7 +176,7 @@ def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.Mo
     assert [heard.spec.name for heard in found.evidence] == ["north", "south"]
     without = estimator.locate({name: sounds[name] for name in ("north", "south")})
     assert found.position_m.tobytes() == without.position_m.tobytes()
-    assert found.outvoted == without.outvoted
+    assert found.outliers == without.outliers
 
 
 def test_gains_of_microphones_do_not_matter() -> None:
@@ -213,8 +213,8 @@ def test_what_onsets_do_not_tell_whole_segments_do(ended: bool) -> None:
         sounds[spec.name] = Sound((segment,), RATE_HZ, (only_noise,), ended=ended)
     found = estimator.locate(sounds)
     assert (found.refused is None) == ended
-    assert found.signs is not None
-    assert found.signs.whole == ended
+    assert found.features is not None
+    assert found.features.whole == ended
     if ended:
         assert np.linalg.norm(found.position_m - SOURCE_M) < NEAR_M
 

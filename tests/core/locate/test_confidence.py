@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from free_field import C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import LEAST_CONFIDENCE, Judgement, Signs, crossing_deg, judge
+from livessl.core.locate.confidence import LEAST_CONFIDENCE, ConfidenceFeatures, Judgement, crossing_deg, judge
 from livessl.core.locate.srp import SRPFunctional
-from livessl.core.types import ArraySpec, HeardBy
+from livessl.core.types import ArraySpec, Evidence
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
 SOUTH = tetra("south", [2.3, 1.1, 1.5], yaw_deg=71.0)
@@ -22,14 +22,14 @@ GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
 SOURCE_M = np.array([1.13, 3.31, 1.47])
 
 
-def heard_at(spec: ArraySpec, height: float, noise: float = 0.1) -> HeardBy:
+def heard_at(spec: ArraySpec, height: float, noise: float = 0.1) -> Evidence:
     gcc = ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M), RATE_HZ)
     scatter = np.random.default_rng(len(spec.name)).standard_normal(gcc.values.shape)
     values = (height * gcc.values + noise * scatter).astype(np.float32)
-    return HeardBy(spec, replace(gcc, values=values))
+    return Evidence(spec, replace(gcc, values=values))
 
 
-def judged(*evidence: HeardBy, rival_share: float = 0.3) -> Judgement:
+def judged(*evidence: Evidence, rival_share: float = 0.3) -> Judgement:
     functional = SRPFunctional(evidence, C_M_S)
     power = float(functional.value(SOURCE_M[None])[0])
     return judge(functional, evidence, SOURCE_M, power, rival_share * power, GRID)
@@ -37,31 +37,34 @@ def judged(*evidence: HeardBy, rival_share: float = 0.3) -> Judgement:
 
 @given(margin=st.floats(0.0, 0.3), standing=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
 def test_more_evidence_is_more_confidence(margin: float, standing: float, more: float) -> None:
-    confidence = Signs(margin, standing).confidence
+    confidence = ConfidenceFeatures(margin, standing).confidence
     assert 0.0 < confidence < 1.0
-    assert Signs(margin + more, standing).confidence > confidence
-    assert Signs(margin, standing + more).confidence > confidence
+    assert ConfidenceFeatures(margin + more, standing).confidence > confidence
+    assert ConfidenceFeatures(margin, standing + more).confidence > confidence
 
 
 def test_clear_evidence_is_located_and_noise_is_refused() -> None:
     clear = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0))
     assert clear.refused is None
-    assert clear.signs.confidence > 0.95
+    assert clear.features.confidence > 0.95
     drowned = judged(heard_at(NORTH, 0.02), heard_at(SOUTH, 0.02), rival_share=0.95)
-    assert drowned.signs.confidence < LEAST_CONFIDENCE
+    assert drowned.features.confidence < LEAST_CONFIDENCE
     assert drowned.refused is not None
-    assert f"{drowned.signs.confidence:.2f}" in drowned.refused
+    assert f"{drowned.features.confidence:.2f}" in drowned.refused
 
 
 def test_an_array_that_hears_only_noise_hardly_takes_away() -> None:
-    alone = judged(heard_at(NORTH, 1.0)).signs
-    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).signs
+    alone = judged(heard_at(NORTH, 1.0)).features
+    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
     assert both.standing == pytest.approx(alone.standing, abs=1.0)  # noise stands no higher than once its own rms
-    assert judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).signs.standing > alone.standing + 2.0
+    assert judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features.standing > alone.standing + 2.0
 
 
 def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
-    assert Signs(0.01, 5.0, crossing_deg=45.0).confidence > Signs(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
+    assert (
+        ConfidenceFeatures(0.01, 5.0, crossing_deg=45.0).confidence
+        > ConfidenceFeatures(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
+    )
     east = tetra("east", [2.0, 0.0, 1.0])
     west = tetra("west", [0.0, 2.0, 1.0])
     assert crossing_deg([east], np.array([2.0, 3.0, 1.0])) == 0.0
@@ -71,12 +74,12 @@ def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
 
 
 def test_arrays_that_hear_only_noise_leave_it_unsure() -> None:
-    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).signs
-    one = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).signs
+    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features
+    one = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
     assert both.is_sure
     assert one.shared < 2.0 < both.shared
     assert not one.is_sure
-    assert not judged(heard_at(NORTH, 1.0)).signs.is_sure
+    assert not judged(heard_at(NORTH, 1.0)).features.is_sure
 
 
 def test_pairs_that_disagree_widen_the_ellipsoid() -> None:
@@ -84,7 +87,7 @@ def test_pairs_that_disagree_widen_the_ellipsoid() -> None:
     evidence = [heard_at(NORTH, 1.0, 0.0), heard_at(SOUTH, 1.0, 0.0)]
     off_s = 1e-5 * np.random.default_rng(0).standard_normal((2, 6))
     torn = [
-        HeardBy(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
+        Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
         for spec, off in zip((NORTH, SOUTH), off_s, strict=True)
     ]
     agreed, disagreed = (judged(*each).covariance_m2 for each in (evidence, torn))
@@ -102,7 +105,7 @@ def test_nothing_heard_is_refused_without_a_warning() -> None:
     silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (heard_at(NORTH, 1.0),)]
     nothing = judged(*silent)
     assert nothing.refused is not None
-    assert nothing.signs == Signs(0.0, 0.0)
+    assert nothing.features == ConfidenceFeatures(0.0, 0.0)
     assert np.isfinite(nothing.covariance_m2).all()
 
 

@@ -31,11 +31,11 @@ def turned(spec: ArraySpec, yaw_deg: float, name: str | None = None) -> ArraySpe
 
 
 def sounds_of(
-    specs: Sequence[ArraySpec], source_m: FloatArray = SOURCE_M, doubted: Collection[str] = ()
+    specs: Sequence[ArraySpec], source_m: FloatArray = SOURCE_M, suspect: Collection[str] = ()
 ) -> dict[str, Sound]:
     """What arrays hear that stand as these say."""
     sound = burst(6400, seed=2)
-    return {spec.name: Sound((heard(spec, source_m, sound),), RATE_HZ, doubted=spec.name in doubted) for spec in specs}
+    return {spec.name: Sound((heard(spec, source_m, sound),), RATE_HZ, suspect=spec.name in suspect) for spec in specs}
 
 
 def locate(believed: Sequence[ArraySpec], sounds: dict[str, Sound]) -> Localization:
@@ -52,13 +52,13 @@ SOUNDS = sounds_of([NORTH, SOUTH, EAST])
 @pytest.mark.parametrize("yaw_deg", [30.0, -30.0])
 def test_a_turned_array_is_outvoted_and_named(yaw_deg: float) -> None:
     good = locate([NORTH, SOUTH, EAST], SOUNDS)
-    assert good.outvoted == {}
+    assert good.outliers == {}
     assert error_m(good) < NEAR_M
     found = locate([NORTH, SOUTH, turned(EAST, yaw_deg)], SOUNDS)
     assert found.refused is None
-    assert found.outvoted is not None
+    assert found.outliers is not None
     # its direction turns with it: by 30 degrees about the vertical, times the cosine of some elevation
-    assert found.outvoted == {"east": pytest.approx(28.0, abs=4.0)}
+    assert found.outliers == {"east": pytest.approx(28.0, abs=4.0)}
     assert error_m(found) == error_m(locate([NORTH, SOUTH], SOUNDS))
     assert error_m(found) < NEAR_M
     assert {heard.spec.name for heard in found.evidence} == {"north", "south", "east"}  # the maps show all
@@ -69,36 +69,36 @@ def test_two_arrays_that_do_not_meet_are_refused() -> None:
     found = locate([NORTH, turned(SOUTH, -30.0)], SOUNDS)
     assert found.refused is not None
     assert "'north' and 'south' point to different places" in found.refused
-    assert found.outvoted == {}
+    assert found.outliers == {}
 
 
 def test_a_little_is_outvoted_by_two_and_not_refused_of_two() -> None:
     """Five degrees at 2.5 m are 0.2 m, which drags the place along: three can leave it out, two must live with it."""
     aside = turned(EAST, 5.0)
     found = locate([NORTH, SOUTH, aside], SOUNDS)
-    assert found.outvoted is not None
-    assert list(found.outvoted) == ["east"]
+    assert found.outliers is not None
+    assert list(found.outliers) == ["east"]
     assert error_m(found) < NEAR_M
     two = locate([NORTH, aside], SOUNDS)
-    assert (two.refused, two.outvoted) == (None, {})
+    assert (two.refused, two.outliers) == (None, {})
     assert error_m(two) > NEAR_M
     agree = locate([NORTH, SOUTH, turned(EAST, 2.0)], SOUNDS)
-    assert (agree.refused, agree.outvoted) == (None, {})
+    assert (agree.refused, agree.outliers) == (None, {})
 
 
 def test_one_array_has_nobody_to_disagree_with() -> None:
-    assert locate([NORTH], SOUNDS).outvoted == {}
+    assert locate([NORTH], SOUNDS).outliers == {}
 
 
 def test_a_doubted_array_is_heard_last() -> None:
     """It is taken back as soon as it agrees, and then nothing is lost by the doubt."""
     good = locate([NORTH, SOUTH, EAST], SOUNDS)
-    again = locate([NORTH, SOUTH, EAST], sounds_of([NORTH, SOUTH, EAST], doubted=["east"]))
-    assert again.outvoted == {}
+    again = locate([NORTH, SOUTH, EAST], sounds_of([NORTH, SOUTH, EAST], suspect=["east"]))
+    assert again.outliers == {}
     np.testing.assert_array_equal(again.position_m, good.position_m)
-    still = locate([NORTH, SOUTH, turned(EAST, 30.0)], sounds_of([NORTH, SOUTH, EAST], doubted=["east"]))
-    assert still.outvoted is not None
-    assert list(still.outvoted) == ["east"]
+    still = locate([NORTH, SOUTH, turned(EAST, 30.0)], sounds_of([NORTH, SOUTH, EAST], suspect=["east"]))
+    assert still.outliers is not None
+    assert list(still.outliers) == ["east"]
 
 
 def test_where_any_two_of_three_agree_doubt_decides() -> None:
@@ -112,10 +112,10 @@ def test_where_any_two_of_three_agree_doubt_decides() -> None:
     divided = estimator.locate(sounds)
     assert divided.refused is not None
     assert "cannot be told which is wrong" in divided.refused
-    decided = estimator.locate(sounds_of(flat, source_m, doubted=["east"]))
+    decided = estimator.locate(sounds_of(flat, source_m, suspect=["east"]))
     assert decided.refused is None
-    assert decided.outvoted is not None
-    assert list(decided.outvoted) == ["east"]
+    assert decided.outliers is not None
+    assert list(decided.outliers) == ["east"]
     assert error_m(decided, source_m) < NEAR_M
 
 

@@ -15,7 +15,7 @@ from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.locate import peak_search, refine, srp
 from livessl.core.locate.peak_search import PeakSearch, Rule
 from livessl.core.locate.srp import SRPMapper
-from livessl.core.types import ArraySpec, Float32Array, HeardBy
+from livessl.core.types import ArraySpec, Evidence, Float32Array
 
 ROOM = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
 KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="NumPy")]
@@ -43,7 +43,7 @@ def arrays(count: int, seed: int) -> list[ArraySpec]:
     return specs
 
 
-def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[HeardBy]:
+def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[Evidence]:
     """What arrays hear of one talker, of two, or of nothing but their own noise; with reflections that differ."""
     rng = np.random.default_rng(seed)
     evidence = []
@@ -55,11 +55,11 @@ def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[HeardBy]:
             samples += heard(spec, source_m, sound)
             for _ in range(4):
                 samples += 0.3 * heard(spec, rng.uniform(-4.0, 8.0, 3), np.roll(sound, int(rng.integers(2048))))
-        evidence.append(HeardBy(spec, GCCPhat(spec, RATE_HZ, C_M_S)([samples])))
+        evidence.append(Evidence(spec, GCCPhat(spec, RATE_HZ, C_M_S)([samples])))
     return evidence
 
 
-def fused_map(evidence: list[HeardBy], grid: Grid, rule: Rule) -> Float32Array:
+def fused_map(evidence: list[Evidence], grid: Grid, rule: Rule) -> Float32Array:
     maps = [SRPMapper(h.spec, grid, h.gcc.pairs, h.gcc.lags_s, C_M_S)(h.gcc) for h in evidence]
     if rule is Rule.PRODUCT:
         maps = [np.maximum(one, 0) for one in maps]
@@ -67,7 +67,7 @@ def fused_map(evidence: list[HeardBy], grid: Grid, rule: Rule) -> Float32Array:
     return np.asarray(join.reduce(maps))
 
 
-def searching(evidence: list[HeardBy], grid: Grid) -> PeakSearch:
+def searching(evidence: list[Evidence], grid: Grid) -> PeakSearch:
     searched = PeakSearch([h.spec for h in evidence], grid, C_M_S)
     for h in evidence:
         searched.prepare(h.spec.name, h.gcc.lags_s)
@@ -131,7 +131,7 @@ def test_of_equals_the_first_is_taken(kernels: ModuleType, rule: Rule) -> None:
     grid = Grid(ROOM, 0.05)
     spec = arrays(1, 3)[0]
     silent = GCCPhat(spec, RATE_HZ, C_M_S)([np.zeros((len(spec.microphones_m), 2048), np.float32)])
-    (found,) = searching([HeardBy(spec, silent)], grid).among([HeardBy(spec, silent)], rule)(1)
+    (found,) = searching([Evidence(spec, silent)], grid).among([Evidence(spec, silent)], rule)(1)
     assert (found.node, found.power) == (0, 0.0)
 
 
@@ -156,12 +156,12 @@ def test_arrays_of_different_rates_and_some_of_all(kernels: ModuleType) -> None:
     source_m = np.array([2.31, 1.17, 0.83])
     grid = Grid(ROOM, 0.1)
     evidence = [
-        HeardBy(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, source_m), rate_hz))
+        Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, source_m), rate_hz))
         for spec, rate_hz in zip(specs, (16e3, 44.1e3, 48e3), strict=True)
     ]
     searched = searching(evidence, grid)
     for chosen in (evidence, evidence[1:], evidence[::-1], evidence[2:]):
-        power = fused_map([HeardBy(h.spec, h.gcc) for h in chosen], grid, Rule.SUM)
+        power = fused_map([Evidence(h.spec, h.gcc) for h in chosen], grid, Rule.SUM)
         (found,) = searched.among(chosen)(1)
         assert [found.node, found.power] == [int(power.argmax()), float(power.max())]
 

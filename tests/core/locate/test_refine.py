@@ -14,7 +14,7 @@ from livessl.core.correlate.gcc_phat import GCCPhat, mean_square_angular_frequen
 from livessl.core.geometry import Grid, line, posed
 from livessl.core.locate import refine
 from livessl.core.locate.srp import SRPFunctional
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
+from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
 GRID = Grid(BOUNDS_M, 0.1)
@@ -26,18 +26,18 @@ CHI2_3_MEDIAN = 2.366
 
 def evidence_of(
     specs: tuple[ArraySpec, ...], source_m: FloatArray = SOURCE_M, noise: float = 0.0, seed: int = 1
-) -> list[HeardBy]:
+) -> list[Evidence]:
     """Ideal peaks at the source's lags; and on every lag white noise of a standard deviation."""
     rng = np.random.default_rng(seed)
     evidence = []
     for spec in specs:
         gcc = ideal_gcc(spec, true_lags_s(spec.microphones_m, source_m))
         values = gcc.values + noise * rng.standard_normal(gcc.values.shape)
-        evidence.append(HeardBy(spec, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), values)))
+        evidence.append(Evidence(spec, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), values)))
     return evidence
 
 
-def covariance_of(evidence: list[HeardBy], grid: Grid = GRID, place_m: FloatArray = SOURCE_M) -> FloatArray:
+def covariance_of(evidence: list[Evidence], grid: Grid = GRID, place_m: FloatArray = SOURCE_M) -> FloatArray:
     return refine.laplace_covariance_m2(SRPFunctional(evidence, C_M_S), evidence, place_m, grid)
 
 
@@ -185,7 +185,7 @@ def test_covariance_is_one_and_within_the_volumes(noise: float, seed: int, both:
 
 def test_without_evidence_the_covariance_is_the_volumes() -> None:
     gcc = evidence_of((NORTH,))[0].gcc
-    nothing = HeardBy(NORTH, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), 0.0 * gcc.values))
+    nothing = Evidence(NORTH, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), 0.0 * gcc.values))
     np.testing.assert_allclose(covariance_of([nothing]), np.diag(np.array([4.2, 5.1, 2.7]) ** 2 / 12), rtol=1e-9)
 
 
@@ -236,7 +236,7 @@ def squared_distances() -> FloatArray:
         evidence = []
         for spec in (NORTH, SOUTH):
             noisy = heard(spec, SOURCE_M, sound) + rng.standard_normal((4, n))
-            evidence.append(HeardBy(spec, correlate[spec.name]([noisy.astype(np.float32)])))
+            evidence.append(Evidence(spec, correlate[spec.name]([noisy.astype(np.float32)])))
         position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), node_m, GRID)
         error_m = position_m - SOURCE_M
         distances[trial] = error_m @ np.linalg.solve(covariance_of(evidence, GRID, position_m), error_m)

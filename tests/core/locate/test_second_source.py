@@ -12,7 +12,7 @@ from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
 from livessl.core.locate.estimators import Localization, Onset, Sound
 from livessl.core.locate.second_source import Moments, clearness, confidence
-from livessl.core.types import FRAME_S, GCC, ArraySpec, FloatArray, HeardBy
+from livessl.core.types import FRAME_S, GCC, ArraySpec, Evidence, FloatArray
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
 NORTH = tetra("north", [2.7, 4.4, 1.1])
@@ -137,7 +137,7 @@ def test_of_places_that_stand_high_the_one_that_is_clear_in_a_moment_is_told(est
         )
         values = np.stack([first + 0.25 * left] * 8 + [second]).astype(np.float32)
         moments.append(Moments(spec, axis_s, values, np.full(9, 1e3)))
-        evidence.append(HeardBy(spec, GCC(microphone_pairs(4), axis_s, values.mean(axis=0))))
+        evidence.append(Evidence(spec, GCC(microphone_pairs(4), axis_s, values.mean(axis=0))))
         estimator.listener(spec.name, RATE_HZ)
     place = estimator._place(evidence)
     assert np.linalg.norm(place.position_m - ONE_M) < 0.1

@@ -10,7 +10,7 @@ from livessl.core.correlate.gcc_phat import GCCPhat, microphone_pairs
 from livessl.core.geometry import Grid, line
 from livessl.core.locate.srp import SRPFunctional, SRPMapper, pair_weight
 from livessl.core.steering import steering_delays_s
-from livessl.core.types import GCC, ArraySpec, FloatArray, HeardBy
+from livessl.core.types import GCC, ArraySpec, Evidence, FloatArray
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
 SOURCE_M = np.array([1.13, 3.31, 1.47])
@@ -77,7 +77,7 @@ def test_map_is_the_functional_to_half_a_fine_lag() -> None:
     for array in (spec, NORTH):
         gcc = ideal(array)
         on_grid = mapped(array, gcc)
-        smooth = SRPFunctional([HeardBy(array, gcc)], C_M_S).value(GRID.nodes_m())
+        smooth = SRPFunctional([Evidence(array, gcc)], C_M_S).value(GRID.nodes_m())
         # half a fine lag off at most: half the largest difference, and what the largest curvature takes off
         steepest = 0.5 * np.abs(np.diff(gcc.values, axis=1)).max(axis=1)
         bend = np.abs(np.diff(gcc.values, 2, axis=1)).max(axis=1) / 8
@@ -88,20 +88,20 @@ def test_map_is_the_functional_to_half_a_fine_lag() -> None:
 
 def test_functional_is_the_closed_form() -> None:
     points_m = np.random.default_rng(2).uniform(GRID.lower_m, GRID.upper_m, (500, 3))
-    functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
+    functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     expected = exact(NORTH, points_m) + exact(SOUTH, points_m)
     # Cubic between lags h apart errs by 3/128 h^4 max R^(4) = 3/128 (2 pi 6 kHz h)^4 / 5 = 3.5e-5 for each pair: 6 of
     # weight 1/2 in each of 2 arrays.
     np.testing.assert_allclose(functional.value(points_m), expected, atol=6 * 3.5e-5)
     assert functional.value(SOURCE_M[None])[0] == pytest.approx(6.0, abs=6 * 3.5e-5)
     # a tenth of a per mille more of speed shows
-    other = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], 1.0001 * C_M_S)
+    other = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], 1.0001 * C_M_S)
     assert np.abs(other.value(points_m) - expected).max() > 2 * 6 * 3.5e-5
 
 
 def test_functional_has_no_kinks() -> None:
     """Over half-millimetres its curvature is the closed form's: a roof at every fine lag would stop a climb."""
-    functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
+    functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     h_m = 5e-4
     path_m = SOURCE_M + h_m * np.arange(-100, 100)[:, None] * np.array([0.6, 0.0, 0.8])
     second = np.diff(functional.value(path_m), 2) / h_m**2
@@ -114,7 +114,7 @@ def test_source_scores_the_number_of_independent_delays() -> None:
     point = Grid(((x, x), (y, y), (z, z)), 1.0)
     for count in (2, 3, 8, 16):
         spec = ArraySpec("any", np.random.default_rng(count).uniform(0, 0.3, (count, 3)), BAND_HZ)
-        functional = SRPFunctional([HeardBy(spec, ideal(spec))], C_M_S)
+        functional = SRPFunctional([Evidence(spec, ideal(spec))], C_M_S)
         # K (K - 1) / 2 pairs of value 1 and weight 2 / K; a node half a fine lag off loses (w h / 2)^2 / 2 / 3
         assert functional.value(SOURCE_M[None])[0] == pytest.approx(count - 1, rel=3.5e-5)
         assert mapped(spec, ideal(spec), point)[0] == pytest.approx(count - 1, rel=0.0036)
@@ -122,7 +122,7 @@ def test_source_scores_the_number_of_independent_delays() -> None:
 
 
 def test_gradient_is_the_closed_forms() -> None:
-    functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
+    functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     rng = np.random.default_rng(3)
     h_m = 1e-4
     shifts = h_m * np.concatenate([np.eye(3), -np.eye(3)])
@@ -139,7 +139,7 @@ def test_gradient_is_the_closed_forms() -> None:
 
 
 def test_hessian_at_the_peak_is_the_closed_forms() -> None:
-    functional = SRPFunctional([HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
+    functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     gradient, hessian = functional.derivatives(SOURCE_M)
     h_m = 1e-3
     expected = np.empty((3, 3))
@@ -158,7 +158,7 @@ def test_hessian_at_the_peak_is_the_closed_forms() -> None:
 
 
 def test_pair_terms_are_each_arrays_own() -> None:
-    evidence = [HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)]
+    evidence = [Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)]
     terms = SRPFunctional(evidence, C_M_S).pair_terms(SOURCE_M + 0.01)
     assert [term.array for term in terms] == ["north", "south"]
     for term, spec in zip(terms, (NORTH, SOUTH), strict=True):
@@ -168,7 +168,7 @@ def test_pair_terms_are_each_arrays_own() -> None:
 
 
 def test_order_of_the_arrays_does_not_matter() -> None:
-    evidence = [HeardBy(spec, ideal(spec)) for spec in (NORTH, SOUTH)]
+    evidence = [Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)]
     points_m = np.random.default_rng(4).uniform(GRID.lower_m, GRID.upper_m, (50, 3))
     one, other = (SRPFunctional(order, C_M_S) for order in (evidence, evidence[::-1]))
     np.testing.assert_allclose(one.value(points_m), other.value(points_m), rtol=1e-12, atol=1e-14)
@@ -202,6 +202,6 @@ def test_plane_is_a_slice_of_space() -> None:
 
 def test_node_on_a_microphone_is_finite() -> None:
     place = NORTH.microphones_m[2]
-    functional = SRPFunctional([HeardBy(NORTH, ideal(NORTH))], C_M_S)
+    functional = SRPFunctional([Evidence(NORTH, ideal(NORTH))], C_M_S)
     assert np.isfinite(functional.value(place[None])).all()
     assert all(np.isfinite(part).all() for part in functional.derivatives(place))

@@ -10,37 +10,37 @@ from test_fusion import HANG_OVER, START, Arrivals, frame, fusion_of, mark, node
 
 from livessl.core.stream import final_pass
 from livessl.core.stream.array_health import LOST_NS
-from livessl.core.stream.final_pass import HOLD_NS, Settled, Settling
+from livessl.core.stream.final_pass import HOLD_NS, FinalResults, TwoPassFusion
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")
 SECOND = 20
 
 
-def settling_of(settled: int | None = None) -> Settling:
-    return Settling(fusion_of(), NAMES, settled)
+def settling_of(settled: int | None = None) -> TwoPassFusion:
+    return TwoPassFusion(fusion_of(), NAMES, settled)
 
 
-def play(into: Settling, arrivals: Arrivals, until: int, since: int = 0) -> list[tuple[int, Event | Settled]]:
-    """Step through time, in raster intervals; the events that came out, and when."""
-    said: list[tuple[int, Event | Settled]] = []
+def play(into: TwoPassFusion, arrivals: Arrivals, until: int, since: int = 0) -> list[tuple[int, Event | FinalResults]]:
+    """Step through time, in frame indices; the events that came out, and when."""
+    said: list[tuple[int, Event | FinalResults]] = []
     for now in range(since, until + 1):
         here = [message for when, message in arrivals if since <= now and (when <= now < when + 1 or when == now)]
         outputs = into.step(here, now_ns(now))
-        said += [(now, output) for output in outputs if isinstance(output, Event | Settled)]
+        said += [(now, output) for output in outputs if isinstance(output, Event | FinalResults)]
     return said
 
 
-def settled_events(said: Iterable[tuple[int, Event | Settled]]) -> list[Event]:
-    return [event for _, output in said if isinstance(output, Settled) for event in output.events]
+def settled_events(said: Iterable[tuple[int, Event | FinalResults]]) -> list[Event]:
+    return [event for _, output in said if isinstance(output, FinalResults) for event in output.events]
 
 
-def provisional(said: Iterable[tuple[int, Event | Settled]]) -> list[Event]:
+def provisional(said: Iterable[tuple[int, Event | FinalResults]]) -> list[Event]:
     return [output for _, output in said if isinstance(output, Event)]
 
 
-def both(active: range, rasters: range) -> Arrivals:
-    return node("north", active, rasters) + node("south", active, rasters)
+def both(active: range, frame_indices: range) -> Arrivals:
+    return node("north", active, frame_indices) + node("south", active, frame_indices)
 
 
 def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() -> None:
@@ -48,7 +48,7 @@ def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() ->
     assert provisional(said) == []
     ((when, output),) = said
     assert when == 16 + HANG_OVER
-    assert isinstance(output, Settled)
+    assert isinstance(output, FinalResults)
     (event,) = output.events
     assert (event.heard_by, event.late) == (NAMES, False)
     assert event.latency_s == pytest.approx(HANG_OVER * 0.05)
@@ -97,7 +97,7 @@ def test_nobody_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     (told,) = provisional(said)
     assert (event.id, event.start_ns, event.end_ns) == (told.id, told.start_ns, told.end_ns)
     # the last frame of its hang-over came at 52
-    assert next(when for when, output in said if isinstance(output, Settled)) == 52 + 5 * SECOND + 1
+    assert next(when for when, output in said if isinstance(output, FinalResults)) == 52 + 5 * SECOND + 1
     # what the other kept of that time comes too late, and is counted
     into.greet("south", (START + 38, START + 52), now_ns(300))
     play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
@@ -140,7 +140,7 @@ def test_what_was_settled_before_is_not_told_again() -> None:
     """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
     into = settling_of()
     first = play(into, both(range(10, 16), range(30)), 30)
-    (output,) = [output for _, output in first if isinstance(output, Settled)]
+    (output,) = [output for _, output in first if isinstance(output, FinalResults)]
     again = settling_of(output.until)
     for name in NAMES:
         again.greet(name, (START + 8, START + 31), now_ns(31))
@@ -151,19 +151,19 @@ def test_what_was_settled_before_is_not_told_again() -> None:
     said += play(again, [(w, m) for w, m in both(range(40, 46), range(32, 60)) if w >= 32], 60, 32)
     (event,) = settled_events(said)
     assert event.start_ns == (START + 40) * FRAME_NS
-    assert sum(again.duplicates.values()) == sum(m.raster < output.until for _, m in kept)
+    assert sum(again.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
 
 
 def test_clock_of_the_server_set_back_begins_anew() -> None:
     into = settling_of()
     play(into, both(range(10, 16), range(100)), 100)
     hour = 3600 * SECOND
-    said: list[tuple[int, Event | Settled]] = []
+    said: list[tuple[int, Event | FinalResults]] = []
     for now in range(-hour, -hour + 40):
         messages: list[Message] = [
             m for w, m in both(range(-hour + 10, -hour + 16), range(-hour, -hour + 40)) if w == now
         ]
-        said += [(now, o) for o in into.step(messages, now_ns(now)) if isinstance(o, Event | Settled)]
+        said += [(now, o) for o in into.step(messages, now_ns(now)) if isinstance(o, Event | FinalResults)]
     (event,) = settled_events(said)
     assert event.start_ns == now_ns(-hour + 10)
 
@@ -171,7 +171,9 @@ def test_clock_of_the_server_set_back_begins_anew() -> None:
 def test_no_event_lies_in_the_future() -> None:
     """A node an hour ahead is refused and told so; the other goes on."""
     into = settling_of()
-    ahead = [(w, replace(m, raster=m.raster + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))]
+    ahead = [
+        (w, replace(m, frame_index=m.frame_index + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))
+    ]
     said = play(into, node("north", range(10, 16), range(40)) + ahead, 40)
     (event,) = provisional(said)
     assert event.heard_by == ("north",)

@@ -1,4 +1,4 @@
-"""Arrays joined on the time raster: whatever comes, when it comes, or does not come at all."""
+"""Arrays joined on the grid of frames: whatever comes, when it comes, or does not come at all."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from livessl.core.types import (
     ArraySpec,
     ClockState,
     Event,
+    Evidence,
     Float32Array,
     FloatArray,
     Frame,
-    HeardBy,
     Mark,
     Message,
     Output,
@@ -48,17 +48,17 @@ GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.25)
 SOURCE_M = np.array([1.13, 3.31, 1.47])
 
 START = 20 * 1_700_000_000
-"""Raster index at which every test begins; those below count from it."""
+"""Frame index at which every test begins; those below count from it."""
 
 HANG_OVER = 6
 DEADLINE = 10
-"""Defaults, in raster intervals of 50 ms."""
+"""Defaults, in frame indices of 50 ms."""
 
 NOTHING = GCC(np.array([[0, 1]]), np.array([0.0, 1e-4]), np.zeros((1, 2)))
 """Evidence of no sound."""
 
 Arrivals = list[tuple[float, Message]]
-"""When, in raster intervals after START, a message comes in."""
+"""When, in frame indices after START, a message comes in."""
 
 
 class Scripted:
@@ -78,10 +78,10 @@ class Scripted:
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
-        heard = tuple(HeardBy(spec, NOTHING) for spec in (NORTH, SOUTH) if spec.name in sounds)
+        heard = tuple(Evidence(spec, NOTHING) for spec in (NORTH, SOUTH) if spec.name in sounds)
         return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
 
-    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         return PowerMaps(GRID, np.full(GRID.size, len(evidence), dtype=np.float32), {})
 
 
@@ -94,34 +94,41 @@ def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any
     return Fusion("site", [NORTH, SOUTH], estimator or Scripted(), FusionParameters(**parameters), updates=updates)
 
 
-def frame(array: str, raster: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
+def frame(array: str, frame_index: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
     made = Frame(
-        array, 1, START + raster, (START + raster) * FRAME_NS, RATE_HZ, np.zeros((4, 20), np.float32), power, active
+        array,
+        1,
+        START + frame_index,
+        (START + frame_index) * FRAME_NS,
+        RATE_HZ,
+        np.zeros((4, 20), np.float32),
+        power,
+        active,
     )
     return replace(made, **changes)
 
 
-def mark(array: str, raster: int, **changes: Any) -> Mark:
-    return replace(Mark(array, 0, START + raster, 1e-7, 1e-7, (1e-7,) * 4, clock=ClockState.LOCKED), **changes)
+def mark(array: str, frame_index: int, **changes: Any) -> Mark:
+    return replace(Mark(array, 0, START + frame_index, 1e-7, 1e-7, (1e-7,) * 4, clock=ClockState.LOCKED), **changes)
 
 
-def node(array: str, active: Collection[int], rasters: Iterable[int], delay: float = 0.0) -> Arrivals:
+def node(array: str, active: Collection[int], frame_indices: Iterable[int], delay: float = 0.0) -> Arrivals:
     """What a node sends, each as its interval ends: frames while active and for a hang-over after, else marks."""
     sent: Arrivals = []
-    for raster in rasters:
-        lately = any(raster - k in active for k in range(HANG_OVER + 1))
-        loud = raster in active
-        message = frame(array, raster, loud, 1e-2 if loud else 1e-7) if lately else mark(array, raster)
-        if loud and raster - 1 not in active:
-            sent += [(raster + 1 + delay, frame(array, raster - k, False, 1e-7)) for k in (2, 1)]
-        sent.append((raster + 1 + delay, message))
+    for frame_index in frame_indices:
+        lately = any(frame_index - k in active for k in range(HANG_OVER + 1))
+        loud = frame_index in active
+        message = frame(array, frame_index, loud, 1e-2 if loud else 1e-7) if lately else mark(array, frame_index)
+        if loud and frame_index - 1 not in active:
+            sent += [(frame_index + 1 + delay, frame(array, frame_index - k, False, 1e-7)) for k in (2, 1)]
+        sent.append((frame_index + 1 + delay, message))
     return sent
 
 
 def play(
     fusion: Fusion, arrivals: Arrivals, end: int, start: int = 0, every: float = 1.0
 ) -> list[tuple[float, Output]]:
-    """Step through time, in raster intervals; what came out, and when."""
+    """Step through time, in frame indices; what came out, and when."""
     waiting = sorted(arrivals, key=lambda arrival: arrival[0])
     said: list[tuple[float, Output]] = []
     for step in range(round((end - start) / every) + 1):
@@ -132,8 +139,8 @@ def play(
     return said
 
 
-def now_ns(raster: float) -> int:
-    return START * FRAME_NS + round(raster * FRAME_NS)
+def now_ns(frame_index: float) -> int:
+    return START * FRAME_NS + round(frame_index * FRAME_NS)
 
 
 def events_of(said: Iterable[tuple[float, Output]]) -> list[tuple[float, Event]]:
@@ -172,9 +179,9 @@ def sound_frames(
 
 def live(frames: Sequence[Frame], end: int) -> Arrivals:
     """These frames as they end, and marks before and after."""
-    array, rasters = frames[0].array, {made.raster - START for made in frames}
-    quiet = [(k + 1.0, mark(array, k)) for k in range(end) if k not in rasters]
-    return [(made.raster - START + 1.0, made) for made in frames] + list[tuple[float, Message]](quiet)
+    array, frame_indices = frames[0].array, {made.frame_index - START for made in frames}
+    quiet = [(k + 1.0, mark(array, k)) for k in range(end) if k not in frame_indices]
+    return [(made.frame_index - START + 1.0, made) for made in frames] + list[tuple[float, Message]](quiet)
 
 
 def position_of(event: Event) -> FloatArray:
@@ -345,7 +352,7 @@ def test_live_and_all_at_once_are_the_same() -> None:
 
 @pytest.mark.parametrize("stops", [0, 5, 12, 18])
 def test_silent_array_delays_by_the_deadline_at_most(stops: int) -> None:
-    """It stops sending before, in or after a sound of the other's; a raster interval later nobody waits for it."""
+    """It stops sending before, in or after a sound of the other's; a frame index later nobody waits for it."""
     prompt = 16 + HANG_OVER
     arrivals = node("north", range(10, 16), range(60)) + node("south", range(10, 16), range(stops))
     ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
@@ -372,10 +379,10 @@ def test_late_array_is_waited_for_up_to_the_deadline() -> None:
 def test_array_that_was_away_catches_up() -> None:
     active = {*range(10, 16), *range(60, 66), *range(100, 106)}
     south = [
-        (max(when, 46.0) if 5 <= message.raster - START < 45 else when, message)
+        (max(when, 46.0) if 5 <= message.frame_index - START < 45 else when, message)
         for when, message in node("south", active, range(140))
     ]
-    south = [(when + (4.0 if message.raster - START >= 95 else 0.0), message) for when, message in south]
+    south = [(when + (4.0 if message.frame_index - START >= 95 else 0.0), message) for when, message in south]
     fusion = fusion_of()
     said = events_of(play(fusion, node("north", active, range(140)) + south, 140))
     assert [event.heard_by for _, event in said] == [("north",), ("north", "south"), ("north", "south")]
@@ -395,7 +402,7 @@ def test_array_that_is_punctual_again_is_waited_for() -> None:
     """Behind by less than the deadline, it never comes first again; but it need not."""
     active = {*range(10, 16), *range(100, 106)}
     south = node("south", active, range(140), 3 * DEADLINE)
-    south = [(max(when - 25, 80.0) if message.raster - START >= 50 else when, message) for when, message in south]
+    south = [(max(when - 25, 80.0) if message.frame_index - START >= 50 else when, message) for when, message in south]
     said = events_of(play(fusion_of(), node("north", active, range(140)) + south, 145))
     assert said[0][1].heard_by == ("north",)
     assert (said[-1][0], said[-1][1].heard_by) == (106 + HANG_OVER + 5, ("north", "south"))
@@ -451,8 +458,8 @@ def test_long_pause_is_skipped() -> None:
     fusion = fusion_of()
     play(fusion, node("north", range(10, 100), range(20)), 20)
     later = 20 * 3600 * 24 * 365 * 10  # ten years: walked through they would take hours
-    rasters = range(later, later + 40)
-    said = play(fusion, node("north", range(later + 10, later + 15), rasters), later + 40, start=later)
+    frame_indices = range(later, later + 40)
+    said = play(fusion, node("north", range(later + 10, later + 15), frame_indices), later + 40, start=later)
     assert [event.start_ns for _, event in events_of(said)] == [now_ns(10), now_ns(later + 10)]
 
 
@@ -543,7 +550,9 @@ def test_wrong_number_of_channels_is_rejected() -> None:
 def test_clock_an_hour_off_is_rejected_and_disturbs_nobody(off: int, side: str) -> None:
     fusion = fusion_of()
     north = node("north", range(10, 16), range(40))
-    astray = [(when, replace(m, raster=m.raster + off)) for when, m in node("south", range(10, 16), range(40))]
+    astray = [
+        (when, replace(m, frame_index=m.frame_index + off)) for when, m in node("south", range(10, 16), range(40))
+    ]
     said = play(fusion, north + astray, 40)
     alone = play(fusion_of(), north, 40)
     assert told(output for _, output in said) == told(output for _, output in alone)
@@ -588,9 +597,9 @@ def test_array_starts_then_is_healthy_then_lost() -> None:
 
 def test_array_is_active_while_its_frames_are() -> None:
     fusion = fusion_of()
-    for raster, active in ((5, False), (12, True), (17, False), (30, False)):
-        play(fusion, node("north", range(10, 16), range(raster + 1)), raster + 1, start=raster)
-        assert status_of(fusion, "north", raster + 1).active == active
+    for frame_index, active in ((5, False), (12, True), (17, False), (30, False)):
+        play(fusion, node("north", range(10, 16), range(frame_index + 1)), frame_index + 1, start=frame_index)
+        assert status_of(fusion, "north", frame_index + 1).active == active
     fusion = fusion_of()
     play(fusion, node("north", range(10, 16), range(13)), 13)
     assert status_of(fusion, "north", 14).active
@@ -619,12 +628,12 @@ def test_goodbye_is_told_and_nobody_waits() -> None:
 )
 def test_dead_microphone_is_told_after_a_second(powers: tuple[float, ...], said: str) -> None:
     fusion = fusion_of()
-    for raster in range(60):
-        dead = 10 <= raster < 50
-        message = mark("north", raster, channel_power=powers) if dead else mark("north", raster)
-        fusion.step([message], now_ns(raster + 1))
-        status = status_of(fusion, "north", raster + 1)
-        if 10 + 20 <= raster < 50:
+    for frame_index in range(60):
+        dead = 10 <= frame_index < 50
+        message = mark("north", frame_index, channel_power=powers) if dead else mark("north", frame_index)
+        fusion.step([message], now_ns(frame_index + 1))
+        status = status_of(fusion, "north", frame_index + 1)
+        if 10 + 20 <= frame_index < 50:
             assert (status.state, status.reason) == (ArrayState.DEGRADED, said)
         else:
             assert (status.state, status.reason) == (ArrayState.HEALTHY, None)
@@ -641,11 +650,11 @@ def test_dead_microphone_is_told_after_a_second(powers: tuple[float, ...], said:
 def test_trouble_is_told_for_ten_seconds(trouble: dict[str, Any], said: str) -> None:
     fusion = fusion_of()
     lasting = {name: value for name, value in trouble.items() if name != "clock"}
-    for raster in range(240):
-        changes = trouble if raster == 20 else lasting if raster > 20 else {}
-        fusion.step([mark("north", raster, **changes)], now_ns(raster + 1))
-        status = status_of(fusion, "north", raster + 1)
-        troubled = 20 <= raster < 20 + 200
+    for frame_index in range(240):
+        changes = trouble if frame_index == 20 else lasting if frame_index > 20 else {}
+        fusion.step([mark("north", frame_index, **changes)], now_ns(frame_index + 1))
+        status = status_of(fusion, "north", frame_index + 1)
+        troubled = 20 <= frame_index < 20 + 200
         assert status.state is (ArrayState.DEGRADED if troubled else ArrayState.HEALTHY)
         assert status.reason == (said if troubled else None)
     assert status.counters["overflows"] == trouble.get("overflows", 0)
@@ -674,14 +683,14 @@ def test_memory_does_not_grow(arrays: tuple[str, ...]) -> None:
     fusion = fusion_of(scripted, max_event_s=1.0)
     held: list[weakref.ref[Float32Array]] = []
     sizes = []
-    for raster in range(12_000):
-        loud = raster % 100 < 45
+    for frame_index in range(12_000):
+        loud = frame_index % 100 < 45
         for array in arrays:
-            message: Message = frame(array, raster) if loud else mark(array, raster)
+            message: Message = frame(array, frame_index) if loud else mark(array, frame_index)
             if isinstance(message, Frame):
                 held.append(weakref.ref(message.samples))
-            fusion.step([message], now_ns(raster + 1))
-        if raster % 2000 == 1999:
+            fusion.step([message], now_ns(frame_index + 1))
+        if frame_index % 2000 == 1999:
             scripted.calls.clear()
             sizes.append(len(pickle.dumps(fusion)))
             held = [reference for reference in held if reference() is not None]
@@ -711,7 +720,7 @@ class Gauged(Scripted):
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.calls.append({name: [piece.shape[1] for piece in sound.segments] for name, sound in sounds.items()})
-        heard = tuple(HeardBy(spec, NOTHING) for spec in MANY if spec.name in sounds)
+        heard = tuple(Evidence(spec, NOTHING) for spec in MANY if spec.name in sounds)
         return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
 
 
@@ -726,14 +735,16 @@ def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) ->
     held: dict[str, list[weakref.ref[Float32Array]]] = {spec.name: [] for spec in MANY}
     most = dict.fromkeys(held, 0)
     events: list[Output] = []
-    for raster in range(100):
+    for frame_index in range(100):
         for rank, spec in enumerate(MANY[::order]):
-            message: Message = mark(spec.name, raster)
-            if raster < 90:
+            message: Message = mark(spec.name, frame_index)
+            if frame_index < 90:
                 samples = np.full((4, 20), 1e-3 * (1 + rank), np.float32)
-                message = frame(spec.name, raster, raster >= 10, 1e-2 if raster >= 10 else 1e-7, samples=samples)
+                message = frame(
+                    spec.name, frame_index, frame_index >= 10, 1e-2 if frame_index >= 10 else 1e-7, samples=samples
+                )
                 held[spec.name].append(weakref.ref(message.samples))
-            events += fusion.step([message], now_ns(raster + 1))
+            events += fusion.step([message], now_ns(frame_index + 1))
             del message
         for name, references in held.items():
             held[name] = [reference for reference in references if reference() is not None]
@@ -752,20 +763,20 @@ def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
     """One by one, in another order, or all at once, as a recording's: the same pieces are left of every array."""
     loudness = np.random.default_rng(1).uniform(0.5, 1.0, (len(MANY), 90)).astype(np.float32)
     frames: list[Message] = [
-        frame(spec.name, raster, raster >= 10, samples=np.full((4, 20), loudness[k, raster], np.float32))
-        for raster in range(90)
+        frame(spec.name, frame_index, frame_index >= 10, samples=np.full((4, 20), loudness[k, frame_index], np.float32))
+        for frame_index in range(90)
         for k, spec in enumerate(MANY)
     ]
-    quiet: list[Message] = [mark(spec.name, raster) for raster in range(90, 100) for spec in MANY]
+    quiet: list[Message] = [mark(spec.name, frame_index) for frame_index in range(90, 100) for spec in MANY]
     left = []
     for steps in (
         [[message] for message in frames + quiet],
-        [[message] for message in sorted(frames + quiet, key=lambda m: (m.raster, -int(m.array[1:])))],
+        [[message] for message in sorted(frames + quiet, key=lambda m: (m.frame_index, -int(m.array[1:])))],
         [frames + quiet],
     ):
         gauged = Gauged()
         fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
-        said = [output for step in steps for output in fusion.step(step, now_ns(step[-1].raster - START + 1))]
+        said = [output for step in steps for output in fusion.step(step, now_ns(step[-1].frame_index - START + 1))]
         assert sum(isinstance(output, Event) for output in said) == 1
         left.append(gauged.calls[-1])
     assert left[0] == left[1] == left[2]
@@ -808,8 +819,10 @@ class Listening(Scripted):
         return replace(super().locate(sounds), refused=self.refused)
 
 
-def numbered(raster: int, active: bool) -> Frame:
-    return frame("north", raster, active, 1e-2 if active else 1e-7, samples=np.full((4, 20), raster, np.float32))
+def numbered(frame_index: int, active: bool) -> Frame:
+    return frame(
+        "north", frame_index, active, 1e-2 if active else 1e-7, samples=np.full((4, 20), frame_index, np.float32)
+    )
 
 
 def test_a_listener_hears_each_frame_of_an_event_once_and_in_order() -> None:
@@ -827,7 +840,7 @@ def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
     on_time, late = Listening(), Listening()
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
     events_of(play(fusion_of(on_time), arrivals, 60))
-    held = [(21.0 if frame.raster == START + 13 else when, frame) for when, frame in arrivals]
+    held = [(21.0 if frame.frame_index == START + 13 else when, frame) for when, frame in arrivals]
     (event,) = (event for _, event in events_of(play(fusion_of(late), held, 60)))
     assert event.late_frames == 1
     assert late.sums == on_time.sums
@@ -850,7 +863,7 @@ def test_a_twin_hears_only_what_the_other_has_not() -> None:
     partly = Listening()
     first = fusion_of(partly)
     second = first.twin()
-    play(first, [arrival for arrival in arrivals if arrival[1].raster != START + 16], 60)
+    play(first, [arrival for arrival in arrivals if arrival[1].frame_index != START + 16], 60)
     play(second, arrivals, 60)
     assert partly.sums[-1] == alone.sums[-1]
 
@@ -864,12 +877,17 @@ def test_a_live_fusion_listens_ahead_and_says_the_same(pause: int) -> None:
     for newest_only in (False, True):
         estimator = Listening()
         fusion = Fusion("site", [NORTH, SOUTH], estimator, newest_only=newest_only, updates=False)
-        until = [arrival for arrival in arrivals if arrival[1].raster < START + again.start]
+        until = [arrival for arrival in arrivals if arrival[1].frame_index < START + again.start]
         play(fusion, until, again.start)
         before = len(estimator.heard)
         fusion.step([numbered(again.start, True)], now_ns(again.start + 1.0))
         heard_at_once.append(len(estimator.heard) - before)
-        play(fusion, [arrival for arrival in arrivals if arrival[1].raster > START + again.start], 70, again.start + 2)
+        play(
+            fusion,
+            [arrival for arrival in arrivals if arrival[1].frame_index > START + again.start],
+            70,
+            again.start + 2,
+        )
         told.append(estimator.sums)
     assert told[0] == told[1]
     assert heard_at_once[0] == {5: 1, 7: 9, 9: 10}[pause]
@@ -918,31 +936,31 @@ class Voting(Scripted):
 
     def __init__(self) -> None:
         super().__init__()
-        self.outvoted: dict[str, float] = {}
-        self.doubted: list[set[str]] = []
+        self.outliers: dict[str, float] = {}
+        self.suspect: list[set[str]] = []
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        self.doubted.append({name for name, sound in sounds.items() if sound.doubted})
+        self.suspect.append({name for name, sound in sounds.items() if sound.suspect})
         found = super().locate(sounds)
-        evidence = tuple(HeardBy(spec, NOTHING) for spec in (NORTH, SOUTH, EAST) if spec.name in sounds)
-        outvoted = {name: off for name, off in self.outvoted.items() if name in sounds}
-        return replace(found, evidence=evidence, outvoted=outvoted)
+        evidence = tuple(Evidence(spec, NOTHING) for spec in (NORTH, SOUTH, EAST) if spec.name in sounds)
+        outliers = {name: off for name, off in self.outliers.items() if name in sounds}
+        return replace(found, evidence=evidence, outliers=outliers)
 
 
 EAST = tetra("east", [3.9, 2.4, 1.9])
 
 
-def sound_at(fusion: Fusion, raster: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
+def sound_at(fusion: Fusion, frame_index: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
     """One short sound that these arrays hear."""
-    span = range(raster, raster + 20)
-    arrivals = [message for name in arrays for message in node(name, {raster + 5, raster + 6}, span)]
-    return [output for _, output in play(fusion, arrivals, raster + 21, raster)]
+    span = range(frame_index, frame_index + 20)
+    arrivals = [message for name in arrays for message in node(name, {frame_index + 5, frame_index + 6}, span)]
+    return [output for _, output in play(fusion, arrivals, frame_index + 21, frame_index)]
 
 
 def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
     estimator = Voting()
     fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator, updates=True)
-    estimator.outvoted = {"east": 29.6}
+    estimator.outliers = {"east": 29.6}
     for turn in range(4):
         (event,) = (output for output in sound_at(fusion, 20 * turn) if isinstance(output, Event))
         assert event.reason == "located without 'east' (30° off): outvoted by the others"
@@ -958,23 +976,23 @@ def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
     assert status.reason is not None
     assert "disagrees with the others in 4 of the last 4 sounds, by 30°: is its pose right" in status.reason
     assert status_of(fusion, "north", 80).state is ArrayState.HEALTHY
-    assert estimator.doubted[-1] == {"east"}  # the fourth event
+    assert estimator.suspect[-1] == {"east"}  # the fourth event
     assert "east" not in estimator.calls[-2]  # its windows go without who is doubted, its answer does not
     assert "east" in estimator.calls[-1]
-    estimator.outvoted = {}
+    estimator.outliers = {}
     for turn in range(4, 7):
         assert status_of(fusion, "east", 20 * turn).state is ArrayState.DEGRADED
         sound_at(fusion, 20 * turn)
     assert status_of(fusion, "east", 140).state is ArrayState.HEALTHY
     sound_at(fusion, 140)
-    assert estimator.doubted[-1] == set()
+    assert estimator.suspect[-1] == set()
 
 
 class Choosing(Voting):
     """An estimator that needs no more than two arrays, and asks all of these."""
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        return replace(super().locate(sounds), unneeded={"north"}, outvoted={})
+        return replace(super().locate(sounds), unneeded={"north"}, outliers={})
 
 
 def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None:
@@ -993,7 +1011,7 @@ def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:
     sound_at(fusion, 0, ("north", "south"))
     assert (status_of(fusion, "north", 20).agreed, status_of(fusion, "north", 20).disagreed) == (0, 0)
     twin = fusion.twin()
-    estimator.outvoted = {"south": 12.0}
+    estimator.outliers = {"south": 12.0}
     sound_at(twin, 20)
     sound_at(fusion, 20)  # told before and settled after: one sound
     assert (status_of(fusion, "south", 40).agreed, status_of(fusion, "south", 40).disagreed) == (0, 1)

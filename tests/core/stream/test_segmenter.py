@@ -1,4 +1,4 @@
-"""From sample to message: one for every raster interval, in order, and no sound lost at its beginning or its end."""
+"""From sample to message: one for every frame index, in order, and no sound lost at its beginning or its end."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def segmenter() -> Segmenter:
 
 
 def run(samples: Float32Array, sizes: list[int] | None = None) -> list[Message]:
-    """Every message of some samples that begin on the raster, cut into blocks of the given sizes, then of 480."""
+    """Every message of samples that begin on the grid of frames, cut into blocks of the given sizes, then of 480."""
     framer, made = Framer(RATE_HZ), segmenter()
     messages: list[Message] = []
     index, total, left = 0, samples.shape[1], list(sizes or [])
@@ -59,8 +59,8 @@ def run(samples: Float32Array, sizes: list[int] | None = None) -> list[Message]:
     return messages + made.flush(framer)
 
 
-def rasters(messages: list[Message], kind: type[Frame] | type[Mark]) -> list[int]:
-    return [message.raster - START for message in messages if isinstance(message, kind)]
+def frame_indices(messages: list[Message], kind: type[Frame] | type[Mark]) -> list[int]:
+    return [message.frame_index - START for message in messages if isinstance(message, kind)]
 
 
 def frames_of(messages: list[Message]) -> list[Frame]:
@@ -69,43 +69,43 @@ def frames_of(messages: list[Message]) -> list[Frame]:
 
 def test_quiet_is_a_mark_for_every_interval() -> None:
     messages = run(sound([QUIET] * 40))
-    assert rasters(messages, Mark) == list(range(40))
+    assert frame_indices(messages, Mark) == list(range(40))
     assert {message.sequence for message in messages} == {0}
     assert {message.array for message in messages} == {"north"}
 
 
 def test_sound_is_frames_with_pre_roll_and_hang_over() -> None:
     messages = run(sound([QUIET] * 20 + [LOUD] * 5 + [QUIET] * 20))
-    assert rasters(messages, Frame) == list(range(20 - PRE_ROLL, 25 + HANG_OVER))
-    assert rasters(messages, Mark) == [*range(20), *range(25 + HANG_OVER, 45)]  # the pre-roll was marked as quiet
-    assert [f.raster - START for f in frames_of(messages) if f.active] == list(range(20, 25))
+    assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 25 + HANG_OVER))
+    assert frame_indices(messages, Mark) == [*range(20), *range(25 + HANG_OVER, 45)]  # the pre-roll was marked as quiet
+    assert [f.frame_index - START for f in frames_of(messages) if f.active] == list(range(20, 25))
     assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
     # every interval's first mention is in order
-    first = list(dict.fromkeys(message.raster - START for message in messages))
+    first = list(dict.fromkeys(message.frame_index - START for message in messages))
     assert first == list(range(45))
 
 
 def test_pre_roll_is_sent_once() -> None:
     pause = HANG_OVER + 2  # 2 quiet intervals beyond the hang-over: the next pre-roll has no more
     messages = run(sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * pause + [LOUD] * 3 + [QUIET] * 10))
-    sent = rasters(messages, Frame)
+    sent = frame_indices(messages, Frame)
     assert sent == list(range(20 - PRE_ROLL, 23 + pause + 3 + HANG_OVER))
-    assert rasters(messages, Mark) == [*range(20), 26, 27, *range(34, 41)]
+    assert frame_indices(messages, Mark) == [*range(20), 26, 27, *range(34, 41)]
 
 
 def test_pause_within_the_hang_over_does_not_part() -> None:
     messages = run(sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * HANG_OVER + [LOUD] * 3 + [QUIET] * 10))
-    assert rasters(messages, Frame) == list(range(20 - PRE_ROLL, 29 + HANG_OVER))
+    assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 29 + HANG_OVER))
 
 
 def test_sound_in_the_very_first_frames_is_not_lost() -> None:
     messages = run(sound([LOUD] * 4 + [QUIET] * 26))
-    assert rasters(messages, Frame) == list(range(4 + HANG_OVER))
-    assert rasters(messages, Mark) == list(range(4 + HANG_OVER, 30))
+    assert frame_indices(messages, Frame) == list(range(4 + HANG_OVER))
+    assert frame_indices(messages, Mark) == list(range(4 + HANG_OVER, 30))
 
 
 def test_steady_noise_from_the_start_is_quiet() -> None:
-    assert rasters(run(sound([LOUD] * 60)), Frame) == []
+    assert frame_indices(run(sound([LOUD] * 60)), Frame) == []
     # and it is the warm-up that sees to it: without one, the first frame would be a sound
     assert WARM_UP_FRAMES == 10
     framer, made = Framer(RATE_HZ), segmenter()
@@ -115,16 +115,16 @@ def test_steady_noise_from_the_start_is_quiet() -> None:
 
 
 def test_short_stream_is_told_at_its_end() -> None:
-    assert rasters(run(sound([QUIET, QUIET, LOUD, QUIET])), Frame) == [0, 1, 2, 3]
+    assert frame_indices(run(sound([QUIET, QUIET, LOUD, QUIET])), Frame) == [0, 1, 2, 3]
     assert run(sound([QUIET])[:, :400]) == []
 
 
 def test_samples_are_the_devices_in_order_of_the_microphones() -> None:
     samples = sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * 10)
     for frame in frames_of(run(samples)):
-        first = (frame.raster - START) * N
+        first = (frame.frame_index - START) * N
         np.testing.assert_array_equal(frame.samples, samples[CHANNELS, first : first + N])
-        assert frame.time_ns == pytest.approx(frame.raster * FRAME_NS, abs=1)
+        assert frame.time_ns == pytest.approx(frame.frame_index * FRAME_NS, abs=1)
         assert frame.sample_rate_hz == RATE_HZ
         assert frame.power == pytest.approx(in_band(samples[CHANNELS, first : first + N]).mean(), rel=1e-4)
 
@@ -180,18 +180,18 @@ def test_wrong_number_of_channels_is_refused() -> None:
 def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes: list[int]) -> None:
     samples = sound([LOUD if one else QUIET for one in loud])
     whole, parted = run(samples, [samples.shape[1]]), run(samples, sizes)
-    assert [(type(m), m.raster, m.sequence, m.power) for m in parted] == [
-        (type(m), m.raster, m.sequence, m.power) for m in whole
+    assert [(type(m), m.frame_index, m.sequence, m.power) for m in parted] == [
+        (type(m), m.frame_index, m.sequence, m.power) for m in whole
     ]
     for one, other in zip(frames_of(whole), frames_of(parted), strict=True):
         assert (one.active, abs(one.time_ns - other.time_ns) <= 1) == (other.active, True)
         np.testing.assert_array_equal(one.samples, other.samples)
     # and what holds for every stream
     assert [m.sequence for m in whole] == list(accumulate(isinstance(m, Frame) for m in whole))
-    assert list(dict.fromkeys(m.raster - START for m in whole)) == list(range(len(loud)))
-    sent = rasters(whole, Frame)
+    assert list(dict.fromkeys(m.frame_index - START for m in whole)) == list(range(len(loud)))
+    sent = frame_indices(whole, Frame)
     assert all(earlier < later for earlier, later in pairwise(sent))  # no frame twice
-    assert len(rasters(whole, Mark)) + len(set(sent) - set(rasters(whole, Mark))) == len(loud)
+    assert len(frame_indices(whole, Mark)) + len(set(sent) - set(frame_indices(whole, Mark))) == len(loud)
 
 
 def test_what_was_not_sent_is_remembered_for_a_while() -> None:
@@ -203,17 +203,19 @@ def test_what_was_not_sent_is_remembered_for_a_while() -> None:
         messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
         if k == 30:
             asked = frames_of(made.ask(START + 12, START + 21))
-            assert [frame.raster - START for frame in asked] == list(range(12, 22))
+            assert [frame.frame_index - START for frame in asked] == list(range(12, 22))
             assert {(frame.sequence, frame.active) for frame in asked} == {(0, False)}
-            sent = {frame.raster: frame for frame in frames_of(messages)}
+            sent = {frame.frame_index: frame for frame in frames_of(messages)}
             for frame in asked:
-                np.testing.assert_array_equal(frame.samples, samples[CHANNELS, (frame.raster - START) * N :][:, :N])
-                assert frame.raster not in sent or sent[frame.raster].power == frame.power
-    last = messages[-1].raster
+                np.testing.assert_array_equal(
+                    frame.samples, samples[CHANNELS, (frame.frame_index - START) * N :][:, :N]
+                )
+                assert frame.frame_index not in sent or sent[frame.frame_index].power == frame.power
+    last = messages[-1].frame_index
     assert made.ask(START, START + 40) == []
     remembered = frames_of(made.ask(START, last))
     assert len(remembered) == round(RECENT_S / FRAME_S)
-    assert remembered[-1].raster == last
+    assert remembered[-1].frame_index == last
     # asking takes nothing from what is sent by itself
     assert [frame.sequence for frame in frames_of(messages)] == list(range(1, len(frames_of(messages)) + 1))
 
@@ -225,4 +227,4 @@ def test_nothing_is_remembered_over_a_gap() -> None:
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         for cut in framer.push(block):
             made.push(cut, framer)
-    assert [frame.raster - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))
+    assert [frame.frame_index - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))

@@ -46,24 +46,24 @@ def state_of(framer: Framer) -> ClockState:
 
 def assert_contiguous(cuts: list[Cut]) -> None:
     for earlier, later in pairwise(cuts):
-        assert later.raster == earlier.raster + 1
+        assert later.frame_index == earlier.frame_index + 1
         assert later.samples[0, 0] == earlier.samples[0, -1] + 1
 
 
 @pytest.mark.parametrize("rate_hz", [16000.0, 22050.0, 44100.0, 48000.0])
 @pytest.mark.parametrize("offset", [0, 1, 17, 300])
 def test_ideal_stamps_give_exact_boundaries(rate_hz: float, offset: int) -> None:
-    start_ns = 1_700_000_000 * 10**9 + round(offset * 1e9 / rate_hz)  # the raster begins at whole seconds
+    start_ns = 1_700_000_000 * 10**9 + round(offset * 1e9 / rate_hz)  # the grid of frames begins at whole seconds
     framer = Framer(rate_hz)
     cuts = cut_all(framer, stream(400, lambda index: ideal_ns(index, rate_hz, start_ns)))
     assert_contiguous(cuts)
     for cut in cuts:
-        # sample n is taken (n + offset) / rate after the whole second, raster interval r begins r / 20 after it;
+        # sample n is taken (n + offset) / rate after the whole second, frame index r begins r / 20 after it;
         # at 22.05 kHz every other one begins half-way between two samples, and takes in the earlier
-        assert cut.samples[0, 0] == (cut.raster - 20 * 1_700_000_000) * int(rate_hz) // 20 - offset
+        assert cut.samples[0, 0] == (cut.frame_index - 20 * 1_700_000_000) * int(rate_hz) // 20 - offset
         assert cut.time_ns == pytest.approx(ideal_ns(int(cut.samples[0, 0]), rate_hz, start_ns), abs=2)
-        assert 0 <= cut.time_ns - cut.raster * FRAME_NS + 1e9 / rate_hz < 1.01e9 / rate_hz
-    assert cuts[0].raster == 1_700_000_000 * 10**9 // FRAME_NS + (offset > 0)
+        assert 0 <= cut.time_ns - cut.frame_index * FRAME_NS + 1e9 / rate_hz < 1.01e9 / rate_hz
+    assert cuts[0].frame_index == 1_700_000_000 * 10**9 // FRAME_NS + (offset > 0)
     assert {cut.samples.shape[1] for cut in cuts} <= {int(0.05 * rate_hz), int(np.ceil(0.05 * rate_hz))}
     assert framer.lost_frames == framer.overflows == 0
 
@@ -86,7 +86,7 @@ def test_frames_do_not_care_how_samples_came_in_blocks(sizes: list[int], offset:
 
     whole, cut_up = push([sum(sizes)]), push(sizes)
     assert len(whole) >= (sum(sizes) - 0.05 * rate_hz) // (0.05 * rate_hz + 1)
-    assert [cut.raster for cut in cut_up] == [cut.raster for cut in whole]
+    assert [cut.frame_index for cut in cut_up] == [cut.frame_index for cut in whole]
     for one, other in zip(whole, cut_up, strict=True):
         assert abs(one.time_ns - other.time_ns) <= 1  # stamps are whole nanoseconds
         np.testing.assert_array_equal(one.samples, other.samples)
@@ -212,7 +212,7 @@ def test_step_of_the_clock_is_seen_after_some_blocks(step_ns: int) -> None:
         for cut in cuts:
             right_ns = ideal_ns(int(cut.samples[0, 0])) + offset_ns
             assert cut.time_ns == pytest.approx(right_ns, abs=2)
-            assert abs(cut.raster * FRAME_NS - right_ns) < 1e9 / RATE_HZ
+            assert abs(cut.frame_index * FRAME_NS - right_ns) < 1e9 / RATE_HZ
     assert cuts_after[0].samples[0, 0] - before[-1].samples[0, -1] <= 3 * 800
 
 
@@ -261,8 +261,8 @@ def test_gap_drops_the_torn_frame_and_no_other() -> None:
     whole = int(after[0].samples[0, 0])
     assert 49_000 <= whole < 49_000 + 800
     assert (whole - torn) % 800 == 0
-    assert after[0].raster - before[-1].raster == (whole - torn) // 800 + 1
-    assert all(abs(cut.raster * FRAME_NS - ideal_ns(int(cut.samples[0, 0]))) < 1e9 / RATE_HZ for cut in after)
+    assert after[0].frame_index - before[-1].frame_index == (whole - torn) // 800 + 1
+    assert all(abs(cut.frame_index * FRAME_NS - ideal_ns(int(cut.samples[0, 0]))) < 1e9 / RATE_HZ for cut in after)
 
 
 def test_gap_before_the_first_frame_tears_none() -> None:
@@ -287,7 +287,9 @@ def test_overflow_drops_the_torn_frame_and_starts_a_new_line() -> None:
     assert_contiguous(before)
     assert_contiguous(after)
     assert after[0].samples[0, 0] >= 48_000
-    assert all(abs(cut.raster * FRAME_NS - ideal_ns(int(cut.samples[0, 0]) + 700)) < 1e9 / RATE_HZ for cut in after)
+    assert all(
+        abs(cut.frame_index * FRAME_NS - ideal_ns(int(cut.samples[0, 0]) + 700)) < 1e9 / RATE_HZ for cut in after
+    )
 
 
 def test_empty_blocks_change_nothing() -> None:

@@ -59,10 +59,10 @@ def test_updates_due_are_those_that_the_fusion_makes() -> None:
     fusion: Fusion = make_fusion(site)
     outputs = []
     with threadpool_limits(limits=1):
-        for raster in range(first, first + 2 * load.PERIOD_FRAMES):
-            frames = [sound.frame(raster, raster - first + 1) for sound in sounds]
+        for frame_index in range(first, first + 2 * load.PERIOD_FRAMES):
+            frames = [sound.frame(frame_index, frame_index - first + 1) for sound in sounds]
             assert min(frame.power for frame in frames) > 0
-            outputs += fusion.step(frames, (raster + 1) * FRAME_NS)
+            outputs += fusion.step(frames, (frame_index + 1) * FRAME_NS)
     updates = [output.complete_ns for output in outputs if isinstance(output, Update)]
     assert updates == load.windows_ns(site, first * FRAME_NS, (first + 2 * load.PERIOD_FRAMES) * FRAME_NS)
     assert len(updates) == 2 * load.SOUND_FRAMES // 2

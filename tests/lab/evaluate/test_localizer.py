@@ -10,7 +10,7 @@ import pytest
 
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
 from livessl.core.geometry import speed_of_sound_m_s
-from livessl.core.locate.confidence import Signs
+from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.lab.evaluate.campaign import Job, compute, read_clips, run_campaign
 from livessl.lab.evaluate.command import add_arguments, run
 from livessl.lab.evaluate.localizer import METHODS, LocalizerSettings, development_fit, rivals_fit
@@ -163,11 +163,13 @@ def test_fit_finds_the_odds_that_made_the_events() -> None:
 
 def test_fit_finds_the_odds_of_rivals() -> None:
     rng = np.random.default_rng(2)
-    signs = [Signs(margin, standing) for margin, standing in rng.uniform((0.0, 2.0), (0.3, 9.0), (20000, 2))]
-    likely = [each.heard / (1.0 + np.exp(0.5 - 20.0 * each.margin)) for each in signs]
+    features = [
+        ConfidenceFeatures(margin, standing) for margin, standing in rng.uniform((0.0, 2.0), (0.3, 9.0), (20000, 2))
+    ]
+    likely = [each.heard / (1.0 + np.exp(0.5 - 20.0 * each.margin)) for each in features]
     columns = {
-        "margin": np.array([each.margin for each in signs]),
-        "standing": np.array([each.standing for each in signs]),
+        "margin": np.array([each.margin for each in features]),
+        "standing": np.array([each.standing for each in features]),
         "error_m": np.where(rng.random(20000) < likely, 0.1, 2.0),
     }
     # five standard errors, from the inverse of the information there: 0.04 and 0.7

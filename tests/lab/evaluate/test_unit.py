@@ -109,7 +109,7 @@ def test_sampling_faster_changes_hardly_anything(tmp_path: Path) -> None:
         position = Position(settings, read_clips(write_sounds(tmp_path), CLASSES, rate_hz))
         rows = [row for number in range(6) for row in position.rows(number) if row["method"] == "srp-phat"]
         found.append(np.array([[row[f"found_{axis}_m"] for axis in "xyz"] for row in rows]))
-    # the same nodes, but for places between two where rounding to another raster of 50 ms decides
+    # the same nodes, but for places between two where rounding to another frame index of 50 ms decides
     assert (found[0] == found[1]).all(axis=1).mean() > 0.8
     assert len(np.unique(found[0], axis=0)) > 3
 

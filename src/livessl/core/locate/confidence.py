@@ -14,7 +14,7 @@ import numpy as np
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
 from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
-from livessl.core.types import ArraySpec, FloatArray, HeardBy
+from livessl.core.types import ArraySpec, Evidence, FloatArray
 
 NEAR_M: Final = 0.5
 """The confidence is the probability that the place is right to within so much."""
@@ -58,7 +58,7 @@ of which the lag axis tells nothing, move several arrays' places by as much."""
 
 
 @dataclass(frozen=True, slots=True)
-class Signs:
+class ConfidenceFeatures:
     """What the confidence goes by.
 
     Parameters
@@ -114,19 +114,19 @@ class Judgement:
     Parameters
     ----------
     covariance_m2 : (3, 3) float64
-    signs : Signs
+    signs : ConfidenceFeatures
     refused : str or None
         Why the place should not be relied on, where it should not.
     """
 
     covariance_m2: FloatArray
-    signs: Signs
+    features: ConfidenceFeatures
     refused: str | None
 
 
 def judge(
     functional: SRPFunctional,
-    evidence: Sequence[HeardBy],
+    evidence: Sequence[Evidence],
     position_m: FloatArray,
     power: float,
     rival_power: float,
@@ -140,7 +140,7 @@ def judge(
     ----------
     functional : SRPFunctional
         Of the evidence.
-    evidence : sequence of HeardBy
+    evidence : sequence of Evidence
     position_m : (3,) float64
         The highest place.
     power, rival_power : float
@@ -151,7 +151,7 @@ def judge(
     """
     terms = functional.pair_terms(position_m)
     each = sorted(standing(heard, array_power(heard, term)) for heard, term in zip(evidence, terms, strict=True))
-    signs = Signs(
+    features = ConfidenceFeatures(
         refine.margin(power, rival_power),
         sum(each),
         crossing_deg([heard.spec for heard in evidence], position_m),
@@ -164,15 +164,15 @@ def judge(
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _FINEST_M**2
     refused = None
-    if signs.confidence < LEAST_CONFIDENCE:
+    if features.confidence < LEAST_CONFIDENCE:
         refused = (
-            f"too unsure: right to within {NEAR_M:g} m by a probability of {signs.confidence:.2f}, of at least "
+            f"too unsure: right to within {NEAR_M:g} m by a probability of {features.confidence:.2f}, of at least "
             f"{LEAST_CONFIDENCE:g} wanted"
         )
-    return Judgement(covariance_m2, signs, refused)
+    return Judgement(covariance_m2, features, refused)
 
 
-def _discord(evidence: Sequence[HeardBy], terms: Sequence[PairTerms], axes: int) -> float:
+def _discord(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:
     """How far the pairs disagree about a place with so many free axes, as a share of what stands elsewhere; at most 1.
 
     They have more delays than the place has coordinates, and where they do not agree their slopes R' there are not 0:
@@ -204,7 +204,7 @@ def _likely(log_odds: float) -> float:
     return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
-def standing(heard: HeardBy, power: float) -> float:
+def standing(heard: Evidence, power: float) -> float:
     """An array's share of the standing: how high its SRP, of this power, stands over what its GCCs are elsewhere.
 
     Silent pairs, of a microphone that was left out, are no measure of what the others are.
@@ -216,6 +216,6 @@ def standing(heard: HeardBy, power: float) -> float:
     return max(0.0, power) / (_DELAYS * noise) if live else 0.0
 
 
-def array_power(heard: HeardBy, term: PairTerms) -> float:
+def array_power(heard: Evidence, term: PairTerms) -> float:
     """An array's SRP at a point, from its pairs' terms there."""
     return pair_weight(len(heard.spec.microphones_m)) * float(term.values.sum())

@@ -21,11 +21,11 @@ from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, summed
 from livessl.core.correlate.spectra import FrontEnd, averaged, cepstral, whole_segment
 from livessl.core.geometry import Grid
 from livessl.core.locate import confidence, outliers, refine, second_source
-from livessl.core.locate.confidence import Signs
+from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPFunctional, SRPMapper
 from livessl.core.steering import alias_free_hz
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy
+from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Sound:
     sample_rate_hz: float
     onsets: Sequence[OnsetGCC] = ()
     """What the estimator's listener made of its frames and those around them, frame by frame, where there is one."""
-    doubted: bool = False
+    suspect: bool = False
     """Whether the array has disagreed with the others lately."""
     sources: int = 1
     """How many sources are to be looked for."""
@@ -72,13 +72,13 @@ class Localization:
     position_m: FloatArray
     covariance_m2: FloatArray
     confidence: float
-    evidence: tuple[HeardBy, ...]
+    evidence: tuple[Evidence, ...]
     proven: bool = True
-    signs: Signs | None = None
+    features: ConfidenceFeatures | None = None
     """What the confidence was worked out from, where it is a probability."""
     refused: str | None = None
     """Why it should not be relied on, where it should not."""
-    outvoted: Mapping[str, float] | None = None
+    outliers: Mapping[str, float] | None = None
     """Arrays that it was found without, for they disagree with the others, and by what angle in degrees; None where
     nobody asked."""
     unneeded: Collection[str] = ()
@@ -123,7 +123,7 @@ class Estimator(Protocol):
         """Localize one sound heard by the arrays named in `sounds`; at least one."""
         ...
 
-    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         """Maps of what `locate` went by, for people: the fused one, and those of the arrays named (None for all).
 
         It may be called from another thread than `locate`.
@@ -187,7 +187,7 @@ class SrpPhat:
             found[0].proven,
         )
 
-    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         """Map each array's evidence onto the grid, and sum."""
         fused = np.zeros(self._map_grid.size, dtype=np.float32)
         arrays: dict[str, Float32Array] = {}
@@ -200,21 +200,21 @@ class SrpPhat:
                 mapper.add(fused, heard.gcc, *heard.below)
         return PowerMaps(self._map_grid, fused, arrays)
 
-    def _evidence(self, sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+    def _evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         if any(self._limited[name] for name in sounds):
             return tuple(self._heard(name, sound) for name, sound in sounds.items())
         correlators = [self._correlator(name, sound.sample_rate_hz)[0] for name, sound in sounds.items()]
         segments = [sound.segments for sound in sounds.values()]
         gccs = correlated(list(zip(correlators, segments, strict=True)))
         return tuple(
-            HeardBy(self._arrays[name], sound.live(gcc))
+            Evidence(self._arrays[name], sound.live(gcc))
             for (name, sound), gcc in zip(sounds.items(), gccs, strict=True)
         )
 
-    def _heard(self, array: str, sound: Sound) -> HeardBy:
+    def _heard(self, array: str, sound: Sound) -> Evidence:
         correlate, cut_offs_hz = self._correlator(array, sound.sample_rate_hz)
         gcc, *below = correlate.below(sound.segments, cut_offs_hz)
-        return HeardBy(self._arrays[array], sound.live(gcc), tuple(map(sound.live, below)))
+        return Evidence(self._arrays[array], sound.live(gcc), tuple(map(sound.live, below)))
 
     def _correlator(self, array: str, sample_rate_hz: float) -> tuple[GCCPhat, Sequence[float]]:
         known = self._correlators.get(array)
@@ -228,7 +228,7 @@ class SrpPhat:
         self._correlators[array] = (sample_rate_hz, correlate, cut_offs_hz)
         return correlate, cut_offs_hz
 
-    def _mapper(self, heard: HeardBy) -> SRPMapper:
+    def _mapper(self, heard: Evidence) -> SRPMapper:
         """The mapper of an array's lags; made anew when its sampling rate, and with it the lags, have changed."""
         spec, gcc = heard.spec, heard.gcc
         known = self._mappers.get(spec.name)
@@ -311,37 +311,37 @@ class Onset(SrpPhat):
         """Find the highest place of the summed maps, outvote who does not agree on it, and judge what is left."""
         clearest = _clearest(sounds, MOST_ARRAYS)
         evidence = tuple(self._heard(name, sound) for name, sound in clearest.items())
-        doubted = [name for name, sound in clearest.items() if sound.doubted]
-        found = self._answer(evidence, doubted)
+        suspect = [name for name, sound in clearest.items() if sound.suspect]
+        found = self._answer(evidence, suspect)
         second = self._second(found.agreed, evidence, clearest)
         others = () if second is None else (second[1],)
         if second is not None:
             place, other = second
             judged = _judged(place, self._grid)
-            found = _Answer(evidence, outliers.Agreed(place, other.outvoted or {}), judged, judged.refused)
+            found = _Answer(evidence, outliers.Agreed(place, other.outliers or {}), judged, judged.refused)
         elif not found.is_sure and all(sound.ended for sound in clearest.values()):
-            again = self._answer(self._with_whole(evidence, clearest), doubted, whole=True)
-            found = max(found, again, key=lambda answer: (answer.refused is None, answer.judged.signs.confidence))
+            again = self._answer(self._with_whole(evidence, clearest), suspect, whole=True)
+            found = max(found, again, key=lambda answer: (answer.refused is None, answer.judged.features.confidence))
         place = found.agreed.place
         return Localization(
             place.position_m,
             found.judged.covariance_m2,
-            found.judged.signs.confidence,
+            found.judged.features.confidence,
             found.evidence,
             place.proven,
-            found.judged.signs,
+            found.judged.features,
             found.refused if place.proven else "nothing stands out: the search for the place was given up",
-            found.agreed.outvoted,
+            found.agreed.outliers,
             sounds.keys() - clearest.keys(),
             tuple(replace(other, unneeded=sounds.keys() - {h.spec.name for h in other.evidence}) for other in others),
         )
 
-    def _answer(self, evidence: tuple[HeardBy, ...], doubted: Collection[str], *, whole: bool = False) -> _Answer:
-        agreed = outliers.agreed(evidence, doubted, self._search, self._grid, self._place)
+    def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
+        agreed = outliers.agreed(evidence, suspect, self._search, self._grid, self._place)
         judged = _judged(agreed.place, self._grid, whole=whole)
         return _Answer(evidence, agreed, judged, agreed.refused or judged.refused)
 
-    def _with_whole(self, evidence: tuple[HeardBy, ...], sounds: Mapping[str, Sound]) -> tuple[HeardBy, ...]:
+    def _with_whole(self, evidence: tuple[Evidence, ...], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """The evidence and that of whole segments: what goes on steadily counts as much as what begins."""
         telling = _clearest(sounds, MOST_TELLING_APART)
         return tuple(
@@ -349,12 +349,12 @@ class Onset(SrpPhat):
             for heard in evidence
         )
 
-    def _plus_whole(self, heard: HeardBy, sound: Sound) -> HeardBy:
+    def _plus_whole(self, heard: Evidence, sound: Sound) -> Evidence:
         whole = super()._heard(heard.spec.name, sound).gcc
-        return HeardBy(heard.spec, replace(heard.gcc, values=heard.gcc.values + whole.values))
+        return Evidence(heard.spec, replace(heard.gcc, values=heard.gcc.values + whole.values))
 
     def _second(
-        self, agreed: outliers.Agreed, everyone: tuple[HeardBy, ...], sounds: Mapping[str, Sound]
+        self, agreed: outliers.Agreed, everyone: tuple[Evidence, ...], sounds: Mapping[str, Sound]
     ) -> tuple[outliers.Place, Localization] | None:
         """The first place, and the second; None where there is none.
 
@@ -362,7 +362,7 @@ class Onset(SrpPhat):
         then the second once more. Arrays may disagree because one hears another source best: where each of them hears
         something at both places, none is outvoted.
         """
-        for all_of_them in (everyone, agreed.place.evidence) if agreed.outvoted else (everyone,):
+        for all_of_them in (everyone, agreed.place.evidence) if agreed.outliers else (everyone,):
             divided = agreed.refused is not None or len(all_of_them) > len(agreed.place.evidence)
             telling = _clearest({heard.spec.name: sounds[heard.spec.name] for heard in all_of_them}, MOST_TELLING_APART)
             evidence = tuple(heard for heard in all_of_them if heard.spec.name in telling)
@@ -387,16 +387,16 @@ class Onset(SrpPhat):
             if divided and not (again.is_heard_by_all and second.is_heard_by_all):
                 continue
             judged = _judged(second, self._grid)
-            outvoted = {name: off for name, off in agreed.outvoted.items() if name not in {s.name for s in specs}}
+            outliers = {name: off for name, off in agreed.outliers.items() if name not in {s.name for s in specs}}
             # a short sound hardly counts where another's moments were evened out, and may be surer as it was
             firsts = [again] if divided or first.apart_m(second) < second_source.APART_M else [again, agreed.place]
-            return max(firsts, key=lambda place: _judged(place, self._grid).signs.confidence), Localization(
+            return max(firsts, key=lambda place: _judged(place, self._grid).features.confidence), Localization(
                 second.position_m,
                 judged.covariance_m2,
                 confidence,
                 second.evidence,
-                signs=judged.signs,
-                outvoted=outvoted,
+                features=judged.features,
+                outliers=outliers,
             )
         return None
 
@@ -430,11 +430,11 @@ class Onset(SrpPhat):
         other, confidence = chosen
         return replace(other, rival_power=refine.rival_power(find, self._grid, other.position_m)), confidence
 
-    def _moments(self, heard: HeardBy, sound: Sound) -> second_source.Moments:
+    def _moments(self, heard: Evidence, sound: Sound) -> second_source.Moments:
         sampling = self._sampling(heard.spec.name, sound.sample_rate_hz)
         return second_source.Moments.of(heard.spec, sampling, sound.onsets, np.any(heard.gcc.values, axis=1))
 
-    def _place(self, evidence: Sequence[HeardBy]) -> outliers.Place:
+    def _place(self, evidence: Sequence[Evidence]) -> outliers.Place:
         evidence = tuple(sorted(evidence, key=lambda heard: heard.spec.name))  # sums depend on the order
         find = self._search.among(evidence)
         found = find(_STARTS)
@@ -444,7 +444,7 @@ class Onset(SrpPhat):
         rival_power = refine.rival_power(find, self._grid, position)
         return outliers.Place(evidence, functional, position, power, rival_power, found[0].proven)
 
-    def _heard(self, array: str, sound: Sound) -> HeardBy:
+    def _heard(self, array: str, sound: Sound) -> Evidence:
         if sound.onsets:
             onsets = summed(sound.onsets)
         else:
@@ -453,7 +453,7 @@ class Onset(SrpPhat):
         spec = self._arrays[array]
         pairs = microphone_pairs(len(spec.microphones_m))
         gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
-        return HeardBy(spec, sound.live(gcc))
+        return Evidence(spec, sound.live(gcc))
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
         known = self._samplings.get(array)
@@ -480,7 +480,7 @@ def _clearest(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
 class _Answer:
     """Of what evidence, who agrees on which place, what it is worth, and why it should not be relied on if so."""
 
-    evidence: tuple[HeardBy, ...]
+    evidence: tuple[Evidence, ...]
     agreed: outliers.Agreed
     judged: confidence.Judgement
     refused: str | None
@@ -488,7 +488,7 @@ class _Answer:
     @property
     def is_sure(self) -> bool:
         """Whether a second look is not worth its time."""
-        return self.refused is None and self.judged.signs.is_sure
+        return self.refused is None and self.judged.features.is_sure
 
 
 def _judged(place: outliers.Place, grid: Grid, *, whole: bool = False) -> confidence.Judgement:

@@ -17,7 +17,7 @@ from livessl.core.geometry import Grid, angle_deg
 from livessl.core.locate.confidence import NEAR_M, array_power, standing
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPFunctional, pair_weight
-from livessl.core.types import FloatArray, HeardBy
+from livessl.core.types import Evidence, FloatArray
 
 MOST_LOST: Final = 0.8
 """Where arrays lose more standing than this at a place, one without which the others lose so much less is outvoted.
@@ -46,7 +46,7 @@ class Place:
 
     Parameters
     ----------
-    evidence : tuple of HeardBy
+    evidence : tuple of Evidence
         Theirs, in the order of their names.
     functional : SRPFunctional
         Of it.
@@ -57,7 +57,7 @@ class Place:
         Whether no node of the grid is higher.
     """
 
-    evidence: tuple[HeardBy, ...]
+    evidence: tuple[Evidence, ...]
     functional: SRPFunctional
     position_m: FloatArray
     power: float
@@ -90,16 +90,16 @@ class Agreed:
     """
 
     place: Place
-    outvoted: Mapping[str, float] = field(default_factory=dict)
+    outliers: Mapping[str, float] = field(default_factory=dict)
     refused: str | None = None
 
 
 def agreed(
-    everyone: Sequence[HeardBy],
-    doubted: Collection[str],
+    everyone: Sequence[Evidence],
+    suspect: Collection[str],
     search: PeakSearch,
     grid: Grid,
-    locate: Callable[[Sequence[HeardBy]], Place],
+    locate: Callable[[Sequence[Evidence]], Place],
 ) -> Agreed:
     """The place that most arrays agree on.
 
@@ -109,7 +109,7 @@ def agreed(
 
     Parameters
     ----------
-    everyone : sequence of HeardBy
+    everyone : sequence of Evidence
     doubted : collection of str
         Arrays that have disagreed lately.
     search : PeakSearch
@@ -119,11 +119,11 @@ def agreed(
         From the evidence of some of them to their place.
     """
     own = _Own(search, grid)
-    first = [heard for heard in everyone if heard.spec.name not in doubted]
-    last = [heard for heard in everyone if heard.spec.name in doubted]
+    first = [heard for heard in everyone if heard.spec.name not in suspect]
+    last = [heard for heard in everyone if heard.spec.name in suspect]
     if 2 * len(first) <= len(everyone):
         first, last = list(everyone), []
-    out: list[HeardBy] = []
+    out: list[Evidence] = []
     place = locate(first)
     while len(everyone) > 1:
         lost = own.lost(place)
@@ -184,11 +184,11 @@ class _Own:
                     lost[name] = max(0.0, standing(heard, self._at(heard)[0]) - here[name])
         return lost
 
-    def angle_deg(self, heard: HeardBy, position_m: FloatArray) -> float:
+    def angle_deg(self, heard: Evidence, position_m: FloatArray) -> float:
         """Angle at an array between its own place and another."""
         return angle_deg(self._at(heard)[1] - heard.spec.centre_m, position_m - heard.spec.centre_m)
 
-    def _at(self, heard: HeardBy) -> tuple[float, FloatArray]:
+    def _at(self, heard: Evidence) -> tuple[float, FloatArray]:
         name = heard.spec.name
         if name not in self._highest:
             (peak,) = self._search.among([heard])(1)
@@ -196,12 +196,12 @@ class _Own:
         return self._highest[name]
 
 
-def _most(heard: HeardBy) -> float:
+def _most(heard: Evidence) -> float:
     """Standing that no place has more of: all of an array's pairs at their highest."""
     highest = heard.gcc.values.max(axis=1).sum(dtype=np.float64)
     return standing(heard, pair_weight(len(heard.spec.microphones_m)) * float(highest))
 
 
-def _divided(everyone: Sequence[HeardBy]) -> str:
+def _divided(everyone: Sequence[Evidence]) -> str:
     names = " and ".join(repr(heard.spec.name) for heard in everyone) if len(everyone) == 2 else "the arrays"
     return f"{names} point to different places, and it cannot be told which is wrong: are their poses right?"

@@ -24,9 +24,9 @@ from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper, pair_we
 from livessl.core.types import (
     GCC,
     ArraySpec,
+    Evidence,
     Float32Array,
     FloatArray,
-    HeardBy,
     IntArray,
     UInt16Array,
 )
@@ -132,13 +132,13 @@ class PeakSearch:
         self._sets.clear()
 
     def among(
-        self, evidence: Sequence[HeardBy], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
+        self, evidence: Sequence[Evidence], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
     ) -> FindPeaks:
         """What finds the peaks of some arrays' evidence; good until the next call.
 
         Parameters
         ----------
-        evidence : sequence of HeardBy
+        evidence : sequence of Evidence
             At least one, in the order in which the maps are to be joined. Each array must have been prepared.
         rule : Rule
         most_look_ups : int
@@ -273,7 +273,7 @@ def warm_up() -> None:
     spec = ArraySpec("warm-up", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), (100.0, 6000.0))
     grid = Grid(((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)), 0.5)
     lags_s = np.arange(-200, 201) / 400_000.0
-    heard = HeardBy(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
+    heard = Evidence(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
     search = PeakSearch([spec], grid, 343.0)
     search.prepare(spec.name, lags_s)
     search.among([heard])(2)

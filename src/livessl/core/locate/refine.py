@@ -13,7 +13,7 @@ from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
-from livessl.core.types import BoolArray, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 CANDIDATES: Final = 2
 """Nodes followed to the top: between two nodes a lower one on the grid may be the higher one in truth."""
@@ -170,7 +170,7 @@ def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray)
 
 
 def laplace_covariance_m2(
-    functional: SRPFunctional, evidence: Sequence[HeardBy], position_m: FloatArray, grid: Grid
+    functional: SRPFunctional, evidence: Sequence[Evidence], position_m: FloatArray, grid: Grid
 ) -> FloatArray:
     """Covariance (3, 3) from the map's curvature at the peak: C = (sum lambda (-Hess SRP) + prior)^-1.
 
@@ -193,13 +193,13 @@ def laplace_covariance_m2(
     return covariance
 
 
-def noise(heard: HeardBy, term: PairTerms, live: BoolArray) -> float:
+def noise(heard: Evidence, term: PairTerms, live: BoolArray) -> float:
     """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
     lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
     return float(kernels.mean_square(heard.gcc.values[live], heard.gcc.lags_s, term.lags_s[live], lobe_s))
 
 
-def _scale(heard: HeardBy, term: PairTerms) -> float:
+def _scale(heard: Evidence, term: PairTerms) -> float:
     elsewhere = noise(heard, term, np.ones(len(heard.gcc.values), dtype=np.bool_))
     height = float(term.values.mean())
     return max(height, 0.0) / elsewhere if elsewhere > 0 else 0.0

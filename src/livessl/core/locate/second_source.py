@@ -17,7 +17,7 @@ import numpy as np
 
 from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
-from livessl.core.types import GCC, ArraySpec, BoolArray, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 APART_M: Final = 1.0
 """Two places nearer than this are one."""
@@ -87,7 +87,7 @@ class Moments:
         fine = sampling.fine(coarse.reshape(-1, coarse.shape[2])).reshape(*coarse.shape[:2], -1)
         return cls(spec, sampling.fine_lags_s, fine, np.array([one.weight for one in together]))
 
-    def without(self, delays_s: FloatArray) -> HeardBy:
+    def without(self, delays_s: FloatArray) -> Evidence:
         """What is left when a source at these delays of the pairs (P,) is taken out."""
         share, starts = self._share(delays_s)
         count, live = len(self.lags_s), self._live
@@ -97,7 +97,7 @@ class Moments:
         weighed = scale.astype(np.float32) @ share
         for pair in live:
             values[pair] -= weighed[starts[pair] : starts[pair] + count]
-        return HeardBy(self.spec, GCC(microphone_pairs(len(self.spec.microphones_m)), self.lags_s, values))
+        return Evidence(self.spec, GCC(microphone_pairs(len(self.spec.microphones_m)), self.lags_s, values))
 
     def clearness(self, delays_s: FloatArray, without_s: FloatArray) -> float:
         """How high a source at some delays (P,) stands without that at others, in the moment where it is clearest.

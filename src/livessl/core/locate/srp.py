@@ -17,7 +17,7 @@ from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.kernels.with_numpy import interpolated, lag_places, neighbours
 from livessl.core.steering import NEAREST_M, alias_free_hz
-from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, HeardBy, IntArray
+from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray, IntArray
 
 _SLAB_NODES: Final = 1 << 15
 """Nodes whose delays are worked out at once: what fits the second-level cache."""
@@ -110,12 +110,12 @@ class SRPFunctional:
 
     Parameters
     ----------
-    evidence : sequence of HeardBy
+    evidence : sequence of Evidence
         One for each array.
     c_m_s : float
     """
 
-    def __init__(self, evidence: Sequence[HeardBy], c_m_s: float) -> None:
+    def __init__(self, evidence: Sequence[Evidence], c_m_s: float) -> None:
         self._names = [heard.spec.name for heard in evidence]
         counts = [len(heard.spec.microphones_m) for heard in evidence]
         rows = [len(heard.gcc.pairs) for heard in evidence]

@@ -32,7 +32,7 @@ LEAST_VOTES: Final = 3
 so often in a row."""
 
 Votes = tuple[tuple[int, float | None], ...]
-"""Of the last sounds, by the raster interval each began at: by what angle the array was off, None where it agreed."""
+"""Of the last sounds, by the frame index each began at: by what angle the array was off, None where it agreed."""
 
 
 class ArrayState(StrEnum):
@@ -115,39 +115,39 @@ class Stream:
             self.weak_since_ns = now_ns
         self.weak = weak
 
-    def has_active(self, raster: int) -> bool:
-        """Whether its frame of a raster interval is there, and active."""
-        frame = self.frames.get(raster)
+    def has_active(self, frame_index: int) -> bool:
+        """Whether its frame of a frame index is there, and active."""
+        frame = self.frames.get(frame_index)
         return frame is not None and frame.active
 
-    def segments(self, rasters: Sequence[int]) -> tuple[list[list[Frame]], list[int]]:
+    def segments(self, frame_indices: Sequence[int]) -> tuple[list[list[Frame]], list[int]]:
         """The frames at `rasters` (ascending), cut wherever one is missing; and the rasters that are there."""
         pieces: list[list[Frame]] = []
         there: list[int] = []
-        for raster in rasters:
-            frame = self.frames.get(raster)
+        for frame_index in frame_indices:
+            frame = self.frames.get(frame_index)
             if frame is None:
                 continue
-            if not there or raster != there[-1] + 1:
+            if not there or frame_index != there[-1] + 1:
                 pieces.append([])
             pieces[-1].append(frame)
-            there.append(raster)
+            there.append(frame_index)
         return pieces, there
 
     def let_go(self, before: int) -> None:
-        """Let the samples of its frames before a raster interval go; what else is known of them stays."""
-        for raster, frame in self.frames.items():
-            if raster < before and frame.samples.size:
-                self.frames[raster] = replace(frame, samples=frame.samples[:, :0].copy())
+        """Let the samples of its frames before a frame index go; what else is known of them stays."""
+        for frame_index, frame in self.frames.items():
+            if frame_index < before and frame.samples.size:
+                self.frames[frame_index] = replace(frame, samples=frame.samples[:, :0].copy())
 
-    def keeps(self, rasters: Iterable[int]) -> bool:
+    def keeps(self, frame_indices: Iterable[int]) -> bool:
         """Whether the samples of all of its frames at `rasters` are still there."""
-        return all(self.frames[raster].samples.size for raster in rasters if raster in self.frames)
+        return all(self.frames[frame_index].samples.size for frame_index in frame_indices if frame_index in self.frames)
 
     def move(self, frames: int) -> None:
         """Take it that its clock is ahead by so many frames more."""
         self.ahead += frames
-        self.frames = {r - frames: replace(frame, raster=r - frames) for r, frame in self.frames.items()}
+        self.frames = {r - frames: replace(frame, frame_index=r - frames) for r, frame in self.frames.items()}
         if self.watermark is not None:
             self.watermark -= frames
         self.forget()
@@ -167,7 +167,7 @@ class Stream:
         if mark.clock is ClockState.STEPPED:
             self.worry(now_ns, "its clock has stepped")
         self.counters["overflows"], self.counters["lost_frames"] = mark.overflows, mark.lost_frames
-        if self.watermark is None or mark.raster >= self.watermark:
+        if self.watermark is None or mark.frame_index >= self.watermark:
             self.mark, self.power, self.active = mark, mark.power, False
             self.find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 

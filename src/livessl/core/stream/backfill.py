@@ -56,7 +56,7 @@ def nearest(silent: Sequence[ArraySpec], heard: Sequence[ArraySpec]) -> list[Arr
 
 @dataclass(slots=True)
 class Allowance:
-    """How much of one array's sound may still be asked for: it grows with time. In raster intervals."""
+    """How much of one array's sound may still be asked for: it grows with time. In frame indices."""
 
     left: float = RECENT_S / FRAME_S
     at: int | None = None
@@ -84,7 +84,7 @@ class AskedSound:
 
 @dataclass(slots=True)
 class Asked:
-    """What one array was asked for, and has answered. In joint raster intervals."""
+    """What one array was asked for, and has answered. In joint frame indices."""
 
     span: range
     frames: dict[int, Frame] = field(default_factory=dict)
@@ -96,13 +96,15 @@ class Asked:
 
     def sound(self, estimator: Estimator, start: int) -> AskedSound | None:
         """What it heard of an event that began at `start`; None where it has no frames of it, or no listener."""
-        last_ones = list(takewhile(lambda raster: raster in self.frames, reversed(self.span)))[::-1]
-        frames = [self.frames[raster] for raster in last_ones]
-        loud = [frame for raster, frame in zip(last_ones, frames, strict=True) if raster >= start]
+        last_ones = list(takewhile(lambda frame_index: frame_index in self.frames, reversed(self.span)))[::-1]
+        frames = [self.frames[frame_index] for frame_index in last_ones]
+        loud = [frame for frame_index, frame in zip(last_ones, frames, strict=True) if frame_index >= start]
         if not loud or len({frame.sample_rate_hz for frame in frames}) > 1:
             return None
         listener = estimator.listener(frames[0].array, frames[0].sample_rate_hz)
         if listener is None:
             return None
         heard = zip(last_ones, frames, strict=True)
-        return AskedSound(loud, tuple(listener.push(frame.samples, quiet=raster < start) for raster, frame in heard))
+        return AskedSound(
+            loud, tuple(listener.push(frame.samples, quiet=frame_index < start) for frame_index, frame in heard)
+        )

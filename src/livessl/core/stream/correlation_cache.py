@@ -28,23 +28,23 @@ Each = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
 @dataclass(slots=True)
 class Ear:
-    """How far one array has been followed, and what was heard of it, by raster interval."""
+    """How far one array has been followed, and what was heard of it, by frame index."""
 
     chain: int = 0
     begin: int = 0
     onsets: dict[int, OnsetGCC] = field(default_factory=dict)
 
-    def has(self, rasters: Iterable[int]) -> bool:
+    def has(self, frame_indices: Iterable[int]) -> bool:
         """Whether all of these were heard."""
-        return all(raster in self.onsets for raster in rasters)
+        return all(frame_index in self.onsets for frame_index in frame_indices)
 
-    def at(self, rasters: Iterable[int]) -> tuple[OnsetGCC, ...]:
+    def at(self, frame_indices: Iterable[int]) -> tuple[OnsetGCC, ...]:
         """What was heard at `rasters`."""
-        return tuple(self.onsets[raster] for raster in rasters if raster in self.onsets)
+        return tuple(self.onsets[frame_index] for frame_index in frame_indices if frame_index in self.onsets)
 
 
 Followed = tuple[str, Ear, Mapping[int, Frame]]
-"""An array, how far it has been followed, and its frames by raster interval."""
+"""An array, how far it has been followed, and its frames by frame index."""
 
 
 class Listening:
@@ -63,34 +63,34 @@ class Listening:
         self._onsets: dict[tuple[str, int], OnsetGCC] = {}
         self._listeners: defaultdict[str, dict[int, OnsetFrontEnd]] = defaultdict(dict)
 
-    def hear(self, followed: Iterable[Followed], rasters: Sequence[int]) -> None:
-        """Let ears follow their arrays through some raster intervals; where a frame is missing another chain begins."""
-        self._each(lambda one: self._follow(one, rasters), followed)
+    def hear(self, followed: Iterable[Followed], frame_indices: Sequence[int]) -> None:
+        """Let ears follow their arrays through some frame indices; where a frame is missing another chain begins."""
+        self._each(lambda one: self._follow(one, frame_indices), followed)
         _limit(self._onsets, SHARED_FRAMES)
 
-    def _follow(self, followed: Followed, rasters: Sequence[int]) -> None:
+    def _follow(self, followed: Followed, frame_indices: Sequence[int]) -> None:
         array, ear, frames = followed
-        for raster in rasters:
-            if raster in ear.onsets:
+        for frame_index in frame_indices:
+            if frame_index in ear.onsets:
                 continue
-            frame = frames.get(raster)
+            frame = frames.get(frame_index)
             if frame is None:
                 ear.chain = 0
                 continue
             before = ear.chain
-            ear.begin = ear.begin if before else raster
-            ear.chain = hash((before, raster, frame.time_ns, frame.active, frame.sample_rate_hz))
+            ear.begin = ear.begin if before else frame_index
+            ear.chain = hash((before, frame_index, frame.time_ns, frame.active, frame.sample_rate_hz))
             onsets = self._onsets.get((array, ear.chain))
             if onsets is None:
                 listener = self._listeners[array].pop(before, None) if before else None
                 if listener is None or listener.sample_rate_hz != frame.sample_rate_hz:
-                    listener = self._caught_up(array, frame.sample_rate_hz, range(ear.begin, raster), frames)
+                    listener = self._caught_up(array, frame.sample_rate_hz, range(ear.begin, frame_index), frames)
                 if listener is None:
                     continue
                 onsets = self._onsets[array, ear.chain] = _push(listener, frame)
                 self._listeners[array][ear.chain] = listener
                 _limit(self._listeners[array], LISTENERS)
-            ear.onsets[raster] = onsets
+            ear.onsets[frame_index] = onsets
 
     def clear(self) -> None:
         """Forget all."""
@@ -98,13 +98,13 @@ class Listening:
         self._listeners.clear()
 
     def _caught_up(
-        self, array: str, sample_rate_hz: float, rasters: range, frames: Mapping[int, Frame]
+        self, array: str, sample_rate_hz: float, frame_indices: range, frames: Mapping[int, Frame]
     ) -> OnsetFrontEnd | None:
         """A new listener that has heard what is still there of a chain; None where the estimator has none."""
         listener = self._estimator.listener(array, sample_rate_hz)
         if listener is not None:
-            for raster in rasters:
-                frame = frames.get(raster)
+            for frame_index in frame_indices:
+                frame = frames.get(frame_index)
                 if frame is None or not frame.samples.size or frame.sample_rate_hz != sample_rate_hz:
                     listener.reset()
                 else:

@@ -1,6 +1,6 @@
-"""Joins the frames of all arrays on the time raster and turns them into updates, events and tracks.
+"""Joins the frames of all arrays on the grid of frames and turns them into updates, events and tracks.
 
-`Fusion.step(messages, now_ns)` is the only door, live and replayed. A raster interval closes when every array that is
+`Fusion.step(messages, now_ns)` is the only door, live and replayed. A frame index closes when every array that is
 being waited for has reached it, or at its deadline; who is late or missing contributes nothing. It reads no clock.
 """
 
@@ -26,7 +26,7 @@ from livessl.core.types import (
     FRAME_NS,
     FRAME_S,
     ArraySpec,
-    Ask,
+    BackfillRequest,
     Contribution,
     Estimate,
     Event,
@@ -115,7 +115,7 @@ class FusionParameters:
 class _OpenEvent:
     start: int
     last_active: int
-    closed: int  # the last raster interval looked at: what lies beyond may have come, but is not the event's
+    closed: int  # the last frame index looked at: what lies beyond may have come, but is not the event's
     late_frames: int = 0
     ended: bool = False  # by quiet or length; else it is cut short, for nothing more comes
     became_quiet: bool = False
@@ -177,10 +177,10 @@ class Fusion:
         self._told_until = self._closing_until = -(2**63)
         self._due: int | None = None
         self._listening = Listening(estimator, each)
-        self._ahead: tuple[int, int] | None = None  # raster intervals, first and last, that were listened to ahead
-        self._spared: Collection[str] = ()
+        self._ahead: tuple[int, int] | None = None  # frame indices, first and last, that were listened to ahead
+        self._excluded: Collection[str] = ()
         self._votes: dict[str, Votes] = dict.fromkeys(self._streams, ())
-        self.askable: set[str] = set()
+        self.can_backfill: set[str] = set()
         """Arrays whose nodes can be asked for what they did not send."""
         self.updates_left_out = 0
         self.unknown_arrays = 0
@@ -191,18 +191,18 @@ class Fusion:
         other = Fusion(
             self._site, specs, self._estimator, self._parameters, updates=False, clock_offsets=self.clock_offsets
         )
-        other._listening, other._votes, other.askable = self._listening, self._votes, self.askable
+        other._listening, other._votes, other.can_backfill = self._listening, self._votes, self.can_backfill
         other._watches = False  # nobody asks the twin
         other._align()
         self._learns = False  # the twin hears all, and in order
         return other
 
-    def begin(self, raster: int) -> None:
-        """Take it that everything before this raster interval has been told."""
-        self._heard_until = raster
+    def begin(self, frame_index: int) -> None:
+        """Take it that everything before this frame index has been told."""
+        self._heard_until = frame_index
 
     def frames_ahead(self, array: str) -> int:
-        """By how many frames an array's raster intervals are ahead of the joint ones."""
+        """By how many frames an array's frame indices are ahead of the joint ones."""
         stream = self._streams.get(array)
         return 0 if stream is None else stream.ahead
 
@@ -212,7 +212,7 @@ class Fusion:
 
     @property
     def closed(self) -> int | None:
-        """The last raster interval that was closed; None before the first."""
+        """The last frame index that was closed; None before the first."""
         return None if self._next is None else self._next - 1
 
     @property
@@ -222,7 +222,7 @@ class Fusion:
 
     @property
     def needed_from(self) -> int | None:
-        """Before this raster interval no frame will be looked at again; None at the beginning."""
+        """Before this frame index no frame will be looked at again; None at the beginning."""
         if self._next is None:
             return None
         begin = self._next if self._event is None else self._event.start
@@ -272,9 +272,9 @@ class Fusion:
         if array in self._streams:
             self._streams[array].left = True
 
-    def spare(self, arrays: Collection[str]) -> None:
+    def exclude(self, arrays: Collection[str]) -> None:
         """Wait for none of these arrays and ask none of them, from now on, and all others again."""
-        self._spared = arrays
+        self._excluded = arrays
 
     def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
         """How every array is doing. Any thread may ask: nothing that this walks through ever changes its size.
@@ -311,11 +311,11 @@ class Fusion:
             self.unknown_arrays += 1
             return
         if stream.ahead:
-            message = replace(message, raster=message.raster - stream.ahead)
+            message = replace(message, frame_index=message.frame_index - stream.ahead)
         if isinstance(message, Frame) and message.sequence == 0:
             self._take_answer(stream, message)
             return
-        ahead_ns = message.raster * FRAME_NS - self._now_ns
+        ahead_ns = message.frame_index * FRAME_NS - self._now_ns
         if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
             stream.counters["rejected"] += 1
             side = "ahead of" if ahead_ns > 0 else "behind"
@@ -327,13 +327,15 @@ class Fusion:
         else:
             stream.take_mark(message, self._now_ns)
         stream.heard_ns, stream.left = self._now_ns, False
-        stream.watermark = message.raster if stream.watermark is None else max(stream.watermark, message.raster)
-        if not self._reached or message.raster > self._reached[-1][0]:
-            self._reached.append((message.raster, self._now_ns))
-        if (self._reached[-1][0] - message.raster) * FRAME_S < self._parameters.deadline_s:
+        stream.watermark = (
+            message.frame_index if stream.watermark is None else max(stream.watermark, message.frame_index)
+        )
+        if not self._reached or message.frame_index > self._reached[-1][0]:
+            self._reached.append((message.frame_index, self._now_ns))
+        if (self._reached[-1][0] - message.frame_index) * FRAME_S < self._parameters.deadline_s:
             stream.waited_for = True
         if self._next is None:
-            self._next = message.raster
+            self._next = message.frame_index
 
     def _accept_frame(self, stream: Stream, frame: Frame) -> bool:
         if len(frame.samples) != len(stream.spec.microphones_m):
@@ -341,7 +343,7 @@ class Fusion:
             expected, got = len(stream.spec.microphones_m), len(frame.samples)
             stream.worry(self._now_ns, f"its frames have {got} channels, the server's site file says {expected}")
             return False
-        if frame.active and self._next is not None and frame.raster < self._next:
+        if frame.active and self._next is not None and frame.frame_index < self._next:
             stream.counters["late"] += 1
             stream.worry(self._now_ns, "its frames come after their deadline")
             if self._event is not None:
@@ -350,12 +352,12 @@ class Fusion:
             stream.frames.clear()  # its node came back with another device: the two do not make one sound
             stream.forget()
             stream.rate_hz = frame.sample_rate_hz
-        stream.frames[frame.raster] = frame
+        stream.frames[frame.frame_index] = frame
         stream.counters["frames"] += 1
-        if stream.watermark is None or frame.raster >= stream.watermark:
+        if stream.watermark is None or frame.frame_index >= stream.watermark:
             stream.power, stream.active = frame.power, frame.active
             stream.find_dead(self._now_ns, _alive(frame.samples))
-            if frame.active and self._watches and frame.raster % WEAK_FRAMES == 0:
+            if frame.active and self._watches and frame.frame_index % WEAK_FRAMES == 0:
                 stream.find_weak(self._now_ns, frame.samples)
         return True
 
@@ -374,8 +376,8 @@ class Fusion:
                 outputs += self._finish()
             if self._next > self._newest() or not self._may_close(self._next):
                 break
-            raster, self._next = self._next, self._next + 1
-            outputs += self._close(raster)
+            frame_index, self._next = self._next, self._next + 1
+            outputs += self._close(frame_index)
             self._prune()
         due, self._due = self._due, None
         if due is not None and self._event is not None and not self._event.ended and due >= self._event.start:
@@ -385,10 +387,10 @@ class Fusion:
     def _newest(self) -> int:
         return max(stream.watermark for stream in self._streams.values() if stream.watermark is not None)
 
-    def _may_close(self, raster: int) -> bool:
-        while self._reached and self._reached[0][0] < raster:
+    def _may_close(self, frame_index: int) -> bool:
+        while self._reached and self._reached[0][0] < frame_index:
             self._reached.popleft()
-        late = [stream for stream in self._streams.values() if self._is_waited_for(stream, raster)]
+        late = [stream for stream in self._streams.values() if self._is_waited_for(stream, frame_index)]
         if not late:
             return True
         first_ns = self._reached[0][1] if self._reached else self._now_ns
@@ -399,70 +401,70 @@ class Fusion:
             stream.worry(self._now_ns, "its frames come after their deadline")
         return True
 
-    def _is_waited_for(self, stream: Stream, raster: int) -> bool:
-        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._spared:
+    def _is_waited_for(self, stream: Stream, frame_index: int) -> bool:
+        if stream.watermark is None or stream.heard_ns is None or stream.left or stream.spec.name in self._excluded:
             return False
-        return stream.watermark < raster and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
+        return stream.watermark < frame_index and stream.waited_for and self._now_ns - stream.heard_ns < LOST_NS
 
     def _everyone_silent(self) -> bool:
         quiet_ns = self._parameters.deadline_s * 1e9 + self._parameters.hang_over_s * 1e9
         return all(s.heard_ns is None or self._now_ns - s.heard_ns > quiet_ns for s in self._streams.values())
 
-    def _close(self, raster: int) -> list[Output]:
-        active = any(stream.has_active(raster) for stream in self._streams.values())
+    def _close(self, frame_index: int) -> list[Output]:
+        active = any(stream.has_active(frame_index) for stream in self._streams.values())
         if active and self._event is None:
-            self._event = self._open(raster)
+            self._event = self._open(frame_index)
         event = self._event
         if event is None:
-            self._listen_ahead(raster, self._heard_until)
+            self._listen_ahead(frame_index, self._heard_until)
             return []
-        event.closed = raster
-        self._hear(self._streams.values(), [raster])
+        event.closed = frame_index
+        self._hear(self._streams.values(), [frame_index])
         if active:
-            event.last_active, self._ahead = raster, None
+            event.last_active, self._ahead = frame_index, None
         else:
-            self._listen_ahead(raster, event.last_active + 1)
-        if raster - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
+            self._listen_ahead(frame_index, event.last_active + 1)
+        if frame_index - event.last_active >= round(self._parameters.hang_over_s / FRAME_S):
             event.became_quiet = True
             return self._end(event)
         outputs: list[Output] = []
         period = round(self._parameters.update_s / FRAME_S)
-        if self._updates and active and (raster - event.start + 1) % period == 0:
+        if self._updates and active and (frame_index - event.start + 1) % period == 0:
             if self._newest_only:
                 self.updates_left_out += self._due is not None
-                self._due = raster
+                self._due = frame_index
             else:
-                outputs += self._update(event, raster)
-        if (raster - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
+                outputs += self._update(event, frame_index)
+        if (frame_index - event.start + 1) * FRAME_S >= self._parameters.max_event_s:
             return outputs + self._end(event)
-        if (raster - event.start + 1) % LET_GO_FRAMES == 0:
-            self._let_go(event, raster)
+        if (frame_index - event.start + 1) % LET_GO_FRAMES == 0:
+            self._let_go(event, frame_index)
         return outputs
 
-    def _let_go(self, event: _OpenEvent, raster: int) -> None:
+    def _let_go(self, event: _OpenEvent, frame_index: int) -> None:
         """Let the samples go that no answer will be told by: those of arrays that hear the sound least clearly.
 
         What windows may still be made of stays.
         """
         if len(self._streams) <= MOST_KEPT:
             return
-        lately = range(raster - LET_GO_FRAMES + 1, raster + 1)
+        lately = range(frame_index - LET_GO_FRAMES + 1, frame_index + 1)
         for name, stream in self._streams.items():
             heard = sum(onsets.weight for onsets in stream.ear.at(lately))
             event.clarity[name] = event.clarity.get(name, 0.0) + heard
         clearest = sorted(event.clarity, key=lambda name: -event.clarity[name])
-        before = raster - round((self._parameters.window_s + self._parameters.hang_over_s) / FRAME_S)
+        before = frame_index - round((self._parameters.window_s + self._parameters.hang_over_s) / FRAME_S)
         for name in clearest[MOST_KEPT:]:
             if self._streams[name].ear.onsets:
                 self._streams[name].let_go(before)
 
-    def _open(self, raster: int) -> _OpenEvent:
+    def _open(self, frame_index: int) -> _OpenEvent:
         """Begin an event, and listen to its pre-roll afresh, so that it is the same whatever came before.
 
         Where a sound goes on that was cut for its length, the listeners go on, too.
         """
-        span = range(self._span_start(raster), raster)
-        if raster != self._heard_until:
+        span = range(self._span_start(frame_index), frame_index)
+        if frame_index != self._heard_until:
             ready = self._ahead == (span.start, span.stop - 1)
             for stream in self._streams.values():
                 ready = ready and stream.next_ear.has(r for r in span if r in stream.frames)
@@ -471,40 +473,40 @@ class Fusion:
             if not ready:
                 self._hear(self._streams.values(), span)
         self._ahead = None
-        return _OpenEvent(raster, raster, raster)
+        return _OpenEvent(frame_index, frame_index, frame_index)
 
-    def _hear(self, streams: Iterable[Stream], rasters: Sequence[int]) -> None:
-        self._listening.hear(((stream.spec.name, stream.ear, stream.frames) for stream in streams), rasters)
+    def _hear(self, streams: Iterable[Stream], frame_indices: Sequence[int]) -> None:
+        self._listening.hear(((stream.spec.name, stream.ear, stream.frames) for stream in streams), frame_indices)
 
-    def _hear_anew(self, stream: Stream, rasters: Sequence[int]) -> None:
+    def _hear_anew(self, stream: Stream, frame_indices: Sequence[int]) -> None:
         stream.ear = Ear()
-        self._hear([stream], rasters)
+        self._hear([stream], frame_indices)
 
-    def _listen_ahead(self, raster: int, begin: int) -> None:
+    def _listen_ahead(self, frame_index: int, begin: int) -> None:
         """In quiet, listen to what a sound that comes soon will begin with: from `begin` on, where the last one ended.
 
         That is as far as its pre-roll reaches back. With many arrays there is no time for it when the sound is there.
         """
-        if not self._newest_only or raster - begin >= round(self._parameters.pre_roll_s / FRAME_S):
+        if not self._newest_only or frame_index - begin >= round(self._parameters.pre_roll_s / FRAME_S):
             return
-        if raster != begin and self._ahead != (begin, raster - 1):
+        if frame_index != begin and self._ahead != (begin, frame_index - 1):
             return
-        if raster == begin:
+        if frame_index == begin:
             for stream in self._streams.values():
                 stream.next_ear = Ear()
         streams = self._streams.values()
-        self._listening.hear(((stream.spec.name, stream.next_ear, stream.frames) for stream in streams), [raster])
-        self._ahead = begin, raster
+        self._listening.hear(((stream.spec.name, stream.next_ear, stream.frames) for stream in streams), [frame_index])
+        self._ahead = begin, frame_index
 
     def _span(self, event: _OpenEvent) -> range:
         return range(self._span_start(event.start), event.closed + 1)
 
     def _span_start(self, start: int) -> int:
-        """The first raster interval that belongs to an event, with its pre-roll, that became active at `start`."""
+        """The first frame index that belongs to an event, with its pre-roll, that became active at `start`."""
         return max(start - round(self._parameters.pre_roll_s / FRAME_S), self._heard_until)
 
-    def _update(self, event: _OpenEvent, raster: int) -> list[Output]:
-        window = range(raster - round(self._parameters.window_s / FRAME_S) + 1, raster + 1)
+    def _update(self, event: _OpenEvent, frame_index: int) -> list[Output]:
+        window = range(frame_index - round(self._parameters.window_s / FRAME_S) + 1, frame_index + 1)
         sounds = _Sounds(self._parameters.live_sources, ended=False)
         powers: dict[str, FloatArray] = {}
         for name, stream in self._streams.items():
@@ -525,7 +527,7 @@ class Fusion:
         others = self._others(found, middle_ns, sounds)
         update = Update(self._id(event.start), status, estimate, loudest, contributions, complete_ns, others)
         trusted = [*([] if status is Status.REFUSED else [estimate]), *others]
-        tracks: list[Track] = self._tracker.step(middle_ns, trusted, probable=found.signs is not None)
+        tracks: list[Track] = self._tracker.step(middle_ns, trusted, probable=found.features is not None)
         return [update, Window(middle_ns, found.evidence), *tracks]
 
     def _finish(self) -> list[Output]:
@@ -580,24 +582,24 @@ class Fusion:
         span = self._span(event)
         heard = _Heard(_Sounds(parameters.sources, {name for name, votes in self._votes.items() if doubts(votes)}))
         for name, stream in self._streams.items():
-            active = [raster for raster in span if stream.has_active(raster)]
+            active = [frame_index for frame_index in span if stream.has_active(frame_index)]
             if not active:
                 continue
             # beyond its hang-over may lie the run-up to its next sound, which comes when that begins
             own_end = active[-1] + round(parameters.hang_over_s / FRAME_S) + 1
             _, there = stream.segments(range(span.start, min(span.stop, own_end)))
-            power = np.array([stream.frames[raster].power for raster in there])
+            power = np.array([stream.frames[frame_index].power for frame_index in there])
             mask = exact_mask(power, parameters.threshold)
-            rasters = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
-            pieces, _ = stream.segments(rasters)
+            frame_indices = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
+            pieces, _ = stream.segments(frame_indices)
             if not pieces:
                 continue
             if not stream.ear.has(there) and stream.keeps(there):  # some came late
                 self._hear_anew(stream, span)
             heard.sounds.pieces[name], heard.powers[name] = pieces, power[mask]
-            heard.sounds.onsets[name] = stream.ear.at(range(span.start, rasters[-1] + 1))
-            heard.start_ns = min(heard.start_ns, rasters[0] * FRAME_NS - stream.rest_ns)
-            heard.end_ns = max(heard.end_ns, (rasters[-1] + 1) * FRAME_NS - stream.rest_ns)
+            heard.sounds.onsets[name] = stream.ear.at(range(span.start, frame_indices[-1] + 1))
+            heard.start_ns = min(heard.start_ns, frame_indices[0] * FRAME_NS - stream.rest_ns)
+            heard.end_ns = max(heard.end_ns, (frame_indices[-1] + 1) * FRAME_NS - stream.rest_ns)
         return heard
 
     def _answer(
@@ -663,7 +665,7 @@ class Fusion:
     def _end(self, event: _OpenEvent) -> list[Output]:
         """The sound is over: tell of it, unless somebody is to be asked first."""
         event.ended = True
-        if self.askable:
+        if self.can_backfill:
             event.told = self._told(event)
             event.asked = self._whom_to_ask(event)
             event.asked_ns = self._now_ns
@@ -671,7 +673,7 @@ class Fusion:
             return self._finish()
         ahead = {name: self._streams[name].ahead for name in event.asked}
         spans = {name: asked.span for name, asked in event.asked.items()}
-        return [Ask(name, span[0] + ahead[name], span[-1] + ahead[name]) for name, span in spans.items()]
+        return [BackfillRequest(name, span[0] + ahead[name], span[-1] + ahead[name]) for name, span in spans.items()]
 
     def _whom_to_ask(self, event: _OpenEvent) -> dict[str, Asked]:
         """Arrays that may help where those that heard the sound are not sure."""
@@ -684,7 +686,7 @@ class Fusion:
         silent = [
             stream.spec
             for name, stream in self._streams.items()
-            if name in self.askable - set(self._spared) and name not in answer.heard_by and not stream.left
+            if name in self.can_backfill - set(self._excluded) and name not in answer.heard_by and not stream.left
         ]
         first = self._span_start(event.start)
         span = range(first, min(event.last_active + 1, first + round(MOST_ASKED_S / FRAME_S)))
@@ -697,12 +699,16 @@ class Fusion:
     def _is_answered(self, event: _OpenEvent) -> bool:
         if self._now_ns - event.asked_ns >= self._parameters.answer_s * 1e9:
             return True
-        return all(asked.is_answered or name not in self.askable for name, asked in event.asked.items())
+        return all(asked.is_answered or name not in self.can_backfill for name, asked in event.asked.items())
 
     def _take_answer(self, stream: Stream, frame: Frame) -> None:
         asked = None if self._event is None else self._event.asked.get(frame.array)
-        if asked is not None and frame.raster in asked.span and len(frame.samples) == len(stream.spec.microphones_m):
-            asked.frames[frame.raster] = frame
+        if (
+            asked is not None
+            and frame.frame_index in asked.span
+            and len(frame.samples) == len(stream.spec.microphones_m)
+        ):
+            asked.frames[frame.frame_index] = frame
 
     def _reconsidered(self, event: _OpenEvent, told: list[Output]) -> list[Output]:
         """The answer with those that were asked, where it is better with all or one of them."""
@@ -735,11 +741,11 @@ class Fusion:
 
     def _count_votes(self, start: int, found: Localization, sounds: Iterable[str]) -> None:
         """Remember who agreed. Replaced, never changed, for other threads read it."""
-        if found.outvoted is None or len(found.evidence) < LEAST_VOTES:
+        if found.outliers is None or len(found.evidence) < LEAST_VOTES:
             return
         for name in (name for name in sounds if name not in found.unneeded):
             before = [vote for vote in self._votes[name] if vote[0] != start]
-            self._votes[name] = (*before, (start, found.outvoted.get(name)))[-VOTES:]
+            self._votes[name] = (*before, (start, found.outliers.get(name)))[-VOTES:]
 
     def _contributions(
         self,
@@ -753,8 +759,8 @@ class Fusion:
             for name in powers
         )
 
-    def _id(self, raster: int) -> str:
-        return f"{self._site}-{raster * FRAME_NS // 1_000_000}"
+    def _id(self, frame_index: int) -> str:
+        return f"{self._site}-{frame_index * FRAME_NS // 1_000_000}"
 
     def _prune(self) -> None:
         assert self._next is not None
@@ -811,7 +817,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
     if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
         return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
-    if found.signs is not None and not found.signs.tell_direction:
+    if found.features is not None and not found.features.tell_direction:
         return Status.REFUSED, "nothing that was heard came from any one direction"
     who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
     return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
@@ -820,8 +826,8 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
 class _Sounds(Mapping[str, Sound]):
     """What the arrays heard."""
 
-    def __init__(self, sources: int, doubted: Collection[str] = (), *, ended: bool = True) -> None:
-        self.doubted = doubted
+    def __init__(self, sources: int, suspect: Collection[str] = (), *, ended: bool = True) -> None:
+        self.suspect = suspect
         self.ended = ended
         self.sources = sources
         self.pieces: dict[str, Sequence[Sequence[Frame]]] = {}
@@ -834,7 +840,7 @@ class _Sounds(Mapping[str, Sound]):
             _Segments(pieces),
             pieces[0][0].sample_rate_hz,
             onsets,
-            array in self.doubted,
+            array in self.suspect,
             self.sources,
             self.ended,
         )
@@ -857,7 +863,7 @@ class _Heard:
 
     def with_asked(self, asked: Mapping[str, AskedSound]) -> tuple[_Sounds, dict[str, FloatArray]]:
         """These sounds and powers, and those of arrays that were asked."""
-        sounds, powers = _Sounds(self.sounds.sources, self.sounds.doubted), dict(self.powers)
+        sounds, powers = _Sounds(self.sounds.sources, self.sounds.suspect), dict(self.powers)
         sounds.pieces |= self.sounds.pieces
         sounds.onsets |= self.sounds.onsets
         for name, sound in asked.items():
@@ -867,7 +873,7 @@ class _Heard:
 
 
 def _estimate(found: Localization, time_ns: int, sounds: Mapping[str, Sound]) -> Estimate:
-    arrays = tuple(name for name in sounds if name not in (found.outvoted or ()) and name not in found.unneeded)
+    arrays = tuple(name for name in sounds if name not in (found.outliers or ()) and name not in found.unneeded)
     return Estimate(time_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
 
 
@@ -881,9 +887,9 @@ def _contribution(
 ) -> Contribution:
     azimuth, elevation, distance = direction_deg(spec.centre_m, estimate.position_m)
     agrees: bool | None = None
-    if found.outvoted is not None and len(found.evidence) > 1 and spec.name not in found.unneeded:
-        agrees = spec.name not in found.outvoted
-    off_deg = (found.outvoted or {}).get(spec.name)
+    if found.outliers is not None and len(found.evidence) > 1 and spec.name not in found.unneeded:
+        agrees = spec.name not in found.outliers
+    off_deg = (found.outliers or {}).get(spec.name)
     return Contribution(
         spec.name, len(power) * FRAME_S, float(power.mean()), azimuth, elevation, distance, agrees, off_deg, asked
     )
@@ -891,7 +897,7 @@ def _contribution(
 
 def _dissent(found: Localization) -> str | None:
     """Who was outvoted, in words."""
-    if not found.outvoted:
+    if not found.outliers:
         return None
-    each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outvoted.items()))
+    each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outliers.items()))
     return f"located without {each}: outvoted by the others"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.segmenter import Segmenter
 from livessl.core.stream.timeline import Framer
-from livessl.core.types import ArraySpec, Ask, Block, IntArray, Message
+from livessl.core.types import ArraySpec, BackfillRequest, Block, IntArray, Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Pipeline:
             for message in segmenter.push(cut, self.framer)
         ]
 
-    def backfill(self, request: Ask) -> list[Message]:
+    def backfill(self, request: BackfillRequest) -> list[Message]:
         """Return the remembered frames that a request names; none where the array is on another device."""
         return [
             message

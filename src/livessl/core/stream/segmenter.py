@@ -22,7 +22,7 @@ WARM_UP_FRAMES: Final = 10
 class Segmenter:
     """Decides what is sound, and keeps what came just before it.
 
-    Every raster interval yields one message in order, a `Mark` while it is quiet and a `Frame` around sound; intervals
+    Every frame index yields one message in order, a `Mark` while it is quiet and a `Frame` around sound; intervals
     of the pre-roll, already marked as quiet, are sent again as frames when sound begins.
 
     Parameters
@@ -62,12 +62,12 @@ class Segmenter:
         return self._spec.name
 
     def push(self, cut: Cut, framer: Framer) -> list[Message]:
-        """Take in the next raster interval; `framer` tells how the device is doing."""
-        if self._raster is not None and cut.raster != self._raster + 1:
+        """Take in the next frame index; `framer` tells how the device is doing."""
+        if self._raster is not None and cut.frame_index != self._raster + 1:
             self._pre_roll.clear()  # what came before a gap is no run-up to what comes after it
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
-        self._raster = cut.raster
+        self._raster = cut.frame_index
         power = band_power(self._selected(cut), self._rate_hz, self._spec.band_hz)
         if self._warm_up is None:
             return self._decide(cut, power, framer)
@@ -82,8 +82,8 @@ class Segmenter:
         return [message for cut, power in held for message in self._decide(cut, power, framer)]
 
     def ask(self, first: int, last: int) -> list[Message]:
-        """What is remembered of some raster intervals, both ends included, whether or not it was sent."""
-        return [self._frame(cut, power, 0) for cut, power in self._recent if first <= cut.raster <= last]
+        """What is remembered of some frame indices, both ends included, whether or not it was sent."""
+        return [self._frame(cut, power, 0) for cut, power in self._recent if first <= cut.frame_index <= last]
 
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
@@ -107,13 +107,13 @@ class Segmenter:
 
     def _frame(self, cut: Cut, power: float, sequence: int, active: bool = False) -> Frame:
         samples = np.ascontiguousarray(self._selected(cut))
-        return Frame(self._spec.name, sequence, cut.raster, cut.time_ns, self._rate_hz, samples, power, active)
+        return Frame(self._spec.name, sequence, cut.frame_index, cut.time_ns, self._rate_hz, samples, power, active)
 
     def _mark(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> Mark:
         return Mark(
             array=self._spec.name,
             sequence=self._sequence,
-            raster=cut.raster,
+            frame_index=cut.frame_index,
             power=float(channel_power.mean()),
             noise_power=self._activity.floor_power,
             channel_power=tuple(float(power) for power in channel_power),

@@ -1,4 +1,4 @@
-"""Sample index to site time, and the cutting of blocks into raster frames; it reads no clock."""
+"""Sample index to site time, and the cutting of blocks into frames; it reads no clock."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SLOPE_RIDGE_S2: Final = 1e4
 """Prior on the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
 
 _BOUNDARY: Final = 0.4
-"""Rounding of raster boundaries to samples. Not a half: at 22.05 kHz every other boundary would be a tie."""
+"""Rounding of frame index boundaries to samples. Not a half: at 22.05 kHz every other boundary would be a tie."""
 
 
 class Timeline:
@@ -123,15 +123,15 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """One raster interval of all of a device's channels: `samples` (channels, n) from site time `time_ns` on."""
+    """One frame index of all of a device's channels: `samples` (channels, n) from site time `time_ns` on."""
 
-    raster: int
+    frame_index: int
     time_ns: int
     samples: Float32Array
 
 
 class Framer:
-    """Cuts a device's blocks on the site-time raster; frames are contiguous, now and then a sample longer.
+    """Cuts a device's blocks on the grid of 50 ms; frames are contiguous, now and then a sample longer.
 
     Parameters
     ----------
@@ -174,25 +174,25 @@ class Framer:
         self._parts.clear()
         self._raster = None
 
-    def _boundary(self, raster: int) -> int:
-        return int(np.floor(self.timeline.index_at(raster * FRAME_NS) + _BOUNDARY))
+    def _boundary(self, frame_index: int) -> int:
+        return int(np.floor(self.timeline.index_at(frame_index * FRAME_NS) + _BOUNDARY))
 
     def _cut(self) -> list[Cut]:
         if self._raster is None:
-            raster = self.timeline.time_ns(self._begin) // FRAME_NS
-            while self._boundary(raster) < self._begin:
-                raster += 1
-            start = self._boundary(raster)
+            frame_index = self.timeline.time_ns(self._begin) // FRAME_NS
+            while self._boundary(frame_index) < self._begin:
+                frame_index += 1
+            start = self._boundary(frame_index)
             if start >= self._end:
                 self._parts.clear()
                 return []
             self._drop(start - self._begin)
-            self._raster = raster
+            self._raster = frame_index
         cuts: list[Cut] = []
         while (stop := self._boundary(self._raster + 1)) <= self._end:
             length = stop - self._begin
             if not 0.5 * self._frame_samples <= length <= 1.5 * self._frame_samples:
-                self._tear()  # the line moved by more than half a frame: start over on the new raster
+                self._tear()  # the line moved by more than half a frame: start over on the new frame index
                 break
             cuts.append(Cut(self._raster, self.timeline.time_ns(self._begin), self._take(length)))
             self._raster += 1

@@ -21,7 +21,7 @@ from livessl.core.kernels import kernels
 from livessl.core.locate.estimators import Sound, SrpPhat
 from livessl.core.locate.peak_search import PeakSearch, Rule
 from livessl.core.locate.srp import SRPMapper
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, HeardBy
+from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 from livessl.simulate.room import impulse_responses
 from livessl.simulate.sounds import voice
 
@@ -236,10 +236,10 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[Case]
     made = {(kind, n): blocks.sound(kind, n) for kind in KINDS for n in range(12)}
     segments = [blocks.sound("voice", n, SEGMENT)[0] for n in range(2)]
 
-    def evidence(kind: str, number: int, count: int) -> list[HeardBy]:
+    def evidence(kind: str, number: int, count: int) -> list[Evidence]:
         sounds = made[kind, number % 12]
         gccs = correlated([(correlate[s.name], [x]) for s, x in zip(most[:count], sounds, strict=False)])
-        return [HeardBy(s, gcc) for s, gcc in zip(most, gccs, strict=False)]
+        return [Evidence(s, gcc) for s, gcc in zip(most, gccs, strict=False)]
 
     yield Case("GCC of a block, one array", lambda n: correlate[first.name]([made["voice", n % 12][0]]))
     yield Case("GCC of 1 s, one array", lambda n: correlate[first.name]([segments[n % 2]]))

@@ -87,10 +87,10 @@ def windows_ns(site: Site, start_ns: int, end_ns: int) -> list[int]:
     """Ends of the windows, within some time, that updates are due for: one every `update_s` of a sound."""
     step = round(site.fusion.update_s / FRAME_S)
     ends = []
-    for raster in range(start_ns // FRAME_NS, end_ns // FRAME_NS):
-        number = raster % PERIOD_FRAMES
+    for frame_index in range(start_ns // FRAME_NS, end_ns // FRAME_NS):
+        number = frame_index % PERIOD_FRAMES
         if number < SOUND_FRAMES and (number + 1) % step == 0:
-            ends.append((raster + 1) * FRAME_NS)
+            ends.append((frame_index + 1) * FRAME_NS)
     return ends
 
 
@@ -119,15 +119,15 @@ def play(site_file_text: str, endpoint: str, rt60_s: float, parent: Connection) 
 def _play(links: Sequence[Link], nodes: Sequence[Sequence[_Sound]], told: Callable[[], bool], clock: Clock) -> Report:
     lateness_s: list[float] = []
     sent = 0
-    raster = clock.now_ns() // FRAME_NS + 1
+    frame_index = clock.now_ns() // FRAME_NS + 1
     while not told():
-        while not clock.sleep_until_ns((raster + 1) * FRAME_NS):
+        while not clock.sleep_until_ns((frame_index + 1) * FRAME_NS):
             pass
         for link, node in zip(links, nodes, strict=True):
-            link.send(sound.frame(raster, sent + 1) for sound in node)
+            link.send(sound.frame(frame_index, sent + 1) for sound in node)
         sent += 1
-        lateness_s.append(clock.now_ns() / 1e9 - (raster + 1) * FRAME_S)
-        raster += 1
+        lateness_s.append(clock.now_ns() / 1e9 - (frame_index + 1) * FRAME_S)
+        frame_index += 1
     deadline_ns = clock.monotonic_ns() + SETTLE_NS
     while any(link.pending for link in links) and clock.monotonic_ns() < deadline_ns:
         clock.sleep_until_ns(clock.now_ns() + FRAME_NS)
@@ -145,12 +145,12 @@ class _Sound:
         self._frames = list(_cut(render(scene, spec.microphones_m, seed=seed)))
         self._power = [float(band_power(frame, RATE_HZ, spec.band_hz).mean()) for frame in self._frames]
 
-    def frame(self, raster: int, sequence: int) -> Frame:
+    def frame(self, frame_index: int, sequence: int) -> Frame:
         """The frame of an interval."""
-        index = raster % len(self._frames)
+        index = frame_index % len(self._frames)
         active = index % PERIOD_FRAMES < SOUND_FRAMES
         samples, power = self._frames[index], self._power[index]
-        return Frame(self.array, sequence, raster, raster * FRAME_NS, RATE_HZ, samples, power, active)
+        return Frame(self.array, sequence, frame_index, frame_index * FRAME_NS, RATE_HZ, samples, power, active)
 
 
 def _scene(site: Site, rt60_s: float) -> Scene:

@@ -17,7 +17,7 @@ import pyarrow as pa
 from scipy.optimize import minimize
 
 from livessl.core.geometry import angle_deg
-from livessl.core.locate.confidence import Signs
+from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.fusion import judged
@@ -56,7 +56,7 @@ SCHEMA: Final = pa.schema(
     ]
 )
 """One row per event, condition, case and method. `bearing_deg` is the error of the direction from the nearest array,
-`mahalanobis2` the error's square in units of the covariance; `margin` and `standing` are the `Signs` of `onset`'s
+`mahalanobis2` the error's square in units of the covariance; `margin` and `standing` are features of `onset`'s
 confidence, so that another fit of it needs no other run. `outvoted` names the arrays that the others outvoted."""
 
 _NOISE, _POSE = 1, 2
@@ -216,13 +216,13 @@ def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, f
     near_m : float
         What is right.
     """
-    signs = np.stack([np.ones(len(columns["margin"])), columns["margin"], columns["standing"]], axis=1)
+    features = np.stack([np.ones(len(columns["margin"])), columns["margin"], columns["standing"]], axis=1)
     right = np.asarray(columns["error_m"]) <= near_m
     weights = np.zeros(3)
     for _ in range(50):  # Newton; the least ridge keeps it finite where all is right
-        likely = 1.0 / (1.0 + np.exp(-signs @ weights))
-        gradient = signs.T @ (right - likely) - 1e-3 * weights
-        hessian = (signs.T * (likely * (1.0 - likely))) @ signs + 1e-3 * np.eye(3)
+        likely = 1.0 / (1.0 + np.exp(-features @ weights))
+        gradient = features.T @ (right - likely) - 1e-3 * weights
+        hessian = (features.T * (likely * (1.0 - likely))) @ features + 1e-3 * np.eye(3)
         weights = weights + np.linalg.solve(hessian, gradient)
     intercept, of_margin, of_standing = (float(weight) for weight in weights)
     return intercept, of_margin, of_standing
@@ -234,8 +234,10 @@ def rivals_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float]
     Parameters are those of `development_fit`, of events of which the arrays may tell nothing but directions.
     """
     right = np.asarray(columns["error_m"]) <= near_m
-    signs = [Signs(float(m), float(s)) for m, s in zip(columns["margin"], columns["standing"], strict=True)]
-    log_heard, margin = np.log([each.heard for each in signs]), np.array([each.margin for each in signs])
+    features = [
+        ConfidenceFeatures(float(m), float(s)) for m, s in zip(columns["margin"], columns["standing"], strict=True)
+    ]
+    log_heard, margin = np.log([each.heard for each in features]), np.array([each.margin for each in features])
 
     def surprise(constants: FloatArray) -> float:
         log_likely = log_heard - np.logaddexp(0.0, -constants[0] - constants[1] * margin)
@@ -249,7 +251,7 @@ def rivals_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float]
 def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
     """What an estimator makes of an event, and how far that is from the truth."""
     found = estimator.locate(sounds)
-    outvoted = found.outvoted or {}
+    outliers = found.outliers or {}
     error = found.position_m - source_m
     nearest_m = min((spec.centre_m for spec in specs), key=lambda centre_m: float(np.linalg.norm(centre_m - source_m)))
     row: Row = {
@@ -259,13 +261,13 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
         "error_m": float(np.linalg.norm(error)),
         "bearing_deg": angle_deg(found.position_m - nearest_m, source_m - nearest_m),
         "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
-        "status": str(judged(found, [spec for spec in specs if spec.name not in outvoted])[0]),
-        "outvoted": "".join(sorted(outvoted)),
+        "status": str(judged(found, [spec for spec in specs if spec.name not in outliers])[0]),
+        "outvoted": "".join(sorted(outliers)),
     }
     row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
     row |= {f"found_{axis}_m": value for axis, value in zip("xyz", found.position_m, strict=True)}
-    if found.signs is not None:
-        row |= {"confidence": found.confidence, "margin": found.signs.margin, "standing": found.signs.standing}
+    if found.features is not None:
+        row |= {"confidence": found.confidence, "margin": found.features.margin, "standing": found.features.standing}
     return row
 
 

@@ -199,8 +199,8 @@ def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str,
 def _rooms(columns: Columns, rows: Sequence[SummaryRow]) -> list[Block]:
     of_rooms = columns["case"] == SCENARIOS[ROOMS].cases[0].name
     ours = of_rooms & (columns["method"] == OURS)
-    signs = {name: columns[name][ours].astype(np.float64) for name in ("error_m", "margin", "standing")}
-    intercept, of_margin, of_standing = development_fit(signs, NEAR_M)
+    features = {name: columns[name][ours].astype(np.float64) for name in ("error_m", "margin", "standing")}
+    intercept, of_margin, of_standing = development_fit(features, NEAR_M)
     return [
         Heading(2, SCENARIOS[ROOMS].title),
         SCENARIOS[ROOMS].about,
