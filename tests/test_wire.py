@@ -300,7 +300,7 @@ def test_samples_must_be_such_as_a_converter_gives() -> None:
         ({"power": math.nan}, "power"),
         ({"power": 1e300}, "power"),
         ({"frame_index": 2**62}, "frame index"),
-        ({"frame_index": -(2**62)}, "frame_index"),
+        ({"frame_index": -(2**62)}, "frame index"),
         ({"samples": np.zeros((1, 10), dtype=np.float32)}, "2 to 16 channels, got 1"),
         ({"samples": np.zeros((17, 10), dtype=np.float32)}, "2 to 16 channels, got 17"),
         ({"samples": np.zeros((4, 0), dtype=np.float32)}, "samples, got 0"),
