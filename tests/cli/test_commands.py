@@ -24,7 +24,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from livessl import __version__
 from livessl.capture.link import Link
-from livessl.cli import main as command_line
 from livessl.cli.main import main
 from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.lab import demo
@@ -490,7 +489,7 @@ def test_interrupted_demo(run: Run, monkeypatch: pytest.MonkeyPatch, options: tu
 def test_interrupted_simulation_is_cut_short(
     run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.simulate.export.write_scene", interrupted)
+    monkeypatch.setattr("livessl.simulation.export.write_scene", interrupted)
     assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
 
 
@@ -695,7 +694,7 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
     seen: list[set[int]] = []
-    monkeypatch.setattr(command_line, "load_site", lambda _: seen.append(threads()) or site_of())  # type: ignore[func-returns-value]
+    monkeypatch.setattr("livessl.cli.check.load_site", lambda _: seen.append(threads()) or site_of())
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")

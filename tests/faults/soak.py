@@ -41,7 +41,7 @@ from livessl.server.app import Server
 from livessl.server.engine import Engine
 from livessl.server.latency import Arrival
 from livessl.server.refusals import Refusals
-from livessl.simulate.scene import make_scene, render
+from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
 

@@ -188,7 +188,7 @@ def _all_compiled(
     ends: IntArray,
 ) -> Float32Array:
     """Do the same by compiled code, each up to its own end: (R, bins)."""
-    from livessl.simulate.images import lay_down_all
+    from livessl.simulation.images import lay_down_all
 
     x, y, z = (_axis(*each, reach_m) for each in zip(room_m, source_m, microphone_m, strict=True))
     return lay_down_all((x, y, z), reach_m, bins_per_m, beta, ends * OVERSAMPLING)

@@ -10,7 +10,7 @@ from scipy.signal import oaconvolve
 
 from livessl.core.geometry import as_positions_m
 from livessl.core.types import Float32Array, FloatArray
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 STEP_S: Final = 0.05
 """Time between two responses. At a walk of 1 m/s they lie 5 cm apart, and a source is never further than half of that
@@ -75,7 +75,7 @@ def render_moving(
     microphones_m : (K, 3)
         Absolute positions, metres.
     room_size_m, rt60_s, sample_rate_hz, c_m_s, compiled
-        As in `livessl.simulate.room.impulse_responses`, which makes each response.
+        As in `livessl.simulation.room.impulse_responses`, which makes each response.
     step_s : float
         Time between two responses.
 

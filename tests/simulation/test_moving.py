@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import oaconvolve
 
 from livessl.core.types import Float32Array
-from livessl.simulate.moving import place_on_way, render_moving
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.moving import place_on_way, render_moving
+from livessl.simulation.room import impulse_responses
 
 ROOM_M = (5.0, 6.0, 3.0)
 RATE_HZ = 16000.0

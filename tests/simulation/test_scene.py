@@ -13,7 +13,7 @@ import soundfile
 
 from livessl.core.geometry import tetrahedron
 from livessl.core.types import Float32Array
-from livessl.simulate.scene import Scene, Source, make_scene, read_sounds, render, synthesised_sounds, truth
+from livessl.simulation.scene import Scene, Source, make_scene, read_sounds, render, synthesised_sounds, truth
 
 ROOM_M = (6.1, 7.3, 3.2)
 CENTRES_M = np.array([[3.0, 1.9, 1.6], [3.1, 5.4, 1.5]])

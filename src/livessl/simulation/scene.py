@@ -15,8 +15,8 @@ from scipy.signal import oaconvolve, resample_poly
 
 from livessl.core.geometry import as_positions_m
 from livessl.core.types import Float32Array, FloatArray, read_only
-from livessl.simulate.room import absorption, impulse_responses
-from livessl.simulate.sounds import SOUNDS
+from livessl.simulation.room import absorption, impulse_responses
+from livessl.simulation.sounds import SOUNDS
 
 NamedSound = tuple[str, Float32Array]
 """Name, and mono samples (n,)."""
@@ -79,7 +79,7 @@ class Scene:
     room_size_m : (3,) float
         Metres, one corner at the origin.
     rt60_s : float
-        Nominal reverberation time in seconds, 0 is anechoic: see `livessl.simulate.room.absorption`.
+        Nominal reverberation time in seconds, 0 is anechoic: see `livessl.simulation.room.absorption`.
     c_m_s : float
         Speed of sound, m/s.
     sample_rate_hz : float

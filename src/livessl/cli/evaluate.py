@@ -1,26 +1,28 @@
-"""`livessl evaluate`: its arguments, and what they set in motion. Imports what is heavy only when it runs."""
+"""`livessl evaluate`: campaigns in simulated rooms. Packages of the extra `evaluate` are imported only when it runs."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from livessl.cli import argument, progress
+from livessl.cli.exits import OK, WRONG_USE
+from livessl.cli.output import complain
 from livessl.lab.evaluate.layout import layout_of
 from livessl.lab.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
-from livessl.lab.evaluate.scenarios import ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
+from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
 from livessl.site.load import load_site
 
-HALVES: Final = ("development", "test")
-LOCALIZER: Final = "localizer"
 REPORT: Final = "report"
-"""Runs nothing: reports campaigns that were run."""
+"""The experiment that runs nothing: it reports campaigns that were run."""
 
 
 def add_arguments(parser: Any) -> None:
-    """Describe the command's arguments to an argparse parser."""
+    """Describe the command's arguments."""
     parser.add_argument(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
@@ -40,10 +42,12 @@ def add_arguments(parser: Any) -> None:
         metavar="DIR",
         help="another experiment's --out, to be reported together; may be given more than once",
     )
-    parser.add_argument("--positions", type=_whole, metavar="N", help="of the source (default: as many as the paper)")
+    parser.add_argument(
+        "--positions", type=argument.positive, metavar="N", help="of the source (default: as many as the paper)"
+    )
     parser.add_argument("--rt", metavar="S,S,…", help="reverberation times, seconds; 0:2:0.2 is a range")
     parser.add_argument("--seed", type=int, default=0, help="same seed, same results (default 0)")
-    parser.add_argument("--jobs", type=_whole, help="processes (default: one a core)")
+    parser.add_argument("--jobs", type=argument.positive, help="processes (default: one a core)")
     parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of processes here")
     parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
     parser.add_argument(
@@ -53,7 +57,7 @@ def add_arguments(parser: Any) -> None:
         "takes several",
     )
     parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
-    parser.add_argument("--sample-rate", type=_whole, default=16000, metavar="HZ", help="of the simulation")
+    parser.add_argument("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="of the simulation")
     parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
     parser.add_argument("--half", choices=HALVES, default="test", help=f"{LOCALIZER}: half of the clips (default test)")
     parser.add_argument(
@@ -66,20 +70,33 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    try:
+        with progress.counted(f"evaluating {arguments.experiment}", "position") as bar:
+            written = evaluate(arguments, arguments.jobs or os.cpu_count() or 1, bar)
+    except ValueError as error:
+        complain(str(error))
+        return WRONG_USE
+    for path in written:
+        print(path)
+    return OK
+
+
 def settings_of(arguments: argparse.Namespace) -> Settings:
-    """What was asked for.
+    """Return the settings that the arguments describe.
 
     Raises
     ------
     ValueError
-        Where something cannot be.
+        Where a value is impossible.
     ConfigError
         Where the site file is wrong.
     """
     layout = None if arguments.site is None else layout_of(load_site(arguments.site))
     experiment = experiment_of(arguments.experiment, layout)
     rt60s_s = experiment.rt60s_s if arguments.rt is None else reverberation_times_s(arguments.rt)
-    from livessl.simulate.room import absorption
+    from livessl.simulation.room import absorption
 
     for rt60_s in rt60s_s:
         absorption(rt60_s, experiment.room_m, experiment.c_m_s)
@@ -104,8 +121,8 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
-    """Run the campaign and write what it found; returns the files.
+def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
+    """Run the campaign and write what it found; return the files.
 
     Raises
     ------
@@ -129,19 +146,17 @@ def run(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int],
     if arguments.events is None:
         raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
     if arguments.experiment == LOCALIZER:
-        return _run_localizer(arguments, jobs, progress)
+        return _run_localizer(arguments, jobs, show)
     for folder in arguments.others:
         require_campaign(folder)  # now, not when hours are over
     settings = settings_of(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
-    results = run_campaign(
-        Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress
-    )
+    results = run_campaign(Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
     return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
 
 
-def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[[int, int], None]) -> list[Path]:
+def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
     from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
     from livessl.lab.evaluate.localizer_report import write_localizer_report
     from livessl.lab.evaluate.sessions import SessionSettings
@@ -151,13 +166,13 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, progress: Callable[
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     job = Job(settings, clips)
-    results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=progress)
+    results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
     write = write_sessions_report if isinstance(settings, SessionSettings) else write_localizer_report
     return [results, *write(arguments.out)]
 
 
 def _localizer_settings(arguments: argparse.Namespace) -> Any:
-    """What was asked for: `SessionSettings` of a session's scenario, else `LocalizerSettings`."""
+    """Return the settings that the arguments describe: of a session's scenario, or of the localizer's rooms."""
     from livessl.lab.evaluate import localizer, sessions
 
     names = _scenarios(arguments.scenario)
@@ -240,9 +255,3 @@ def _scenarios(text: str) -> tuple[str, ...]:
         alone = " and ".join(name for name in names if name in SESSIONS)
         raise ValueError(f"--scenario: {alone}: each of {', '.join(SESSIONS)} is run alone, got {', '.join(names)}")
     return names
-
-
-def _whole(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
-    return int(text)

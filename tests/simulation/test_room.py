@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfilt
 
 from livessl.core.types import Float32Array, FloatArray
-from livessl.simulate import room
-from livessl.simulate.room import OVERSAMPLING, absorption, impulse_responses
+from livessl.simulation import room
+from livessl.simulation.room import OVERSAMPLING, absorption, impulse_responses
 
 ROOM_M = np.array([4.3, 5.2, 2.9])
 SOURCE_M = np.array([1.13, 3.31, 1.47])

@@ -10,13 +10,14 @@ from typing import Final
 import soundfile
 
 from livessl.recordings.session import piece, write_session
-from livessl.simulate.scene import Scene, render, truth
+from livessl.simulation.of_site import rendered
+from livessl.simulation.scene import Scene, truth
 from livessl.site.models import Site
 
 TRUTH_FILE: Final = "truth.jsonl"
 
 NOMINAL_START_NS: Final = 1_767_225_600_000_000_000
-"""2026-01-01T00:00:00Z: a simulated session happened at no time, and two of the same seed shall be the same."""
+"""Start of every simulated session, 2026-01-01T00:00:00Z: two sessions of one seed are the same to the byte."""
 
 
 def write_scene(
@@ -36,15 +37,7 @@ def write_scene(
     """
     directory.mkdir(parents=True, exist_ok=True)
     pieces = []
-    total = len(site.specs) * len(scene.sources)
-    for number, spec in enumerate(site.specs):
-        done_before = number * len(scene.sources)
-
-        def report(done: int, _: int, before: int = done_before) -> None:
-            if progress is not None:
-                progress(before + done, total)
-
-        samples = render(scene, spec.microphones_m, seed=seed + 1 + number, progress=report)
+    for spec, samples in rendered(site, scene, seed=seed, progress=progress):
         soundfile.write(directory / f"{spec.name}.wav", samples.T, round(scene.sample_rate_hz), subtype="PCM_16")
         pieces.append(piece(spec.name, f"{spec.name}.wav", NOMINAL_START_NS))
     lines = "".join(json.dumps(entry) + "\n" for entry in truth(scene))

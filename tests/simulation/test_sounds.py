@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from livessl.core.types import Float32Array
-from livessl.simulate.sounds import SOUNDS
+from livessl.simulation.sounds import SOUNDS
 
 LENGTHS_S = {"door_slam": 0.4, "dropped_keys": 0.6, "phone": 1.2, "voice": 1.5}
 
