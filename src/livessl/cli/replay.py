@@ -68,8 +68,8 @@ def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Part]
 
     def send() -> None:
         try:
-            _send(site, server.engine.endpoint, parts, arguments.speed, stop)
-            server.engine.wait_idle()
+            _send(site, server.endpoint, parts, arguments.speed, stop)
+            server.wait_idle()
         except Exception as error:  # noqa: BLE001 - raised again below
             failures.append(error)
         if arguments.once or failures:

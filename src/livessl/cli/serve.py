@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     site = read_site(arguments)
     print_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
-    logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
+    logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
     run_until_stopped(server)
     return OK
 
