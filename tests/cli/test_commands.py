@@ -474,9 +474,7 @@ def test_what_is_for_files_is_not_for_an_audio_interface(
 ) -> None:
     done = run("capture", "--site", recorded.site, "--node", "lab-pc", *options)
     assert done.code == 2
-    assert done.err == (
-        f"livessl: error: {options[0]}: applies to files, and none is given; remove it or add --wav\n"
-    )
+    assert done.err == (f"livessl: error: {options[0]}: applies to files, and none is given; remove it or add --wav\n")
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 0), (("--once",), 130)])
