@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from websockets.asyncio.client import connect
 
-from livessl.bench import load
 from livessl.clock import SystemClock
 from livessl.core.types import Contribution, Estimate, Status, Update
-from livessl.messages import JsonObject, Messages, Stages
+from livessl.lab.bench import load
+from livessl.server.api.encode import JsonObject, Messages, Stages
 from livessl.server.app import Server
-from livessl.server.hub import LAGGING
-from livessl.site_file import parse_site
+from livessl.server.fanout import LAGGING
+from livessl.site.load import parse_site
 
 CLOCK = SystemClock()
 

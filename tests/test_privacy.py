@@ -11,11 +11,11 @@ import httpx
 import pytest
 
 from livessl.capture.node import send_session
-from livessl.cli import main
+from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.config import ConfigError
 from livessl.server import app
 from livessl.server.store import Query, Store
+from livessl.site.models import ConfigError
 from small_site import running_server, scene_parts, site_of, wait_until, write_site
 
 CLOCK = SystemClock()

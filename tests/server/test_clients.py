@@ -11,7 +11,7 @@ import pytest
 
 from clients import MAX_CLIENT_KB, measure, open_client
 from livessl.server.app import Server
-from livessl.server.hub import BACKLOG
+from livessl.server.fanout import BACKLOG
 from small_site import running_server, site_of, wait_until
 
 

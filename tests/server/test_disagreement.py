@@ -7,14 +7,14 @@ from dataclasses import replace
 import httpx
 import numpy as np
 
-from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.node import capture_recordings
-from livessl.capture.recorded import Part
 from livessl.clock import SystemClock
-from livessl.config import Site
 from livessl.core.types import FRAME_NS
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
 from livessl.simulate.scene import Scene, Source, render
+from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, running_server, scene, site_of, wait_until
 
 CLOCK = SystemClock()

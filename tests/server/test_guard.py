@@ -16,14 +16,15 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from livessl import keys, wire
+from livessl import wire
 from livessl.capture.link import Link
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.config import ConfigError, Site
 from livessl.core.types import FRAME_NS, Frame
-from livessl.keys import KeyPair, NodeKeys
 from livessl.server.receiver import Joined, Receiver
+from livessl.site import keys
+from livessl.site.keys import KeyPair, NodeKeys
+from livessl.site.models import ConfigError, Site
 from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
 
 CLOCK = SystemClock()

@@ -7,7 +7,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 from livessl.core.types import FRAME_NS, Estimate, Event, Status, Update
-from livessl.messages import Messages, Stages
+from livessl.server.api.encode import Messages, Stages
 from livessl.server.latency import KEPT, Arrival, Arrivals, Latency
 from small_site import site_of
 
@@ -52,8 +52,8 @@ def test_nobody_knows_what_nobody_stamped() -> None:
 
 def test_old_intervals_are_forgotten() -> None:
     arrivals = Arrivals()
-    for raster in range(RASTER, RASTER + KEPT):
-        arrivals.note(raster, Arrival(END_NS, END_NS))
+    for frame_index in range(RASTER, RASTER + KEPT):
+        arrivals.note(frame_index, Arrival(END_NS, END_NS))
     assert arrivals.stages(UPDATE, END_NS) is not None
     arrivals.note(RASTER + KEPT, Arrival(END_NS, END_NS))
     assert arrivals.stages(UPDATE, END_NS) is None

@@ -18,18 +18,18 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Close
 from websockets.sync.client import connect
 
-from livessl import replay, wire
-from livessl.capture.devices import Placed, Spliced
+from livessl import offline, wire
 from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
-from livessl.keys import add_token
-from livessl.messages import Messages
+from livessl.recordings.recording import Placed, Spliced
 from livessl.server import engine
+from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
+from livessl.site.keys import add_token
 from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
 
 CLOCK = SystemClock()
@@ -76,11 +76,11 @@ def play(server: Server, speed: float | None = None) -> None:
     server.engine.wait_idle()
 
 
-def offline() -> list[dict[str, Any]]:
+def offline_events() -> list[dict[str, Any]]:
     """The events of the scene without any server."""
     site = site_of()
     told = Messages(site, START_NS, utc=True)
-    outputs = replay.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
+    outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
     return [told.event(output) for output in outputs if isinstance(output, Event)]
 
 
@@ -99,7 +99,7 @@ def test_replay_reaches_subscribers_and_rest_as_it_would_be_offline() -> None:
         subscriber.close()
         events_only.close()
     events = subscriber.of("event")
-    assert [without_delays(event) for event in events] == [without_delays(event) for event in offline()]
+    assert [without_delays(event) for event in events] == [without_delays(event) for event in offline_events()]
     assert [without_delays(event) for event in reversed(rest)] == [without_delays(event) for event in events]
     for event, source in zip(events, scene().sources, strict=True):
         assert math.dist(event["position_m"], source.position_m) < NEAR_M
@@ -252,7 +252,7 @@ def test_live_and_replay_do_not_mix(first: wire.Hello, second: wire.Hello, reaso
 def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
     with running_server(site_of()) as server:
         link = connected(server, LIVE)
-        link.send([frame(1, raster=1000)])
+        link.send([frame(1, frame_index=1000)])
 
         def state() -> dict[str, Any]:
             link.service()
@@ -361,4 +361,4 @@ def test_events_are_handed_on_too() -> None:
     play(server)
     server.stop()
     thread.join(timeout=10)
-    assert [event["id"] for event in taken] == [event["id"] for event in offline()]
+    assert [event["id"] for event in taken] == [event["id"] for event in offline_events()]

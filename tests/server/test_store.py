@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from livessl.core.types import FRAME_NS
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 
 START_NS = 1_767_225_600_000_000_000
@@ -237,16 +237,16 @@ def test_settled_events_take_the_place_of_provisional_ones(tmp_path: Path) -> No
     assert store.settled("lab") == (None, None)
     for n in range(3):
         store.add(event(n), START_NS + n * NS, provisional=True)
-    raster = (START_NS + 2 * NS) // FRAME_NS
-    assert [old["id"] for old in store.provisional(raster)] == ["e-0", "e-1"]
-    store.settle("lab", [(event(7), START_NS)], ["e-0"], raster, {"heard": {"b": [[1, 0.15]]}})
+    frame_index = (START_NS + 2 * NS) // FRAME_NS
+    assert [old["id"] for old in store.provisional(frame_index)] == ["e-0", "e-1"]
+    store.settle("lab", [(event(7), START_NS)], ["e-0"], frame_index, {"heard": {"b": [[1, 0.15]]}})
     assert ids(store) == [2, 1, 7]
-    assert store.provisional(raster + 100) == [event(2)]  # e-1 has come to stay
+    assert store.provisional(frame_index + 100) == [event(2)]  # e-1 has come to stay
     store.close()
     again = Store(path)
-    assert again.settled("lab") == (raster, {"heard": {"b": [[1, 0.15]]}})
+    assert again.settled("lab") == (frame_index, {"heard": {"b": [[1, 0.15]]}})
     assert again.settled("elsewhere") == (None, None)
-    assert again.provisional(raster + 100) == [event(2)]
+    assert again.provisional(frame_index + 100) == [event(2)]
     again.close()
 
 

@@ -93,7 +93,7 @@ def test_nobody_waits_for_a_disabled_array() -> None:
         assert world.server is not None
         if disabled:
             world.server.enable(ARRAY_OF["a"], False)
-        world.run(world.end - world.raster + 50)
+        world.run(world.end - world.frame_index + 50)
         assert heard(world) == {"south"}
         assert (world.nodes["b"].link.kept <= 60) is disabled
 
@@ -103,7 +103,7 @@ def test_enabled_again_it_is_used_again() -> None:
     assert world.server is not None
     world.server.enable("north", False)
     sounds = world.groups()
-    world.run(min(sounds[4]) - world.raster - 20)
+    world.run(min(sounds[4]) - world.frame_index - 20)
     assert heard(world) == {"south"}
     world.server.enable("north", True)
     world.recover()

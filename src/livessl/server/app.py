@@ -19,16 +19,16 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import InvalidState
 
 from livessl.clock import Clock
-from livessl.config import ConfigError, Fault, HttpConfig, Site, open_doors
-from livessl.keys import file_stamp, read_tokens
-from livessl.messages import JsonObject
-from livessl.server.auth import Access
+from livessl.server.api.app import create_app
+from livessl.server.api.auth import Access
+from livessl.server.api.encode import JsonObject
 from livessl.server.engine import Engine
-from livessl.server.hub import Hub
+from livessl.server.fanout import Hub
 from livessl.server.receiver import BindError
 from livessl.server.sinks import Sinks
 from livessl.server.store import Store, StoreError
-from livessl.server.web import create_app
+from livessl.site.keys import file_stamp, read_tokens
+from livessl.site.models import ConfigError, Fault, HttpConfig, Site, open_doors
 
 SWITCH_S: Final = 0.0005
 """How long a thread may keep the interpreter from another one. What listens and searches leaves it for moments,

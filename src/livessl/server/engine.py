@@ -11,19 +11,20 @@ from typing import Final
 
 from livessl import wire
 from livessl.clock import Clock, utc_ns, utc_text
-from livessl.config import Site
-from livessl.core.search import warm_up
-from livessl.core.settling import Settled, Settling
-from livessl.core.streams import ArrayState, ArrayStatus
-from livessl.core.types import FRAME_NS, Ask, Event, Frame, Message, Output, Track, TrackState, Update
-from livessl.messages import JsonObject, Messages, Stages, array_status
-from livessl.server.helper import Helper
+from livessl.core.locate.peak_search import warm_up
+from livessl.core.stream.array_health import ArrayState, ArrayStatus
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Message, Output, Track, TrackState, Update
+from livessl.server.api.encode import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
+from livessl.server.parallel import Helper
 from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.refusals import Refusals
 from livessl.server.resident import unmap_unused
 from livessl.server.store import Store, StoreError
+from livessl.site.build.fusion import make_clock_offsets, make_fusion
+from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
 """How long the thread waits for sound before it looks at the clock again."""
@@ -63,9 +64,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Unsaved:
-    """Events and their start times, the ids they take the place of, and the raster interval they settle all before.
+    """Events and their start times, the ids they take the place of, and the frame index they settle all before.
 
-    `clocks` is what was known of the arrays' clocks then: without it, a raster interval is another one to each.
+    `clocks` is what was known of the arrays' clocks then: without it, a frame index is another one to each.
     """
 
     events: Sequence[tuple[JsonObject, int]]
@@ -240,11 +241,11 @@ class Engine:
         self, arrays: Iterable[str], settled: int | None, clocks: JsonObject | None = None, *, live: bool = False
     ) -> None:
         """A clean slate: nothing of another time may leak into this one."""
-        self._clocks = self._site.make_clock_offsets()
+        self._clocks = make_clock_offsets(self._site)
         if clocks is not None:
             self._clocks.restore(clocks)
-        fusion = self._site.make_fusion(live=live, clock_offsets=self._clocks, each=self._helper.each)
-        self._settling = Settling(fusion, arrays, settled)
+        fusion = make_fusion(self._site, live=live, clock_offsets=self._clocks, each=self._helper.each)
+        self._settling = TwoPassFusion(fusion, arrays, settled)
         self._messages: Messages | None = None
         self.maps.clear()
 
@@ -344,28 +345,28 @@ class Engine:
         if self._messages is None:
             if not batch:
                 return
-            recorded_ns = min(message.raster for message in batch) * FRAME_NS
+            recorded_ns = min(message.frame_index for message in batch) * FRAME_NS
             origin_ns = self._started_ns if self._replay_now_ns is None else recorded_ns
             self._messages = Messages(self._site, origin_ns, utc=True)
         if self._replay_now_ns is not None and batch:
-            newest_ns = (max(message.raster for message in batch) + 1) * FRAME_NS
+            newest_ns = (max(message.frame_index for message in batch) + 1) * FRAME_NS
             self._replay_now_ns = max(self._replay_now_ns, newest_ns)
-        self._settling.spare(self._disabled)
+        self._settling.exclude(self._disabled)
         self._tell(self._settling.step(batch, self.now_ns()))
         if not self._unsaved:
             self._receiver.ingest.settled = self._settling.settled_of
 
-    def _tell(self, outputs: Sequence[Output | Settled]) -> None:
+    def _tell(self, outputs: Sequence[Output | FinalResults]) -> None:
         if self._messages is None:
             return
         for output in outputs:
-            if isinstance(output, Settled):
+            if isinstance(output, FinalResults):
                 self._tell_settled(output, self._messages)
             elif isinstance(output, Event):
                 self._tell_provisional(output, self._messages)
             elif isinstance(output, Update):
                 self._publish(self._messages.update(output, self._stages(output, "update")))
-            elif isinstance(output, Ask):
+            elif isinstance(output, BackfillRequest):
                 self._receiver.ask(output)
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
@@ -397,7 +398,7 @@ class Engine:
             _log.error("%s", error)
             return []
 
-    def _tell_settled(self, settled: Settled, messages: Messages) -> None:
+    def _tell_settled(self, settled: FinalResults, messages: Messages) -> None:
         """Events that stay: those that are news are told, once they are stored."""
         before = [] if self._replay_now_ns is not None else self._provisional(settled.until)
         events = []

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from prometheus_client import Histogram
 
 from livessl.core.types import FRAME_NS, Event, Update
-from livessl.messages import JsonObject, Stages
+from livessl.server.api.encode import JsonObject, Stages
 
 KEPT: Final = 1200
 """Raster intervals whose arrival is remembered: a minute."""
@@ -34,19 +34,19 @@ class Arrival(NamedTuple):
 
 
 class Arrivals:
-    """Of each raster interval the message that came last. Noted on one thread, looked up on another."""
+    """Of each frame index the message that came last. Noted on one thread, looked up on another."""
 
     def __init__(self) -> None:
         self._last: dict[int, Arrival] = {}
         self._order: deque[int] = deque()
 
-    def note(self, raster: int, arrival: Arrival) -> None:
+    def note(self, frame_index: int, arrival: Arrival) -> None:
         """A message of that interval has come."""
-        if raster not in self._last:
-            self._order.append(raster)
+        if frame_index not in self._last:
+            self._order.append(frame_index)
             if len(self._order) > KEPT:
                 del self._last[self._order.popleft()]
-        self._last[raster] = arrival
+        self._last[frame_index] = arrival
 
     def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
         """Where the time of an answer that was there at `located_ns` went; None where nobody sent its last interval."""

@@ -14,14 +14,14 @@ import zmq
 
 from livessl import wire
 from livessl.clock import Clock
-from livessl.config import Site
-from livessl.core.types import Ask, Message
+from livessl.core.types import BackfillRequest, Message
 from livessl.errors import RunError
-from livessl.keys import server_keys
 from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrival, Arrivals
 from livessl.server.refusals import Refusals
+from livessl.site.keys import server_keys
+from livessl.site.models import Site
 
 POLL_MS: Final = 20
 """How long the thread waits for sound before it looks whether acknowledgements are due."""
@@ -95,7 +95,7 @@ class Receiver:
         self._guarded = keys is not None
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
-        self._asks: deque[Ask] = deque()
+        self._asks: deque[BackfillRequest] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
         self.failure: BaseException | None = None
@@ -128,7 +128,7 @@ class Receiver:
         self._socket.close()
         self._context.term()
 
-    def ask(self, ask: Ask) -> None:
+    def ask(self, ask: BackfillRequest) -> None:
         """Ask an array's node for frames; from any thread."""
         self._asks.append(ask)
 
@@ -174,7 +174,7 @@ class Receiver:
             if arrival.left is not None:
                 self._put(Left(arrival.left))
             if arrival.message is not None:
-                self.arrivals.note(arrival.message.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+                self.arrivals.note(arrival.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
                 self._put(arrival.message)
             if arrival.offer is not None:
                 self._reply(routing_id, arrival.offer)

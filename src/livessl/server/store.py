@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """About 10 MB. A file has no such limit."""
@@ -88,7 +88,7 @@ class Store:
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
-                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
+                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, frame index INTEGER)")
                 db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
                 db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
             if path is not None:
@@ -116,12 +116,12 @@ class Store:
         site: str,
         events: Sequence[tuple[JsonObject, int]],
         replaced: Iterable[str],
-        raster: int,
+        frame_index: int,
         clocks: JsonObject,
     ) -> None:
-        """Keep events that stay, in place of others; before a raster interval all others stay too. All or nothing.
+        """Keep events that stay, in place of others; before a frame index all others stay too. All or nothing.
 
-        With them goes what is known of the clocks, by which the raster intervals of arrays are those of the site.
+        With them goes what is known of the clocks, by which the frame indices of arrays are those of the site.
 
         Raises
         ------
@@ -135,19 +135,19 @@ class Store:
             db.execute(
                 "DELETE FROM provisional WHERE NOT EXISTS (SELECT 1 FROM events WHERE events.id = provisional.id "
                 "AND time_ns >= ?)",
-                (raster * FRAME_NS,),
+                (frame_index * FRAME_NS,),
             )
-            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, raster))
+            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, frame_index))
             db.execute("INSERT OR REPLACE INTO clocks VALUES (?, ?)", (site, json.dumps(clocks)))
 
     def settled(self, site: str) -> tuple[int | None, JsonObject | None]:
-        """The raster interval before which all sound of the site has become events that stay; what clocks were then."""
-        sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
+        """The frame index before which all sound of the site has become events that stay; what clocks were then."""
+        sql = "SELECT frame index, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
         rows = self._reading.rows(sql, (site,))
         if not rows:
             return None, None
-        raster, clocks = rows[0]
-        return int(raster), None if clocks is None else json.loads(clocks)
+        frame_index, clocks = rows[0]
+        return int(frame_index), None if clocks is None else json.loads(clocks)
 
     def disabled(self, site: str) -> frozenset[str]:
         """The arrays of the site that are not to be used."""
@@ -170,8 +170,8 @@ class Store:
         with self._kept(f"that array {array!r} is {'enabled' if enabled else 'disabled'} was") as db:
             db.execute(sql, (site, array))
 
-    def provisional(self, raster: int) -> list[JsonObject]:
-        """Events before a raster interval that may still be replaced.
+    def provisional(self, frame_index: int) -> list[JsonObject]:
+        """Events before a frame index that may still be replaced.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class Store:
         """
         sql = "SELECT json FROM events JOIN provisional USING (id) WHERE time_ns < ? ORDER BY time_ns"
         try:
-            return [json.loads(text) for (text,) in self._writing.rows(sql, (raster * FRAME_NS,))]
+            return [json.loads(text) for (text,) in self._writing.rows(sql, (frame_index * FRAME_NS,))]
         except sqlite3.Error as error:
             raise StoreError(f"server.events_db: cannot read: {error}; release the file") from error
 
