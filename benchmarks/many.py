@@ -3,13 +3,8 @@
     python benchmarks/many.py --sounds 12 --rt60 1 --snr 10
 
 prints the error and the time of an answer for each number of arrays that may have a part in it
-<<<<<<< HEAD
-(`livessl.core.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
-docs/performance/experiments.md.
-=======
 (`livessl.core.locate.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
-docs/decisions/0027-sixteen-clearest-arrays.md.
->>>>>>> main
+docs/performance/experiments.md.
 """
 
 from __future__ import annotations
