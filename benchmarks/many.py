@@ -4,7 +4,7 @@
 
 prints the error and the time of an answer for each number of arrays that may have a part in it
 (`livessl.core.locate.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
-docs/decisions/0027-sixteen-clearest-arrays.md.
+docs/performance/experiments.md.
 """
 
 from __future__ import annotations
