@@ -52,6 +52,9 @@ def _parser() -> argparse.ArgumentParser:
         help=f"sounds of each kind for the exactness (default {default.sounds}: 540 maps)",
     )
     parser.add_argument(
+        "--scenes", type=int, default=default.scenes, help=f"simulated scenes (default {default.scenes})"
+    )
+    parser.add_argument(
         "--performance", action="store_true", help="also compare `livessl bench`; this never changes the exit code"
     )
     parser.add_argument("--repeats", type=int, default=3, help="performance: runs of each tree (default 3)")
@@ -88,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Compare; 0 where all is the same, 1 where anything differs, 2 for wrong use."""
     parsed = _parser().parse_args(arguments)
     names = [name for name in parsed.only or PROBES if name not in parsed.skip]
-    options = Options(parsed.seeds, parsed.jobs, parsed.sounds)
+    options = Options(parsed.seeds, parsed.jobs, parsed.sounds, parsed.scenes)
     previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with checked_out(REPOSITORY, parsed.base, parsed.head) as pair:

@@ -19,7 +19,10 @@ from pathlib import Path
 from typing import Any, Final
 
 CONTEXT_BYTES: Final = 40
-"""Bytes shown on either side of the first difference: enough for a JSON key and its value."""
+"""Bytes of text shown on either side of the first difference: enough for a JSON key and its value."""
+
+CONTEXT_BINARY_BYTES: Final = 8
+"""Bytes shown on either side of the first difference of what is no text: a number of 64 bits."""
 
 MAX_ERROR_CHARACTERS: Final = 300
 """Longest end of a command's stderr that an error repeats."""
@@ -37,7 +40,7 @@ class ProbeError(Exception):
 
 @dataclass(frozen=True)
 class Done:
-    """How a command ended."""
+    """The exit code and the output of a command that has ended."""
 
     code: int
     out: bytes
@@ -81,7 +84,7 @@ class Tree:
     def start(self, *arguments: object, folder: Path, said: Path | None = None) -> subprocess.Popen[bytes]:
         """Start this interpreter with the tree's code as the leader of a process group.
 
-        Its stdout and stderr are pipes, or both go to the file `said`: a pipe that nobody reads would stop it.
+        Its stdout and stderr are pipes, or both go to the file `said`: a pipe that is never read would block it.
         """
         with ExitStack() as stack:
             file = subprocess.PIPE if said is None else stack.enter_context(said.open("wb"))
@@ -203,14 +206,16 @@ def _first_difference(base: bytes, head: bytes) -> str:
     at = next((k for k, (one, other) in enumerate(zip(base, head, strict=False)) if one != other), None)
     if at is None:
         at = min(len(base), len(head))
-    around = slice(max(0, at - CONTEXT_BYTES), at + CONTEXT_BYTES)
-    return f"byte {at} of {len(base)} and {len(head)}: base {_shown(base[around])}, head {_shown(head[around])}"
+    lengths = f"{len(base)}" if len(base) == len(head) else f"{len(base)} and {len(head)}"
+    return f"byte {at} of {lengths}: base {_shown(base, at)}, head {_shown(head, at)}"
 
 
-def _shown(data: bytes) -> str:
-    """Text as text; anything else as hexadecimal digits."""
-    text = data.decode(errors="replace")
-    return repr(text) if text.replace("\n", "").isprintable() and "\ufffd" not in text else data.hex(" ")
+def _shown(data: bytes, at: int) -> str:
+    """Return what surrounds a byte: text as text, anything else in hexadecimal digits."""
+    text = data[max(0, at - CONTEXT_BYTES) : at + CONTEXT_BYTES].decode(errors="replace")
+    if text.replace("\n", "").isprintable() and "\ufffd" not in text:
+        return repr(text)
+    return data[max(0, at - CONTEXT_BINARY_BYTES) : at + CONTEXT_BINARY_BYTES].hex(" ")
 
 
 Keys = dict[str, set[str]]
@@ -290,7 +295,7 @@ class Ratio:
 
     @property
     def within_spread(self) -> bool:
-        """Whether the ranges of both trees' runs overlap, so that the runs show no difference."""
+        """Return whether the ranges of both trees' runs overlap: the runs then show no difference."""
         return self.lowest <= 1.0 <= self.highest
 
 

@@ -25,7 +25,7 @@ import livessl.wire
 wire: Any = livessl.wire  # its names may move, and then this fails with a clear error
 
 REQUESTED: Final = "requested frame"
-"""The frame that the server requested: sequence number 0 on the wire, however the class says so."""
+"""Name of the frame that the server requested: its sequence number on the wire is 0, whatever field the class has."""
 
 DAMAGED: Final = 100
 """Damaged variants of each message: enough to meet every check of the decoder with most messages."""
@@ -36,7 +36,7 @@ SAMPLES: Final = 2205
 
 
 def main() -> int:
-    """Print the outputs by name: hexadecimal digits of messages, and how damaged ones are taken."""
+    """Print the messages by name in hexadecimal digits, and the outcome of decoding damaged ones."""
     built = {name: data.hex() for name, data in messages().items()}
     given = json.loads(Path(sys.argv[1]).read_text(encoding="ascii"))["built"] if sys.argv[1:] else built
     foreign = {name: bytes.fromhex(digits) for name, digits in given.items()}
@@ -65,7 +65,7 @@ def messages() -> dict[str, bytes]:
         "request, empty": wire.Request("run-1"),
     }
     encoded = {name: wire.encode(message) for name, message in built.items()}
-    # where the class has yet another way to say it, only decoding is compared
+    # if neither fits the class, this message is compared by decoding alone
     for sequence in (0, None):
         with suppress(Exception):
             encoded[REQUESTED] = wire.encode(_filled(wire.Frame, (frame[0], sequence, *frame[2:]), flag=True))
@@ -98,7 +98,7 @@ def _filled(kind: type[Any], values: tuple[Any, ...], clock: str | None = None, 
 
 
 def damaged(name: str, data: bytes) -> str:
-    """Say of each damaged variant of a message whether it is refused, or else the digest of what is decoded from it."""
+    """Return a word for each damaged variant of a message: "refused", or the digest of what it is decoded to."""
     rng = random.Random(name)  # noqa: S311 - to repeat, not to hide
     return " ".join(_taken(_damage(rng, data)) for _ in range(DAMAGED))
 
