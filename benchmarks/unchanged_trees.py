@@ -166,10 +166,10 @@ def checked_out(repository: Path, base: str, head: str | None) -> Iterator[Pair]
             if commit is None:
                 return Tree(label, repository)
             path = folder / label
+            worktrees.callback(_git, repository, "worktree", "remove", "--force", str(path))
             done = _git(repository, "worktree", "add", "--quiet", "--detach", str(path), commit)
             if done.code:
                 raise ProbeError(f"git worktree add: {done.err.strip()}")
-            worktrees.callback(_git, repository, "worktree", "remove", "--force", str(path))
             return Tree(label, path)
 
         (folder / "probes").mkdir()
