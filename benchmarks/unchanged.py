@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -28,6 +28,17 @@ WRONG_USE: Final = 2
 INTERRUPTED: Final = 130
 
 
+def _at_least(least: int) -> Callable[[str], int]:
+    """Return a parser of whole numbers from `least` on: with none, a probe would compare nothing and find no change."""
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"expected a whole number from {least} on, got {text!r}")
+        return int(text)
+
+    return parse
+
+
 def _parser() -> argparse.ArgumentParser:
     listed = "\n".join(f"  {name:<10} {(probe.__doc__ or '').splitlines()[0]}" for name, probe in PROBES.items())
     parser = argparse.ArgumentParser(
@@ -42,22 +53,24 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--skip", nargs="+", choices=list(PROBES), default=[], metavar="PROBE", help="leave these out")
     default = Options()
     parser.add_argument(
-        "--seeds", type=int, default=default.seeds, help=f"worlds of the faults (default {default.seeds})"
+        "--seeds", type=_at_least(1), default=default.seeds, help=f"worlds of the faults (default {default.seeds})"
     )
-    parser.add_argument("--jobs", type=int, default=default.jobs, help=f"processes for them (default {default.jobs})")
+    parser.add_argument(
+        "--jobs", type=_at_least(1), default=default.jobs, help=f"processes for them (default {default.jobs})"
+    )
     parser.add_argument(
         "--sounds",
-        type=int,
+        type=_at_least(1),
         default=default.sounds,
         help=f"sounds of each kind for the exactness (default {default.sounds}: 540 maps)",
     )
     parser.add_argument(
-        "--scenes", type=int, default=default.scenes, help=f"simulated scenes (default {default.scenes})"
+        "--scenes", type=_at_least(1), default=default.scenes, help=f"simulated scenes (default {default.scenes})"
     )
     parser.add_argument(
         "--performance", action="store_true", help="also compare `livessl bench`; this never changes the exit code"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="performance: runs of each tree (default 3)")
+    parser.add_argument("--repeats", type=_at_least(2), default=3, help="performance: runs of each tree (default 3)")
     return parser
 
 

@@ -181,6 +181,13 @@ def test_commit_that_does_not_exist_is_wrong_use(capsys: pytest.CaptureFixture[s
     assert "expected a commit of" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--scenes 0", "--seeds 0", "--sounds 0", "--repeats 1"])
+def test_size_with_which_nothing_would_be_compared_is_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        unchanged.main(["HEAD", *option.split()])
+    assert "expected a whole number from" in capsys.readouterr().err
+
+
 def test_checked_out_commit_is_removed_again() -> None:
     require(_is_checkout(), "this is no checkout of git")
     with checked_out(ROOT, "HEAD", None) as pair:
