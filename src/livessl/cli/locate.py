@@ -1,4 +1,4 @@
-"""`livessl locate`: the whole pipeline on recordings, as fast as it can."""
+"""`livessl locate`: the whole pipeline on recordings, as fast as this machine can."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from livessl.server.api.encode import Messages
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
-    add_wav(parser, "recording of an array; all begin together", required=True)
+    add_wav(parser, "recording of an array, WAV or FLAC; give one for each array; all begin together", required=True)
     add_method(parser)
     add_joint(parser)
     add_json(parser)

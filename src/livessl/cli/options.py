@@ -1,4 +1,4 @@
-"""Options that several commands share, and how their values are read."""
+"""Options that several commands share, and functions that read their values."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def read_site(arguments: argparse.Namespace) -> Site:
 
 
 def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the arrays that --joint joins, by the name of the joint array."""
+    """Return the names of the arrays that --joint joins, by the name of the joint array."""
     return _each_once(arguments.joint, "--joint")
 
 

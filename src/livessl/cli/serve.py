@@ -1,4 +1,4 @@
-"""`livessl serve`: the fusion server, its API and its dashboard."""
+"""`livessl serve`: run the fusion server, its API and its dashboard."""
 
 from __future__ import annotations
 
