@@ -17,7 +17,7 @@ import scipy.fft
 
 from livessl.core.correlate.onset_gcc import _STRONGEST, OnsetFrontEnd, OnsetGCC
 from livessl.core.correlate.spectra import Spectra
-from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
+from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
 from livessl.lab.evaluate.campaign import read_clips
 from livessl.lab.evaluate.command import HALVES
@@ -78,7 +78,7 @@ def errors_m(
     ):
         active: BoolArray = _active(every, RATE_HZ)
         loud = np.flatnonzero(active)
-        listener = estimator.listener(spec.name, RATE_HZ)
+        listener = estimator.onset_front_end(spec.name, RATE_HZ)
         if listener is None or not len(loud):
             raise SystemExit(f"{spec.name}: nothing to hear")
         known = Known(listener, len(every))
@@ -101,7 +101,7 @@ def main() -> int:
     arguments = parser.parse_args()
     clips = read_clips(arguments.events, CLASSES, RATE_HZ)
     arrays = pair(np.array(ROOM_M) / 2.0, 1, 5)
-    estimator = ESTIMATORS["onset"](arrays, EXPERIMENTS["diversity"].grid(0.1), C_M_S)
+    estimator = create("onset", arrays, EXPERIMENTS["diversity"].grid(0.1), C_M_S)
     microphones_m = np.vstack([spec.microphones_m for spec in arrays])
     found: dict[tuple[float, str], list[tuple[float, float]]] = {}
     for number in range(arguments.positions):

@@ -21,13 +21,13 @@ from threadpoolctl import threadpool_limits
 from livessl import __version__
 from livessl.cli import argument, progress
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock
+from livessl.core.methods import METHODS
 from livessl.core.types import Event
 from livessl.errors import RunError, UseError
 from livessl.site import keys as keyring
 from livessl.site.build.grid import search_grid
 from livessl.site.load import load_site
 from livessl.site.models import (
-    METHODS,
     ConfigError,
     Fault,
     HttpConfig,

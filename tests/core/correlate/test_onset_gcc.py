@@ -15,8 +15,9 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.geometry import Grid
-from livessl.core.locate import estimators
-from livessl.core.locate.estimators import Onset, Sound
+from livessl.core.locate import onset
+from livessl.core.locate.estimator import Sound
+from livessl.core.locate.onset import Onset
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
@@ -170,7 +171,7 @@ def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.Mo
     everyone = estimator.locate(sounds)
     assert not everyone.unneeded
     assert [heard.spec.name for heard in everyone.evidence] == ["east", "north", "south"]
-    monkeypatch.setattr(estimators, "MOST_ARRAYS", 2)
+    monkeypatch.setattr(onset, "MOST_ARRAYS", 2)
     found = estimator.locate(sounds)
     assert set(found.unneeded) == {"east"}
     assert [heard.spec.name for heard in found.evidence] == ["north", "south"]

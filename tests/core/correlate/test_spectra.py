@@ -11,8 +11,11 @@ from livessl.core.correlate.gcc_phat import CrossSpectra, GCCPhat, microphone_pa
 from livessl.core.correlate.spectra import averaged, cepstral, minimum_phase_cepstrum, whole_segment
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
-from livessl.core.locate.estimators import ESTIMATORS, Localization, Sound, SrpPhat, third_octaves_below_hz
+from livessl.core.locate.estimator import Localization, Sound, create
+from livessl.core.locate.map_estimator import third_octaves_below_hz
 from livessl.core.locate.srp import SRPMapper
+from livessl.core.locate.srp_phat import SrpPhat
+from livessl.core.methods import METHODS
 from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
@@ -121,12 +124,12 @@ def test_any_length_and_silence_are_taken(front_end: spectra.FrontEnd, count: in
         assert samples.any() or not values.any()
 
 
-@pytest.mark.parametrize("method", sorted(ESTIMATORS))
+@pytest.mark.parametrize("method", sorted(METHODS))
 def test_every_method_finds_a_sound_in_free_air(method: str) -> None:
     grid = Grid(BOUNDS_M, 0.1)
     sound = burst(9000)
     sounds = {spec.name: Sound((heard(spec, SOURCE_M, sound),), RATE_HZ) for spec in (NORTH, SOUTH)}
-    found = ESTIMATORS[method]([NORTH, SOUTH], grid, C_M_S).locate(sounds)
+    found = create(method, [NORTH, SOUTH], grid, C_M_S).locate(sounds)
     assert np.linalg.norm(found.position_m - SOURCE_M) < 0.05  # half a cell: frames' edges cost some
 
 

@@ -178,12 +178,12 @@ class OnsetFrontEnd:
         noisy = None if self._wide else _NOISY * noises
         return CrossSpectra(spectra, self._pairs, self.sample_rate_hz, self._band_hz, weights, noise=noisy)
 
-    def listen(self, pieces: Iterable[Float32Array]) -> OnsetGCC:
-        """Sum over pieces (K, n) of sound without their context: each is taken to begin out of silence."""
+    def push_segments(self, segments: Iterable[Float32Array]) -> OnsetGCC:
+        """Return the sum over segments (K, n) whose context is unknown: each is taken to begin after silence."""
         total = self.nothing
         silence = np.zeros((len(self._tail), round(2.0 * _WARM_UP_S * self.sample_rate_hz)), dtype=np.float32)
-        for piece in pieces:
+        for segment in segments:
             self.reset()
             self.push(silence, quiet=True)
-            total += self.push(piece, quiet=False)
+            total += self.push(segment, quiet=False)
         return total

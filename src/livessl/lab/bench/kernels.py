@@ -18,9 +18,10 @@ from livessl.clock import Clock
 from livessl.core.correlate.gcc_phat import GCCPhat, correlated
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.kernels import kernels
-from livessl.core.locate.estimators import Sound, SrpPhat
+from livessl.core.locate.estimator import Sound
 from livessl.core.locate.peak_search import PeakSearch, Rule
 from livessl.core.locate.srp import SRPMapper
+from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 from livessl.simulate.room import impulse_responses
 from livessl.simulate.sounds import voice

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livessl.core.locate.estimators import ESTIMATORS
+from livessl.core.locate.estimator import create
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import Each
 from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
@@ -30,7 +30,7 @@ def make_fusion(
     `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
     """
     f, a = site.fusion, site.activity
-    estimator = ESTIMATORS[method or f.method](site.processed, search_grid(site), site.c_m_s)
+    estimator = create(method or f.method, site.processed, search_grid(site), site.c_m_s)
     parameters = FusionParameters(
         deadline_s=f.deadline_s,
         answer_s=ANSWER_S if live else RECENT_S,
