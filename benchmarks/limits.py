@@ -51,9 +51,9 @@ class Known:
         spectra = np.asarray(scipy.fft.rfft(cut.swapaxes(0, 1) * here._window, here._n_fft, axis=2), dtype=np.complex64)
         whole, straight = np.split(spectra, 2, axis=1)
         power, rest = (_power(part[:, :, here._band]) for part in (straight, whole - straight))
-        rest += here._least
+        rest += here._parameters.least
         weights = np.minimum(power**2 / (rest * (rest + 2.0 * power)), _STRONGEST).astype(np.float32)
-        cross = here._cross(Spectra(whole, here._n_fft), weights, np.broadcast_to(here._noise, weights.shape))
+        cross = here._cross(Spectra(whole, here._n_fft), weights, np.broadcast_to(here._state.noise, weights.shape))
         return OnsetGCC(here._sampling.sample(cross), cross.levels)
 
 

@@ -29,6 +29,7 @@ from livessl.core.correlate.band import band_bins
 from livessl.core.correlate.gcc_phat import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
 from livessl.core.correlate.spectra import Spectra, fast_length
 from livessl.core.kernels import kernels
+from livessl.core.kernels.arguments import OnsetParameters, OnsetState
 from livessl.core.types import ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 WINDOW_S: Final = 0.032
@@ -125,15 +126,22 @@ class OnsetFrontEnd:
         self._n_fft = fast_length(length + sampling.room)
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
         self._band = slice(*band_bins(self._n_fft, sample_rate_hz, spec.band_hz))
-        self._least = np.float32(_LEAST_POWER * np.square(self._window).sum())
         hop_s = self._hop / sample_rate_hz
-        self._decay = np.float32(np.exp(-hop_s / PAST_S))
-        self._warm_up = round(_WARM_UP_S / hop_s)
-        self._noise_hops = round(_NOISE_S / hop_s)
+        self._parameters = OnsetParameters(
+            least=np.float32(_LEAST_POWER * np.square(self._window).sum()),
+            decay=np.float32(np.exp(-hop_s / PAST_S)),
+            loud=_LOUD,
+            strongest=_STRONGEST,
+            warm_up=round(_WARM_UP_S / hop_s),
+            noise_hops=round(_NOISE_S / hop_s),
+        )
         self._tail: Float32Array = np.zeros((len(spec.microphones_m), 0), dtype=np.float32)
         bins = self._band.stop - self._band.start
-        self._noise, self._past = np.zeros(bins, dtype=np.float32), np.zeros(bins, dtype=np.float32)
-        self._hops = np.zeros(2, dtype=np.int64)  # heard so far, and those of them that were quiet
+        self._state = OnsetState(
+            windows=np.zeros(2, dtype=np.int64),
+            noise=np.zeros(bins, dtype=np.float32),
+            past=np.zeros(bins, dtype=np.float32),
+        )
 
     @property
     def nothing(self) -> OnsetGCC:
@@ -145,7 +153,7 @@ class OnsetFrontEnd:
     def reset(self) -> None:
         """Forget all: samples are missing, and what comes does not continue what was."""
         self._tail = self._tail[:, :0]
-        self._hops[:] = 0
+        self._state.windows[:] = 0
 
     def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
         """Take the next frame and give what its windows say; a window that it does not complete waits for the next.
@@ -166,11 +174,8 @@ class OnsetFrontEnd:
         windows = np.empty((hops, len(samples), self._n_fft), dtype=np.float32)
         kernels.cut_windows(heard, self._hop, self._window, windows)
         spectra = np.asarray(scipy.fft.rfft(windows, axis=2), dtype=np.complex64)
-        weights, noises = np.empty((2, hops, len(self._noise)), dtype=np.float32)
-        kernels.onset_weights(
-            spectra, self._band.start, quiet, self._hops, self._least, self._decay, self._warm_up, self._noise_hops,
-            _LOUD, _STRONGEST, self._noise, self._past, weights, noises,
-        )  # fmt: skip
+        weights, noises = np.empty((2, hops, len(self._state.noise)), dtype=np.float32)
+        kernels.onset_weights(spectra, self._band.start, quiet, self._parameters, self._state, weights, noises)
         cross = self._cross(Spectra(spectra, self._n_fft), weights, noises)
         return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels)
 

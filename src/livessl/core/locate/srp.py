@@ -15,7 +15,9 @@ import numpy as np
 
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
-from livessl.core.kernels.with_numpy import interpolated, lag_places, neighbours
+from livessl.core.kernels.arguments import SmoothRows
+from livessl.core.kernels.search_with_numpy import lag_places
+from livessl.core.kernels.with_numpy import interpolated, neighbours
 from livessl.core.steering import NEAREST_M, alias_free_hz
 from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray, IntArray
 
@@ -116,30 +118,27 @@ class SRPFunctional:
     """
 
     def __init__(self, evidence: Sequence[Evidence], c_m_s: float) -> None:
-        self._names = [heard.spec.name for heard in evidence]
-        counts = [len(heard.spec.microphones_m) for heard in evidence]
-        rows = [len(heard.gcc.pairs) for heard in evidence]
-        self._first_row = np.cumsum([0, *rows])
-        self._microphones_m = np.concatenate([heard.spec.microphones_m for heard in evidence])
-        shift = np.repeat(np.cumsum([0, *counts[:-1]]), rows)
-        self._pairs = np.concatenate([heard.gcc.pairs for heard in evidence]) + shift[:, None]
-        self._weight = np.repeat([pair_weight(count) for count in counts], rows)
+        self._names = [part.spec.name for part in evidence]
         self._c_m_s = c_m_s
-        self._first_s = np.repeat([heard.gcc.lags_s[0] for heard in evidence], rows)
-        self._step_s = np.repeat([heard.gcc.lags_s[1] - heard.gcc.lags_s[0] for heard in evidence], rows)
-        self._last = np.repeat([len(heard.gcc.lags_s) - 3 for heard in evidence], rows)
-        lengths = np.repeat([len(heard.gcc.lags_s) for heard in evidence], rows)
-        self._start = np.cumsum(lengths) - lengths
-        self._values = np.concatenate([heard.gcc.values.ravel() for heard in evidence])
+        counts = [len(part.spec.microphones_m) for part in evidence]
+        rows = [len(part.gcc.pairs) for part in evidence]
+        self._first_row = np.cumsum([0, *rows])
+        shift = np.repeat(np.cumsum([0, *counts[:-1]]), rows)
+        lengths = np.repeat([len(part.gcc.lags_s) for part in evidence], rows)
+        self._rows = SmoothRows(
+            microphones_m=np.concatenate([part.spec.microphones_m for part in evidence]),
+            pairs=np.concatenate([part.gcc.pairs for part in evidence]) + shift[:, None],
+            first_s=np.repeat([part.gcc.lags_s[0] for part in evidence], rows),
+            step_s=np.repeat([part.gcc.lags_s[1] - part.gcc.lags_s[0] for part in evidence], rows),
+            start=np.cumsum(lengths) - lengths,
+            last=np.repeat([len(part.gcc.lags_s) - 3 for part in evidence], rows),
+            weight=np.repeat([pair_weight(count) for count in counts], rows),
+            values=np.concatenate([part.gcc.values.ravel() for part in evidence]),
+        )
 
     def value(self, points_m: FloatArray) -> FloatArray:
-        """SRP at points (N, 3): (N,)."""
-        return np.asarray(
-            kernels.smooth_power(
-                np.ascontiguousarray(points_m), self._microphones_m, self._pairs, self._c_m_s, self._first_s,
-                self._step_s, self._start, self._last, self._weight, self._values,
-            )
-        )  # fmt: skip
+        """SRP at points (N, 3), in metres: (N,)."""
+        return np.asarray(kernels.smooth_power(np.ascontiguousarray(points_m), self._c_m_s, self._rows))
 
     def pair_terms(self, point_m: FloatArray) -> list[PairTerms]:
         """For each array, what its pairs say at one point (3,)."""
@@ -150,19 +149,21 @@ class SRPFunctional:
     def derivatives(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient (3,) and Gauss-Newton Hessian (3, 3) at one point: sum R' grad tau, sum R'' grad tau grad tau^T."""
         _, slope, curvature, gradient, _ = self._terms(point_m)
-        return (self._weight * slope) @ gradient, (gradient.T * (self._weight * curvature)) @ gradient
+        weight = self._rows.weight
+        return (weight * slope) @ gradient, (gradient.T * (weight * curvature)) @ gradient
 
     def _terms(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Of all pairs R, R', R'', grad tau and tau."""
-        towards = point_m - self._microphones_m
+        """R, R', R'', grad tau and tau of all pairs."""
+        rows = self._rows
+        towards = point_m - rows.microphones_m
         distance = np.sqrt((towards**2).sum(axis=1))
         unit = towards / np.maximum(distance, NEAREST_M)[:, None]
-        i, k = self._pairs.T
+        i, k = rows.pairs.T
         lags = (distance[k] - distance[i]) / self._c_m_s
-        place = (lags - self._first_s) / self._step_s
-        left, around = neighbours(place, self._start, self._last, self._values)
+        place = (lags - rows.first_s) / rows.step_s
+        left, around = neighbours(place, rows.start, rows.last, rows.values)
         value, slope, curvature = interpolated(place - left, *around)
-        return value, slope / self._step_s, curvature / self._step_s**2, (unit[k] - unit[i]) / self._c_m_s, lags
+        return value, slope / rows.step_s, curvature / rows.step_s**2, (unit[k] - unit[i]) / self._c_m_s, lags
 
 
 @dataclass(frozen=True, slots=True)
