@@ -1,4 +1,4 @@
-"""What several kernels are given together, by name, and the constants that they share.
+"""Groups of arguments that kernels take by name, and the constants that kernels share.
 
 In all kernels L is the number of lags, P of an array's pairs, A of arrays, M of their microphones together, R of rows
 (all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest.
@@ -46,7 +46,7 @@ class OnsetParameters(NamedTuple):
 
 
 class OnsetState(NamedTuple):
-    """What is known of an array's noise; the kernel updates the arrays in place."""
+    """State of an array's noise; the kernel updates the arrays in place."""
 
     windows: IntArray
     """Windows so far, and quiet ones of them: (2,)."""
@@ -68,7 +68,7 @@ class SmoothRows(NamedTuple):
     step_s: FloatArray
     """Step between lags of each row: (R,)."""
     start: IntArray
-    """Where each row begins in `values`: (R,)."""
+    """Index in `values` at which each row begins: (R,)."""
     last: IntArray
     """Last place on each row that has two more to its right: (R,)."""
     weight: FloatArray
@@ -83,13 +83,13 @@ class SearchRows(NamedTuple):
     site_pair: IntArray
     """Which of the site's pairs each row is: (R,)."""
     first_row: IntArray
-    """Where each array's rows begin, and the end: (A + 1,)."""
+    """Index at which each array's rows begin, and the end: (A + 1,)."""
     weight: Float32Array
     """Weight of each array: (A,)."""
     microphones_m: Float32Array
     """Positions of all microphones: (M, 3)."""
     first_microphone: IntArray
-    """Where each array's microphones begin, and the end: (A + 1,)."""
+    """Index at which each array's microphones begin, and the end: (A + 1,)."""
     pairs: IntArray
     """Microphones (i, k) of each row, within its array: (R, 2)."""
     scale: Float32Array

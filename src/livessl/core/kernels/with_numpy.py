@@ -162,7 +162,7 @@ def add_power(values: Float32Array, table: csr_array, weight: np.float32, power:
 
 
 def mean_square(values: RealArray, lags_s: FloatArray, but_s: FloatArray, apart_s: float) -> float:
-    """Mean square of a GCC (P, L) at lags further than `apart_s` from each pair's lag `but_s` (P,); 0 if there are none."""
+    """Mean square of a GCC (P, L) at lags further than `apart_s` from each pair's lag `but_s` (P,); 0 without any."""
     elsewhere = np.abs(lags_s[None] - but_s[:, None]) > apart_s
     return float((values**2)[elsewhere].mean(dtype=np.float64)) if elsewhere.any() else 0.0
 

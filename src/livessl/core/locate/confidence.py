@@ -111,7 +111,7 @@ class ConfidenceFeatures:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """How certain a position is.
+    """The certainty of a position.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def judge(
 
 
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:
-    """How far the pairs disagree about a position with `axes` free coordinates, as a share of the noise; 0 to 1.
+    """Disagreement of the pairs about a position with `axes` free coordinates, as a share of the noise; 0 to 1.
 
     There are more delays than coordinates. Where the pairs disagree, the slopes R' of their GCCs at the position are
     not 0. The misfit is the mean square slope, corrected for the delays that the coordinates use up, over s^2 kappa:

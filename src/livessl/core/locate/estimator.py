@@ -70,7 +70,7 @@ class Sound:
 
 @dataclass(frozen=True, slots=True)
 class Localization:
-    """Where a sound came from, how certain that is, and the evidence for it.
+    """The answer of an estimator: a position, its certainty, and the evidence for it.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class PowerMaps:
 
 
 class Estimator(Protocol):
-    """What fusion needs of a localization method.
+    """The interface of a localization method, as fusion uses it.
 
     Offline, only `locate` does any work. Live, `prepare` is called when a node connects, `onset_front_end` for every
     array before its first frame, and `power_maps` when a client requests a map. All calls come from one thread, except

@@ -208,7 +208,7 @@ class PeakSearch:
 
 @dataclass(frozen=True, slots=True)
 class _Among:
-    """What a search over one set of arrays needs.
+    """The rows of a search over one set of arrays, and their lengths.
 
     Parameters
     ----------
