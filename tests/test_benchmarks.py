@@ -140,7 +140,7 @@ def measured() -> dict[str, Json]:
         for length in ("block", "1 s")
         for kind in kernels.KINDS
     ]
-    case = {"spacing_m": 0.05, "arrays": 8, "kind": "noise", "rule": "sum", "maps": 6, "same": 6, "given_up": 2}
+    case = {"spacing_m": 0.05, "arrays": 8, "kind": "noise", "maps": 6, "same": 6, "given_up": 2}
     timing = {
         "name": "map, 2 arrays, 0.1 m",
         "ratio": 1.9,

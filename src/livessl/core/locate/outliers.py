@@ -106,12 +106,8 @@ def consensus(
         if disagreement > MAX_UNRESOLVED_LOSS:
             return Consensus(place, refused=_refusal(evidence))
         break
-    for part in last:
-        together = locate([*place.evidence, part])
-        if sum(own.loss(together).values()) - sum(own.loss(place).values()) > MAX_SUSPECT_LOSS:
-            outliers.append(part)
-        else:
-            place = together
+    place, disagreeing = _with_suspects(place, last, own, locate)
+    outliers += disagreeing
     return Consensus(place, {part.spec.name: own.angle_deg(part, place.position_m) for part in outliers})
 
 
@@ -121,6 +117,20 @@ def _by_trust(evidence: Sequence[Evidence], suspect: Collection[str]) -> tuple[l
     if 2 * len(trusted) <= len(evidence):
         return list(evidence), []
     return trusted, [part for part in evidence if part.spec.name in suspect]
+
+
+def _with_suspects(
+    place: Place, suspect: Sequence[Evidence], own: _OwnPeaks, locate: Callable[[Sequence[Evidence]], Place]
+) -> tuple[Place, list[Evidence]]:
+    """Add the evidence of suspect arrays that agree with a place; return the new place and those that disagree."""
+    disagreeing = []
+    for part in suspect:
+        together = locate([*place.evidence, part])
+        if sum(own.loss(together).values()) - sum(own.loss(place).values()) > MAX_SUSPECT_LOSS:
+            disagreeing.append(part)
+        else:
+            place = together
+    return place, disagreeing
 
 
 def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -> bool:
