@@ -1,7 +1,7 @@
-"""Locates sounds in a room, live, with a few small microphone arrays set far apart.
+"""Locate sounds in a room, live, with a few small microphone arrays set far apart.
 
 `livessl.locate("site.yaml", {"north": "north.wav", "south": "south.wav"})` returns the events in recordings. Each name
-below is loaded when it is first used, so that `import livessl` costs nothing.
+below is loaded when it is first used, so that `import livessl` takes no time.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from livessl.core.geometry import Grid
-    from livessl.core.locate.estimators import Estimator, Localization, Sound
+    from livessl.core.locate.estimator import Estimator, Localization, Sound, register
+    from livessl.core.locate.map_estimator import MapEstimator
+    from livessl.core.methods import METHODS
     from livessl.core.types import ArraySpec, Estimate, Event
     from livessl.offline import PowerMap, locate, power_map
     from livessl.simulation.of_site import Simulation, simulate
     from livessl.site.load import load_site
-    from livessl.site.models import METHODS, ConfigError, Site
+    from livessl.site.models import ConfigError, Site
 
 __version__ = "0.2.0"
 
@@ -29,6 +31,7 @@ __all__ = [
     "Event",
     "Grid",
     "Localization",
+    "MapEstimator",
     "PowerMap",
     "Simulation",
     "Site",
@@ -37,25 +40,28 @@ __all__ = [
     "load_site",
     "locate",
     "power_map",
+    "register",
     "simulate",
 ]
 
 _HOMES: Final = {
-    "METHODS": "site.models",
+    "METHODS": "core.methods",
     "ArraySpec": "core.types",
     "ConfigError": "site.models",
     "Estimate": "core.types",
-    "Estimator": "core.locate.estimators",
+    "Estimator": "core.locate.estimator",
     "Event": "core.types",
     "Grid": "core.geometry",
-    "Localization": "core.locate.estimators",
+    "Localization": "core.locate.estimator",
+    "MapEstimator": "core.locate.map_estimator",
     "PowerMap": "offline",
     "Simulation": "simulation.of_site",
     "Site": "site.models",
-    "Sound": "core.locate.estimators",
+    "Sound": "core.locate.estimator",
     "load_site": "site.load",
     "locate": "offline",
     "power_map": "offline",
+    "register": "core.locate.estimator",
     "simulate": "simulation.of_site",
 }
 """The module of each name, below `livessl`."""

@@ -10,7 +10,7 @@ import pytest
 
 from livessl.clock import SystemClock
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimators import PowerMaps
+from livessl.core.locate.estimator import PowerMaps
 from livessl.core.types import GCC, ArraySpec, Evidence, Window
 from livessl.server.maps import HEADER, INTERVAL_NS, Maps
 from small_site import wait_until

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from livessl.clock import utc_ns
+from livessl.core.methods import is_method, unknown_method
 from livessl.site import keys as keyring
 from livessl.site.models import check_endpoint
 
@@ -49,6 +50,13 @@ def channels(text: str) -> tuple[str, list[int]]:
     if not (name and equals and channels):
         raise argparse.ArgumentTypeError(f"expected ARRAY=1,2,3,4, got {text!r}")
     return name, channels
+
+
+def method(text: str) -> str:
+    """Return the name of a localization method after checking that it is registered or has the form `MODULE:NAME`."""
+    if not is_method(text):
+        raise argparse.ArgumentTypeError(unknown_method(text))
+    return text
 
 
 def endpoint(text: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from livessl import offline
 from livessl.cli import progress
 from livessl.cli.exits import OK
-from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, read_site, wavs
+from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, import_from_here, read_site, wavs
 from livessl.cli.output import complain, print_event, print_warnings
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event
@@ -27,6 +27,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import_from_here()
     site = read_site(arguments)
     print_warnings(site)
     parts = parts_from_wavs(site, *wavs(arguments))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from livessl.cli import argument
+from livessl.core.methods import METHODS
 from livessl.site.load import load_site
-from livessl.site.models import METHODS, ConfigError, Fault, Site
+from livessl.site.models import ConfigError, Fault, Site
 
 T = TypeVar("T")
 
@@ -21,7 +23,22 @@ def add_site(parser: Any) -> None:
 
 def add_method(parser: Any) -> None:
     """Add --method."""
-    parser.add_argument("--method", choices=sorted(METHODS), help="estimator (default: the site's)")
+    parser.add_argument(
+        "--method",
+        type=argument.method,
+        metavar="NAME",
+        help=f"localization method: {', '.join(METHODS)}, or one of your own as MODULE:NAME (default: the site's)",
+    )
+
+
+def import_from_here() -> None:
+    """Make modules in the current directory importable, for a method that is named `MODULE:NAME`.
+
+    The directory comes last, so that no file in it hides an installed module.
+    """
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def add_json(parser: Any, text: str = "print one JSON object per event") -> None:

@@ -13,7 +13,7 @@ from livessl.capture.node import send_session
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.node_input import run_id
-from livessl.cli.options import add_joint, add_json, add_method, joints
+from livessl.cli.options import add_joint, add_json, add_method, import_from_here, joints
 from livessl.cli.output import print_event
 from livessl.cli.serve import run_until_stopped
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
@@ -51,6 +51,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import_from_here()
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = joints(arguments)
     site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)

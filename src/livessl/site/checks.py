@@ -12,10 +12,11 @@ import numpy as np
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import microphone_pairs
 from livessl.core.joint_array import joined
+from livessl.core.methods import is_method, unknown_method
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.site.build.grid import search_grid
-from livessl.site.models import METHODS, Bounds, Site, is_loopback
+from livessl.site.models import Bounds, Site, is_loopback
 
 COINCIDENT_M: Final = 1e-3
 """Two microphones nearer than this are a slip of the pen: no capsule is that small."""
@@ -82,8 +83,8 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         )
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
-    if site.fusion.method not in METHODS:
-        yield ("fusion", "method"), f"expected one of {', '.join(METHODS)}, got {site.fusion.method!r}"
+    if not is_method(site.fusion.method):
+        yield ("fusion", "method"), unknown_method(site.fusion.method)
     yield from _name_faults(site)
     count = len(site.arrays) + len(site.processed) - len(site.specs)
     if site.fusion.min_arrays > count:

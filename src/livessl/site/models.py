@@ -17,12 +17,11 @@ from livessl.core.geometry import (
     speed_of_sound_m_s,
     tetrahedron,
 )
+from livessl.core.methods import ONSET
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
 from livessl.errors import UseError
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
-METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
-"""Names of `livessl.core.locate.estimators.ESTIMATORS`: who checks a site file need not load what localizes."""
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -317,7 +316,7 @@ class ActivityConfig(_Model):
 class FusionConfig(_Model):
     """How arrays are joined."""
 
-    method: str = "onset"
+    method: str = ONSET
     deadline_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     window_s: Annotated[float, Field(ge=0.05, le=2)] = 0.2
     update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1

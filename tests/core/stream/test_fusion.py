@@ -19,7 +19,8 @@ from livessl.core.correlate.band import band_power
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
-from livessl.core.locate.estimators import Localization, PowerMaps, Sound, SrpPhat
+from livessl.core.locate.estimator import Localization, PowerMaps, Sound
+from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.fusion import LET_GO_FRAMES, MOST_KEPT, Fusion, FusionParameters
 from livessl.core.types import (
@@ -73,7 +74,7 @@ class Scripted:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         self.prepared.append((array, sample_rate_hz))
 
-    def listener(self, array: str, sample_rate_hz: float) -> None:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> None:
         return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -715,7 +716,7 @@ class Gauge:
 class Gauged(Scripted):
     """Listens."""
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         return Gauge()
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -808,7 +809,7 @@ class Listening(Scripted):
         self.sums: list[tuple[float, float]] = []
         self.refused = refused
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         assert (array, sample_rate_hz) == ("north", RATE_HZ)
         self.heard.append(None)  # a new one, that has heard nothing
         return Ear(self.heard)
@@ -1048,7 +1049,7 @@ class Duet(Scripted):
             return found
         return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         return Ear([])
 
 

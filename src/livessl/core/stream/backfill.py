@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.onset_gcc import OnsetGCC
-from livessl.core.locate.estimators import Estimator
+from livessl.core.locate.estimator import Estimator
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_S, ArraySpec, Event, Frame, Status
 
@@ -101,7 +101,7 @@ class Asked:
         loud = [frame for frame_index, frame in zip(last_ones, frames, strict=True) if frame_index >= start]
         if not loud or len({frame.sample_rate_hz for frame in frames}) > 1:
             return None
-        listener = estimator.listener(frames[0].array, frames[0].sample_rate_hz)
+        listener = estimator.onset_front_end(frames[0].array, frames[0].sample_rate_hz)
         if listener is None:
             return None
         heard = zip(last_ones, frames, strict=True)

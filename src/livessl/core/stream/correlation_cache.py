@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
-from livessl.core.locate.estimators import Estimator
+from livessl.core.locate.estimator import Estimator
 from livessl.core.types import Frame
 
 SHARED_FRAMES: Final = 4096
@@ -101,7 +101,7 @@ class Listening:
         self, array: str, sample_rate_hz: float, frame_indices: range, frames: Mapping[int, Frame]
     ) -> OnsetFrontEnd | None:
         """A new listener that has heard what is still there of a chain; None where the estimator has none."""
-        listener = self._estimator.listener(array, sample_rate_hz)
+        listener = self._estimator.onset_front_end(array, sample_rate_hz)
         if listener is not None:
             for frame_index in frame_indices:
                 frame = frames.get(frame_index)

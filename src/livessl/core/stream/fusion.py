@@ -15,7 +15,7 @@ import numpy as np
 
 from livessl.core.correlate.onset_gcc import OnsetGCC
 from livessl.core.geometry import direction_deg
-from livessl.core.locate.estimators import Estimator, Localization, PowerMaps, Sound
+from livessl.core.locate.estimator import Estimator, Localization, PowerMaps, Sound
 from livessl.core.stream.activity import THRESHOLD, exact_mask, runs
 from livessl.core.stream.array_health import LEAST_VOTES, LOST_NS, VOTES, ArrayStatus, Stream, Votes, doubts
 from livessl.core.stream.backfill import MOST_ASKED_S, Asked, AskedSound, better, is_sure, nearest
@@ -817,7 +817,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
     if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
         return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
-    if found.features is not None and not found.features.tell_direction:
+    if found.features is not None and not found.features.has_direction:
         return Status.REFUSED, "nothing that was heard came from any one direction"
     who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
     return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"

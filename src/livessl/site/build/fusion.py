@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from livessl.core.locate.estimators import ESTIMATORS, Estimator
+from livessl.core.locate.estimator import Estimator, create
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import Each
 from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.site.build.grid import search_grid
-from livessl.site.models import Site
+from livessl.site.models import ConfigError, Fault, Site
 
 
 def make_clock_offsets(site: Site) -> ClockOffsets:
@@ -17,8 +17,17 @@ def make_clock_offsets(site: Site) -> ClockOffsets:
 
 
 def make_estimator(site: Site, method: str | None = None) -> Estimator:
-    """Return a new estimator of a site's arrays: the site's method, or another of `METHODS`."""
-    return ESTIMATORS[method or site.fusion.method](site.processed, search_grid(site), site.c_m_s)
+    """Return a new estimator of a site's arrays, by the site's method or by another one.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method, or it cannot be imported.
+    """
+    try:
+        return create(method or site.fusion.method, site.processed, search_grid(site), site.c_m_s)
+    except ValueError as error:
+        raise ConfigError([Fault("fusion.method" if method is None else "method", str(error))]) from error
 
 
 def make_fusion(
