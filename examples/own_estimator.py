@@ -1,4 +1,4 @@
-"""Write a localization method of one's own, and compare its errors with those of `srp-phat`.
+"""Write a localization method of your own, and compare its errors with those of `srp-phat`.
 
     python examples/own_estimator.py
 

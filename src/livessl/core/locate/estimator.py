@@ -222,7 +222,7 @@ def create(method: str, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -
         If there is no method of that name, or its factory cannot be imported.
     """
     if not is_method(method):
-        raise ValueError(f"method: {unknown_method(method)}")
+        raise ValueError(unknown_method(method))
     factory = METHODS.get(method, method)
     make: Any = _imported(factory) if isinstance(factory, str) else factory
     estimator: Estimator = make(arrays, grid, c_m_s)
@@ -237,15 +237,15 @@ def _imported(path: str) -> Factory:
         factory: Any = import_module(module)
     except ImportError as error:
         raise ValueError(
-            f"method {path!r}: cannot import {module!r} ({error}); install it, or start in the folder that holds it"
+            f"cannot import {module!r} for {path!r} ({error}); install it, or start in the folder that holds it"
         ) from error
     try:
         for name in attribute.split("."):
             factory = getattr(factory, name)
     except AttributeError as error:
-        raise ValueError(f"method {path!r}: {error}; correct the name after the colon") from error
+        raise ValueError(f"{path!r}: {error}; correct the name after the colon") from error
     if not callable(factory):
-        raise ValueError(f"method {path!r}: {_no_factory(factory)}")
+        raise ValueError(f"{path!r}: {_no_factory(factory)}")
     made: Factory = factory
     return made
 
