@@ -185,7 +185,7 @@ def test_method_of_ones_own_is_chosen_by_its_import_path(
     [
         (
             "nowhere:Corner",
-            "cannot import 'nowhere' for 'nowhere:Corner' (No module named 'nowhere'); install it, or start in",
+            "cannot import 'nowhere' for 'nowhere:Corner' (No module named 'nowhere'); install it",
         ),
         ("own_corner:Middle", "module 'own_corner' has no attribute 'Middle'; correct the name after the colon"),
         ("own_corner:not_a_factory", "expected a factory (arrays, grid, c_m_s) -> Estimator, got int; pass the class"),
