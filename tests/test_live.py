@@ -130,9 +130,7 @@ def live(session: Session) -> LiveRun:
         code = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
         reader = [sys.executable, "-u", "-c", code]
         clients.append(subprocess.Popen(reader, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
-        wait_for(
-            lambda: time.time() % TOGETHER_S < 1.0, "the next multiple of 5 s, so that both nodes begin at the same one"
-        )
+        wait_for(lambda: time.time() % TOGETHER_S < 1.0, "the next multiple of 5 s, at which both nodes begin")
         for node, array in (("north-pc", "north"), ("south-pc", "south")):
             wav = f"{array}={session.directory / array}.wav"
             command = [*LIVESSL, "capture", "--site", str(session.site), "--node", node, "--wav", wav]

@@ -73,7 +73,7 @@ def locate(
     sample_rate_hz: float | None = None,
     method: str | None = None,
 ) -> list[Event]:
-    """Locate the sounds in recordings: the live pipeline from activity detection to events, as fast as this machine can.
+    """Locate the sounds in recordings by the live pipeline, from activity detection to events, without waiting.
 
     Parameters
     ----------
