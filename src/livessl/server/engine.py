@@ -130,7 +130,7 @@ class Engine:
     def _switch(self, run: Run) -> None:
         """Begin another run; nodes must not forget frames because the run before it had made them final."""
         self._begin(run)
-        self._receiver.ingest.settled = run.fusion.settled_of
+        self._receiver.ingest.final_until = run.fusion.settled_of
 
     def _meet(self, item: Joined | Greeted | Left) -> None:
         if isinstance(item, Left):
@@ -187,4 +187,4 @@ class Engine:
         run.fusion.exclude(self._array_states.disabled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
-            self._receiver.ingest.settled = run.fusion.settled_of
+            self._receiver.ingest.final_until = run.fusion.settled_of

@@ -22,7 +22,7 @@ from livessl.site.models import Site
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """What runs in a server, and what it shares."""
+    """Everything that runs in a server, and everything that its parts share."""
 
     site: Site
     clock: Clock

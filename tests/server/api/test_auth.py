@@ -20,7 +20,8 @@ from websockets.typing import Subprotocol
 
 from livessl.clock import SystemClock
 from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
-from livessl.server.app import MAX_HEAD_BYTES, REFRESH_S, Server
+from livessl.server.app import REFRESH_S, Server
+from livessl.server.http import MAX_HEAD_BYTES
 from livessl.site.keys import Role, add_token, revoke_token
 from livessl.site.models import ConfigError
 from small_site import running_server, site_of, wait_until, write_site

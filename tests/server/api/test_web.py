@@ -25,7 +25,7 @@ from websockets.typing import Origin
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock, utc_ns, utc_text
 from livessl.core.types import FRAME_NS
-from livessl.server import app
+from livessl.server import http
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
 from livessl.site.keys import add_token
@@ -504,7 +504,7 @@ def test_subscriber_who_says_too_much_is_cut_off(server: Server) -> None:
 
 
 def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(app, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(http, "MAX_CONNECTIONS", 2)
     with running_server(site_of()) as server:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):
