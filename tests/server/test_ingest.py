@@ -258,9 +258,9 @@ def test_request_of_a_node_is_refused() -> None:
 
 def test_settled_is_told_by_each_nodes_own_clock() -> None:
     into = joined()
-    into.settled = {"north": 103, "south": 100}
+    into.final_until = {"north": 103, "south": 100}
     (_, ack), *_ = into.acknowledgements(NOW + ACK_NS)
-    assert ack.settled == min(into.settled[array] for array in HELLO.arrays)
-    into.settled = {}
+    assert ack.settled == min(into.final_until[array] for array in HELLO.arrays)
+    into.final_until = {}
     (_, ack), *_ = into.acknowledgements(NOW + 2 * ACK_NS)
     assert ack.settled is None

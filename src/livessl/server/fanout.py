@@ -118,7 +118,7 @@ class Subscription:
         return gone
 
     def _make_room(self, subject: Hashable | None) -> bool:
-        """Drop the older state of the same subject, or the oldest message of a full queue; return whether one was dropped."""
+        """Drop the older state of the same subject, or the oldest message of a full queue; return whether it did."""
         older = None if subject is None else self._newest.get(subject)
         if older is not None:
             del self._waiting[older]

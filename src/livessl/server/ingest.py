@@ -22,8 +22,8 @@ GONE_NS: Final = 2_000_000_000
 """Silence, in nanoseconds, after which another node may take a node's name and arrays."""
 
 THERE_NS: Final = 1_400_000_000
-"""Silence, in nanoseconds, after which a node counts as dead: longer than the second between two greetings, shorter than
-the time after which its array is lost."""
+"""Silence, in nanoseconds, after which a node counts as dead: longer than the second between two greetings, shorter
+than the time after which its array is lost."""
 
 NOTICE_NS: Final = 60_000_000_000
 """Shortest interval, in nanoseconds, between two log lines about malformed messages."""
@@ -152,9 +152,7 @@ class Ingest:
             return Arrival()
         self.sequence_gaps[message.array] += missing
         if missing:
-            return Arrival(
-                reply=wire.Ack(run_id="?", received={}, who_are_you=True)
-            )  # makes the node send the missing ones again
+            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # the node then sends them again
         if isinstance(message, Frame):
             peer.take(message)
         return Arrival(message=message)
@@ -180,7 +178,7 @@ class Ingest:
         return 0 if last is None else max(0, number - last - is_frame)
 
     def acknowledgements(self, now_ns: int, *, soon: bool = True) -> list[tuple[bytes, wire.Ack]]:
-        """Return the acknowledgements due by now, with `soon` also those that hurry; forget nodes that are long silent."""
+        """Return the acknowledgements that are due, with `soon` also those that hurry; forget long silent nodes."""
         self._peers = {
             key: peer for key, peer in self._peers.items() if now_ns - peer.last_ns < 30 * GONE_NS and not peer.ended
         }
@@ -193,13 +191,11 @@ class Ingest:
         return due
 
     def requests(self, due: Iterable[BackfillRequest]) -> list[tuple[bytes, wire.Request]]:
-        """Return each request with the routing id to send it to; none for nodes that are gone or do not know requests."""
+        """Return each request with its routing id; drop those to nodes that are gone or do not know requests."""
         found = []
         for request in due:
-            peers = (
-                p for p in self._peers.values() if request.array in p.hello.arrays and p.hello.answers and not p.ended
-            )
-            peer = next(peers, None)
+            able = (peer for peer in self._peers.values() if peer.hello.answers and not peer.ended)
+            peer = next((peer for peer in able if request.array in peer.hello.arrays), None)
             if peer is not None:
                 wanted = {request.array: (request.first, request.last + 1)}
                 found.append((peer.routing_id, wire.Request(peer.hello.run_id, wanted)))
@@ -243,7 +239,7 @@ class Ingest:
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
     def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """Return why a key does not fit its greeting: it stands for the node it was enrolled for, and for its arrays."""
+        """Return why a key does not fit its greeting; it is valid for the node it was enrolled for, and for its arrays."""
         if enrolled is None:
             return None
         if hello.node != enrolled:

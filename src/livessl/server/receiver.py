@@ -28,10 +28,10 @@ POLL_MS: Final = 20
 """Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
 QUEUE_MESSAGES: Final = 1000
-"""Length of the queue: ten seconds of five arrays. While it is full the socket is not read, and nodes keep their frames."""
+"""Length of the queue: ten seconds of five arrays. While it is full, nobody reads the socket, and nodes keep frames."""
 
 BUSY_MESSAGES: Final = 100
-"""While more messages than this wait, acknowledgements do not hurry, so that live sound does not wait behind backlogs."""
+"""While as many messages wait, acknowledgements do not hurry, so that live sound does not wait behind backlogs."""
 
 _log = logging.getLogger(__name__)
 
