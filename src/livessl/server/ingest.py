@@ -67,8 +67,8 @@ class Peer:
 class Arrival:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known one that has kept other frames than before. `offer` tells a node
-    that the server may request frames; it is sent before the reply.
+    `joined` is set by a new run, `greeted` by a known one that has kept other frames than before. `offer` informs a
+    node that the server may request frames; it is sent before the reply.
     """
 
     message: Message | None = None
@@ -239,7 +239,7 @@ class Ingest:
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
     def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """Return why a key does not fit its greeting; it is valid for the node it was enrolled for, and for its arrays."""
+        """Return why a key does not fit its greeting; it is valid for its node, and for the arrays of that node."""
         if enrolled is None:
             return None
         if hello.node != enrolled:

@@ -1,7 +1,7 @@
 """Power maps for people, drawn on demand by a thread of their own, so that they never delay localization.
 
-A reader gets the map of one array once, by `newest`; a watcher gets those of every window, by `watching`. A window that
-nobody looks at costs nothing: it holds the evidence that maps are drawn from, not maps.
+A reader gets the map of one array once, by `newest`; a watcher gets those of every window, by `watching`. A window
+costs nothing until it is drawn: it holds the evidence that maps are drawn from, not maps.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ PATIENCE_S: Final = 5.0
 """Longest wait of a reader for a drawing, in seconds: the first one of a fine grid computes its tables."""
 
 HEADER: Final = struct.Struct("<4sBBHq7f2H")
-"""Header of a picture in bytes: magic, version, view, length of this header, time_ns, age in seconds, least and greatest
-power, bounds of rows and columns in metres, numbers of rows and columns. docs/api.md describes it for clients."""
+"""Header of a picture in bytes: magic, version, view, length of this header, time_ns, age in seconds, least and
+greatest power, bounds of rows and columns in metres, numbers of rows and columns; docs/api.md describes it."""
 
 _MAGIC: Final = b"LMAP"
 _VERSION: Final = 1
@@ -162,7 +162,7 @@ class Maps:
             self._thread.join(timeout=PATIENCE_S)
 
     def show(self, window: Window, draw: Draw) -> None:
-        """Make this the newest window; `draw` draws it if somebody looks."""
+        """Make this the newest window; the thread calls `draw` if a reader or watcher wants it."""
         with self._changed:
             self._newest = (window, draw)
             if self._watchers:

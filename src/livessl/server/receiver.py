@@ -28,7 +28,7 @@ POLL_MS: Final = 20
 """Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
 QUEUE_MESSAGES: Final = 1000
-"""Length of the queue: ten seconds of five arrays. While it is full, nobody reads the socket, and nodes keep frames."""
+"""Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
 
 BUSY_MESSAGES: Final = 100
 """While as many messages wait, acknowledgements do not hurry, so that live sound does not wait behind backlogs."""
