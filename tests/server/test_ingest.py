@@ -9,7 +9,7 @@ import pytest
 
 from livessl import wire
 from livessl.core.types import BackfillRequest
-from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Arrival, Ingest
+from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Ingest, Received
 from livessl.wire import Ack, Bye, Hello, Request
 from small_site import frame, mark, site_of
 
@@ -23,7 +23,7 @@ def ingest() -> Ingest:
     return Ingest(site_of(WEST))
 
 
-def tell(into: Ingest, message: wire.WireMessage, peer: bytes = b"p1", now_ns: int = NOW) -> Arrival:
+def tell(into: Ingest, message: wire.WireMessage, peer: bytes = b"p1", now_ns: int = NOW) -> Received:
     return into.receive(peer, wire.encode(message), now_ns)
 
 
@@ -34,20 +34,20 @@ def joined(**changes: Any) -> Ingest:
 
 
 def refusal(into: Ingest, hello: Hello, peer: bytes = b"p2", now_ns: int = NOW) -> str | None:
-    arrival = tell(into, hello, peer, now_ns)
-    assert arrival.reply is not None
-    assert arrival.reply.run_id == hello.run_id
-    assert (arrival.joined is None) or arrival.reply.refused is None
-    return arrival.reply.refused
+    received = tell(into, hello, peer, now_ns)
+    assert received.reply is not None
+    assert received.reply.run_id == hello.run_id
+    assert (received.joined is None) or received.reply.refused is None
+    return received.reply.refused
 
 
 def test_greeting_is_answered_with_what_is_known() -> None:
     into = ingest()
-    arrival = tell(into, HELLO)
-    assert arrival == Arrival(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
+    received = tell(into, HELLO)
+    assert received == Received(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
     tell(into, frame(1))
     again = tell(into, HELLO)
-    assert again == Arrival(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
+    assert again == Received(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
 
 
 def test_run_that_comes_back_by_another_connection_goes_on() -> None:
@@ -71,7 +71,7 @@ def test_new_run_counts_from_the_beginning() -> None:
 
 @pytest.mark.parametrize("message", [frame(), mark(), Bye("lab-pc", "run-1")])
 def test_stranger_is_asked_who_he_is(message: wire.WireMessage) -> None:
-    assert tell(ingest(), message) == Arrival(reply=WHO)
+    assert tell(ingest(), message) == Received(reply=WHO)
 
 
 def test_messages_pass_once_each() -> None:
@@ -85,8 +85,8 @@ def test_messages_pass_once_each() -> None:
 def test_gaps_in_the_sequence_are_counted() -> None:
     into = joined()
     for sequence in (7, 8, 12, 13):
-        arrival = tell(into, frame(sequence))
-        assert arrival == Arrival(reply=WHO) if sequence == 12 else arrival.message is not None  # send them again
+        received = tell(into, frame(sequence))
+        assert received == Received(reply=WHO) if sequence == 12 else received.message is not None  # send them again
     assert into.sequence_gaps == {"north": 3, "south": 0, "west": 0}
 
 
@@ -95,7 +95,7 @@ def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
     for message in (mark(4, 1000), mark(4, 1005), frame(5, 1006), mark(5, 1007)):  # four marks were never sent
         assert tell(into, message).message is not None
     assert into.sequence_gaps["north"] == 0
-    assert tell(into, mark(8, 1011)) == Arrival(reply=WHO)  # frames 6 to 8 never came
+    assert tell(into, mark(8, 1011)) == Received(reply=WHO)  # frames 6 to 8 never came
     assert into.sequence_gaps["north"] == 3
     assert tell(into, frame(9, 1012)).message is not None
     assert into.sequence_gaps["north"] == 3
@@ -104,7 +104,7 @@ def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
 
 def test_good_bye_ends_a_run() -> None:
     into = joined()
-    assert tell(into, Bye("lab-pc", "run-1")) == Arrival(left=HELLO)
+    assert tell(into, Bye("lab-pc", "run-1")) == Received(left=HELLO)
     assert into.live_nodes(NOW) == []
     assert tell(into, frame(1)).reply == WHO
     assert refusal(into, replace(HELLO, run_id="run-2")) is None
@@ -190,7 +190,7 @@ def test_refused_node_may_come_when_the_place_is_free() -> None:
 )
 def test_malformed_is_counted_and_changes_nothing(data: bytes) -> None:
     into = joined()
-    assert into.receive(b"p1", data, NOW) == Arrival()
+    assert into.receive(b"p1", data, NOW) == Received()
     assert into.malformed == 1
     assert tell(into, frame(1)).message is not None
 

@@ -64,7 +64,7 @@ class Peer:
 
 
 @dataclass(slots=True)
-class Arrival:
+class Received:
     """The result of one message.
 
     `joined` is set by a new run, `greeted` by a known one that has kept other frames than before. `offer` informs a
@@ -111,7 +111,7 @@ class Ingest:
             for peer in self._peers.values()
         )
 
-    def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Arrival:
+    def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Received:
         """Take in one message from one peer; `enrolled` is the node whose key it has shown, if the site uses keys."""
         try:
             message = wire.decode(data)
@@ -121,17 +121,17 @@ class Ingest:
             return self._greet(routing_id, message, now_ns, enrolled)
         peer = self._peers.get(routing_id)
         if peer is None or peer.ended:
-            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))
+            return Received(reply=wire.Ack(run_id="?", received={}, who_are_you=True))
         peer.last_ns = now_ns
         if isinstance(message, wire.Bye):
             peer.ended = True
-            return Arrival(left=peer.hello)
+            return Received(left=peer.hello)
         if not isinstance(message, Frame | Mark):
             what = "an acknowledgement" if isinstance(message, wire.Ack) else "a request"
             return self._reject(wire.WireError(f"a node sent {what}; only servers do"), now_ns)
         return self._take(peer, message, now_ns)
 
-    def _take(self, peer: Peer, message: Message, now_ns: int) -> Arrival:
+    def _take(self, peer: Peer, message: Message, now_ns: int) -> Received:
         """Take in a frame or a mark."""
         if message.array not in peer.hello.arrays:
             return self._reject(
@@ -142,20 +142,20 @@ class Ingest:
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
         if isinstance(message, Frame) and message.sequence == 0:
-            return Arrival(message=message)  # requested, and outside the sequence
+            return Received(message=message)  # requested, and outside the sequence
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
-            return Arrival(message=message)
+            return Received(message=message)
         missing = self._missing_before(peer, message)
         if missing is None:
             self.duplicates[message.array] += 1
-            return Arrival()
+            return Received()
         self.sequence_gaps[message.array] += missing
         if missing:
-            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # the node then sends them again
+            return Received(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # the node then sends them again
         if isinstance(message, Frame):
             peer.take(message)
-        return Arrival(message=message)
+        return Received(message=message)
 
     def _wrong_rate(self, peer: Peer, frame: Frame) -> str | None:
         """Return what is wrong with a frame's sampling rate; a backlog may have another rate than was announced."""
@@ -205,10 +205,10 @@ class Ingest:
         """Return the greetings of the nodes that have sent anything in the last `GONE_NS`."""
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.last_ns < GONE_NS]
 
-    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Arrival:
+    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Received:
         refusal = self._pretence(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
         if refusal is not None:
-            return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
+            return Received(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
         known = self._peers.get(routing_id)
         unaware = not hello.answers and (known is None or known.hello.answers)
@@ -229,10 +229,10 @@ class Ingest:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         reply = self._ack(peer)
         if same_run is None:
-            return Arrival(joined=hello, reply=reply, offer=offer)
+            return Received(joined=hello, reply=reply, offer=offer)
         before = same_run.hello
         news = hello.backlog != before.backlog or hello.answers != before.answers
-        return Arrival(greeted=hello if news else None, reply=reply, offer=offer)
+        return Received(greeted=hello if news else None, reply=reply, offer=offer)
 
     def _ack(self, peer: Peer) -> wire.Ack:
         final = [self.final_until[array] for array in peer.hello.arrays if array in self.final_until]
@@ -285,9 +285,9 @@ class Ingest:
                 return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
         return None
 
-    def _reject(self, error: wire.WireError, now_ns: int) -> Arrival:
+    def _reject(self, error: wire.WireError, now_ns: int) -> Received:
         self.malformed += 1
         if now_ns - self._notice_ns >= NOTICE_NS:
             self._notice_ns = now_ns
             _log.warning("message refused (%d so far): %s", self.malformed, error)
-        return Arrival()
+        return Received()

@@ -219,20 +219,20 @@ class Receiver:
                 return
             routing_id, data = address.bytes, b"".join(part.bytes for part in parts)
             enrolled = str(parts[0].get("User-Id")) if self._guarded else None
-            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
-            if arrival.joined is not None:
-                self._put(Joined(arrival.joined))
-            if arrival.greeted is not None:
-                self._put(Greeted(arrival.greeted))
-            if arrival.left is not None:
-                self._put(Left(arrival.left))
-            if arrival.message is not None:
-                self.arrivals.note(arrival.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
-                self._put(arrival.message)
-            if arrival.offer is not None:
-                self._reply(routing_id, arrival.offer)
-            if arrival.reply is not None:
-                self._reply(routing_id, arrival.reply)
+            received = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
+            if received.joined is not None:
+                self._put(Joined(received.joined))
+            if received.greeted is not None:
+                self._put(Greeted(received.greeted))
+            if received.left is not None:
+                self._put(Left(received.left))
+            if received.message is not None:
+                self.arrivals.note(received.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+                self._put(received.message)
+            if received.offer is not None:
+                self._reply(routing_id, received.offer)
+            if received.reply is not None:
+                self._reply(routing_id, received.reply)
 
     def _put(self, item: Item) -> None:
         while not self._stop.is_set():
