@@ -253,7 +253,7 @@ class Soak(World):
     def __enter__(self) -> Self:
         self._thread = threading.Thread(target=self.http.run, daemon=True)
         self._thread.start()
-        while not self.http._uvicorn.started:
+        while not self.http.uvicorn.started:
             time.sleep(0.01)
         return self
 
@@ -302,8 +302,8 @@ class Soak(World):
         """Wait until the server's loop has told all that it was given; else it would fall behind by hours."""
         if self.http.parts.failure is not None:
             raise RuntimeError("the server has failed") from self.http.parts.failure
-        assert self.http._loop is not None
-        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result()
+        assert self.http.loop is not None
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http.loop).result()
 
     def disturbances(self) -> Iterator[int]:
         """Do something bad, and say how many intervals shall pass before the next."""

@@ -24,7 +24,7 @@ THREE = {"arrays.east": EAST, "nodes.lab-pc.arrays": CHANNELS}
 
 
 def play(server: Server, true_site: Site, sounding: Scene) -> None:
-    """Send, live, what arrays that stand as a site says hear of a scene, to a server that may believe otherwise."""
+    """Send a scene live, as received by arrays in the places of one site, to a server whose site may differ."""
     start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
     parts = []
     for seed, spec in enumerate(true_site.specs):
@@ -36,7 +36,7 @@ def play(server: Server, true_site: Site, sounding: Scene) -> None:
     capture_recordings(node, "lab-pc", parts, CLOCK, "run-1", lambda: False)
 
 
-def test_a_turned_array_is_named_by_events_state_and_metrics() -> None:
+def test_turned_array_is_named_by_events_state_and_metrics() -> None:
     wrong = {**EAST, "orientation_deg": {"yaw": 40}}
     with running_server(site_of({**THREE, "arrays.east": wrong})) as server:
         play(server, site_of(THREE), scene(3))

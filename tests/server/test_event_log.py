@@ -79,7 +79,7 @@ class Desk:
 
 
 def event(first: int, last: int, *, id: str | None = None, x_m: float = 1.23456789, source: int = 1) -> Event:  # noqa: A002
-    """An event over these frame indices after the start, both included."""
+    """Return an event over these frame indices after the start, both included."""
     start_ns, end_ns = (START + first) * FRAME_NS, (START + last + 1) * FRAME_NS
     estimate = Estimate(start_ns, np.array([x_m, 2.0, 1.0]), np.eye(3) / 3, 0.9, ("north",))
     name = f"small-{first}" if id is None else id

@@ -50,7 +50,7 @@ def test_greeting_is_answered_with_what_is_known() -> None:
     assert again == Received(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
 
 
-def test_run_that_comes_back_by_another_connection_goes_on() -> None:
+def test_run_that_reconnects_goes_on() -> None:
     into = joined()
     tell(into, frame(4))
     assert tell(into, HELLO, b"p9").reply == Ack("run-1", {"north": 1003})
@@ -70,7 +70,7 @@ def test_new_run_counts_from_the_beginning() -> None:
 
 
 @pytest.mark.parametrize("message", [frame(), mark(), Bye("lab-pc", "run-1")])
-def test_stranger_is_asked_who_he_is(message: wire.WireMessage) -> None:
+def test_unknown_peer_is_requested_to_greet(message: wire.WireMessage) -> None:
     assert tell(ingest(), message) == Received(reply=WHO)
 
 
@@ -90,7 +90,7 @@ def test_gaps_in_the_sequence_are_counted() -> None:
     assert into.sequence_gaps == {"north": 3, "south": 0, "west": 0}
 
 
-def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
+def test_marks_reveal_lost_frames_and_are_no_loss_themselves() -> None:
     into = joined()
     for message in (mark(4, 1000), mark(4, 1005), frame(5, 1006), mark(5, 1007)):  # four marks were never sent
         assert tell(into, message).message is not None
@@ -148,7 +148,7 @@ OTHER = Hello("other-pc", "run-9", {"west": 16000.0})
         (replace(OTHER, arrays={"west": 6001.0}), None),
     ],
 )
-def test_who_may_join(hello: Hello, reason: str | None) -> None:
+def test_greeting_that_contradicts_the_site_is_refused(hello: Hello, reason: str | None) -> None:
     into = joined()
     said = refusal(into, hello)
     if reason is None:
@@ -169,7 +169,7 @@ def test_live_node_waits_for_a_replay_to_end() -> None:
     assert refusal(into, OTHER) is None
 
 
-def test_refused_node_may_come_when_the_place_is_free() -> None:
+def test_refused_node_may_join_when_its_place_is_free() -> None:
     into = joined()
     taken = replace(OTHER, arrays={"north": 16000.0})
     assert refusal(into, taken) is not None
@@ -188,14 +188,14 @@ def test_refused_node_may_come_when_the_place_is_free() -> None:
     ],
     ids=["nothing", "rubbish", "truncated", "acknowledgement", "array not announced", "rate not announced"],
 )
-def test_malformed_is_counted_and_changes_nothing(data: bytes) -> None:
+def test_malformed_message_is_counted_and_changes_nothing(data: bytes) -> None:
     into = joined()
     assert into.receive(b"p1", data, NOW) == Received()
     assert into.malformed == 1
     assert tell(into, frame(1)).message is not None
 
 
-def test_rubbish_is_noticed_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_messages_are_logged_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
     into = ingest()
     for k in range(100):
         into.receive(b"p1", b"rubbish", NOW + k)
@@ -206,7 +206,7 @@ def test_rubbish_is_noticed_once_a_minute(caplog: pytest.LogCaptureFixture) -> N
     assert "message refused (101 so far): " in caplog.text
 
 
-def test_problem_of_a_device_is_told_until_it_is_over() -> None:
+def test_problem_of_a_device_is_reported_until_it_is_over() -> None:
     into = joined()
     assert into.problem_of("north") is None
     tell(into, replace(HELLO, problem="unplugged"))
@@ -218,7 +218,7 @@ def test_problem_of_a_device_is_told_until_it_is_over() -> None:
     assert into.problem_of("north") is None
 
 
-def test_a_node_is_told_once_that_it_may_be_asked() -> None:
+def test_node_is_informed_once_that_the_server_may_request_frames() -> None:
     into = ingest()
     assert tell(into, HELLO).offer == Request("run-1")
     assert tell(into, HELLO).offer is None  # an older one that says nothing of it
@@ -239,7 +239,7 @@ def test_requests_go_to_nodes_that_know_them() -> None:
     assert into.requests(asks) == []
 
 
-def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
+def test_requested_frame_is_handed_on_and_not_counted() -> None:
     into = joined()
     tell(into, frame(1))
     asked = frame(0, frame_index=700, active=False)
@@ -250,13 +250,13 @@ def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
     assert into.acknowledgements(NOW + ACK_NS)[0][1].received == {"north": 1001}
 
 
-def test_request_of_a_node_is_refused() -> None:
+def test_request_from_a_node_is_refused() -> None:
     into = joined()
     tell(into, Request("run-1"))
     assert into.malformed == 1
 
 
-def test_settled_is_told_by_each_nodes_own_clock() -> None:
+def test_final_frame_index_is_acknowledged_by_each_nodes_own_clock() -> None:
     into = joined()
     into.final_until = {"north": 103, "south": 100}
     (_, ack), *_ = into.acknowledgements(NOW + ACK_NS)

@@ -156,7 +156,8 @@ class Server:
         self._on_event = on_event
         self._clock = clock
         self._stepped = stepped
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
+        """The event loop of HTTP and subscribers, while the server runs."""
         first_seq = clock.now_ns() // 1_000_000  # fewer than a message a millisecond, so no number comes twice
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
@@ -168,7 +169,8 @@ class Server:
             _compile_kernels()
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver)
             undo.pop_all()
-        self._uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
+        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
+        """The HTTP server."""
         self.endpoint = self.parts.receiver.endpoint
         """The address that nodes connect to."""
         self.url = url_of(self._listener, tls=certificate is not None)
@@ -195,26 +197,26 @@ class Server:
 
     def stop(self) -> None:
         """End `run`; from any thread."""
-        self._uvicorn.should_exit = True
+        self.uvicorn.should_exit = True
 
     def wait_idle(self) -> None:
         """Return when the running replay has ended and its last event is published."""
         self.parts.engine.wait_idle()
 
     async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()
         self.parts.receiver.start()
         self.parts.maps.start()
         if not self._stepped:
             self.parts.engine.start()
         tasks = [asyncio.create_task(work) for work in (self._watch(), self._expire(), self._refresh())]
         try:
-            await self._uvicorn.serve(sockets=[self._listener])
+            await self.uvicorn.serve(sockets=[self._listener])
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            self._loop = None
+            self.loop = None
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
@@ -255,7 +257,7 @@ class Server:
             self.parts.sinks.take(message)
             if self._on_event is not None:
                 self._on_event(message)
-        loop = self._loop
+        loop = self.loop
         if loop is None:
             return
         try:

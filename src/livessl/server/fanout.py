@@ -178,6 +178,11 @@ class Fanout:
         """Number of subscribers."""
         return len(self._subscriptions)
 
+    @property
+    def lags(self) -> bool:
+        """True if messages wait for any subscriber."""
+        return any(subscription.lags for subscription in self._subscriptions)
+
     def subscribe(self, wanted: Filter, since_seq: int | None = None) -> Subscription:
         """Return a new subscription, to end with `unsubscribe`; with `since_seq` it begins after that number."""
         subscription = Subscription(wanted)

@@ -181,6 +181,11 @@ class Receiver:
         self._socket.close()
         self._context.term()
 
+    @property
+    def queued(self) -> int:
+        """Number of items in the queue."""
+        return self._queue.qsize()
+
     def request(self, request: BackfillRequest) -> None:
         """Send a request for missing frames to the node of an array; from any thread."""
         self._requests.append(request)
@@ -244,7 +249,7 @@ class Receiver:
                 return
 
     def _acknowledge(self) -> None:
-        soon = self._queue.qsize() < BUSY_MESSAGES
+        soon = self.queued < BUSY_MESSAGES
         for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
             self._reply(routing_id, ack)
 
