@@ -183,7 +183,7 @@ def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
     """Nor ended before: the server may ask for what is remembered. But where it settles nothing it goes on."""
     clock, reached = Stuck(), dict[int, int]()
     with server() as there:
-        there.receiver.ingest.settled = dict.fromkeys(ARRAYS, FIRST + 20)
+        there.receiver.ingest.final_until = dict.fromkeys(ARRAYS, FIRST + 20)
 
         def note(end_ns: int) -> None:
             reached[clock.waited_ns] = end_ns - START_NS
