@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+from world import START, HandClock
 
 from livessl import wire
 from livessl.core.types import FRAME_NS
@@ -20,24 +21,7 @@ from livessl.server.store import Finalized, Store, StoreError
 from small_site import frame, mark, site_of
 
 SITE = site_of()
-START = 20 * 1_767_225_600
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
-
-
-class HandClock:
-    """Time that a test moves."""
-
-    def __init__(self) -> None:
-        self.time_ns = START * FRAME_NS
-
-    def now_ns(self) -> int:
-        return self.time_ns
-
-    def monotonic_ns(self) -> int:
-        return self.time_ns
-
-    def sleep_until_ns(self, time_ns: int) -> bool:
-        raise AssertionError("nothing here waits")
 
 
 class ReadOnlyStore(Store):

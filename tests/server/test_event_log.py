@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from world import START, HandClock
 
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Estimate, Event, Status
@@ -19,25 +20,8 @@ from livessl.server.store import Query, Store, StoreError
 from small_site import site_of
 
 SITE = site_of()
-START = 20 * 1_767_225_600
 MESSAGES = Messages(SITE, 0, utc=True)
 CLOCKS = {"b": 0.15}
-
-
-class HandClock:
-    """Time that a test moves."""
-
-    def __init__(self) -> None:
-        self.time_ns = START * FRAME_NS
-
-    def now_ns(self) -> int:
-        return self.time_ns
-
-    def monotonic_ns(self) -> int:
-        return self.time_ns
-
-    def sleep_until_ns(self, time_ns: int) -> bool:
-        raise AssertionError("nothing here waits")
 
 
 class FullStore(Store):

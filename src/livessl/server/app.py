@@ -26,7 +26,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
-from livessl.server.receiver import Receiver, Source
+from livessl.server.receiver import Inbox, Receiver
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
@@ -62,7 +62,7 @@ def assemble(
     sinks: Sinks,
     fanout: Fanout,
     publish: Callable[[JsonObject], None],
-    receiver: Source | None = None,
+    receiver: Inbox | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -70,7 +70,7 @@ def assemble(
     ----------
     publish : callable
         Gets every message for subscribers; called on the fusion thread.
-    receiver : Source or None
+    receiver : Inbox or None
         Stands in for the nodes' socket.
 
     Raises
@@ -118,7 +118,7 @@ class Server:
         Estimator, instead of the site's.
     on_event : callable or None
         Gets every event, as subscribers do; called on the fusion thread.
-    receiver : Source or None
+    receiver : Inbox or None
         Stands in for the nodes' socket.
     stepped : bool
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
@@ -140,7 +140,7 @@ class Server:
         *,
         method: str | None = None,
         on_event: Callable[[JsonObject], None] | None = None,
-        receiver: Source | None = None,
+        receiver: Inbox | None = None,
         stepped: bool = False,
     ) -> None:
         faults = open_doors(site)

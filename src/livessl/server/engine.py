@@ -16,7 +16,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.parallel import Parallel
 from livessl.server.publisher import Publisher
-from livessl.server.receiver import Greeted, Joined, Left, Source
+from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
 from livessl.site.models import Site
@@ -37,7 +37,7 @@ class Engine:
     ----------
     site : Site
     clock : Clock
-    receiver : Source
+    receiver : Inbox
     site_time : SiteTime
     array_states : ArrayStates
     event_log : EventLog
@@ -49,7 +49,7 @@ class Engine:
         self,
         site: Site,
         clock: Clock,
-        receiver: Source,
+        receiver: Inbox,
         site_time: SiteTime,
         array_states: ArrayStates,
         event_log: EventLog,

@@ -73,8 +73,8 @@ class Left:
 Item = Message | Joined | Greeted | Left
 
 
-class Source(Protocol):
-    """The nodes' side of a server: a `Receiver`, or its stand-in in a simulation."""
+class Inbox(Protocol):
+    """Where a server gets the nodes' messages from: a `Receiver`, or its stand-in in a simulation."""
 
     @property
     def ingest(self) -> Ingest:
