@@ -83,7 +83,7 @@ def test_final_event_with_the_same_answer_is_not_published_again(restart: bool) 
     desk.log.add_early(early, MESSAGES)
     [published] = desk.published
     later = restarted(desk, restart)
-    later.finish([replace(early, power=0.02)])  # not part of the answer
+    later.finish([replace(event(10, 19, x_m=1.23456), power=0.02)])  # differs by less than is published
     assert desk.published == [published]
     assert later.published == ([] if restart else [published])
     assert later.stored == [published]

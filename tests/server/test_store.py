@@ -250,14 +250,16 @@ def test_final_events_take_the_place_of_early_ones(tmp_path: Path) -> None:
     again.close()
 
 
-def test_file_without_the_table_of_clocks_is_read(tmp_path: Path) -> None:
-    Store(tmp_path / "events.db").close()
+def test_database_of_an_older_version_is_read(tmp_path: Path) -> None:
+    """Its table of the final pass has this very column, and it has no table of clocks."""
     with closing(sqlite3.connect(tmp_path / "events.db")) as db, db:
-        db.execute("DROP TABLE clocks")
+        db.execute("CREATE TABLE settled (site TEXT PRIMARY KEY, raster INTEGER)")
         db.execute("INSERT INTO settled VALUES ('lab', 1000)")
-    again = Store(tmp_path / "events.db")
-    assert again.finalized("lab") == (1000, None)
-    again.close()
+    store = Store(tmp_path / "events.db")
+    assert store.finalized("lab") == (1000, None)
+    store.finalize("lab", [(event(1), START_NS)], [], 2000, {"b": 0.15})
+    assert store.finalized("lab") == (2000, {"b": 0.15})
+    store.close()
 
 
 def test_finalize_is_all_or_nothing(tmp_path: Path) -> None:

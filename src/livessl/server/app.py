@@ -236,7 +236,7 @@ class Server:
                 self._access.replace(await asyncio.to_thread(read_tokens, path, missing_ok=True))
                 _log.info("%s has changed: %d tokens are in force", path, len(self._access.clients))
             except ConfigError as error:
-                _log.error("%s; the tokens of before stay in force", error)
+                _log.error("%s; the former tokens stay in force", error)
 
     async def _expire(self) -> None:
         """Delete events that are older than `store.retention_days`, again and again."""
