@@ -102,7 +102,7 @@ class Engine:
             if isinstance(item, Joined | Greeted | Left):
                 self._step(batch)
                 batch = []
-                self._meet(item)
+                self._handle(item)
             else:
                 batch.append(self._array_states.for_fusion(item))
         self._step(batch)
@@ -132,7 +132,8 @@ class Engine:
         self._begin(run)
         self._receiver.ingest.final_until = run.fusion.settled_of
 
-    def _meet(self, item: Joined | Greeted | Left) -> None:
+    def _handle(self, item: Joined | Greeted | Left) -> None:
+        """Take in that a node has joined, greeted again, or left."""
         if isinstance(item, Left):
             self._leave(item.hello)
             return

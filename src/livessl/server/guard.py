@@ -1,8 +1,8 @@
 """The guard of the nodes' socket: CURVE, and a handler of ZeroMQ's authentication protocol ZAP (RFC 27) on a thread.
 
-pyzmq's `ThreadAuthenticator` does not serve here: its callback does not get the caller's address, which the list of
-refusals needs; it sets the public key instead of the node's name as `User-Id`; it does not report that its thread has
-failed; and it does not see handshakes that fail before a key is shown, which only a socket monitor does.
+pyzmq's `ThreadAuthenticator` does not serve here. Its callback gets the key but not the caller's address, which the
+list of refusals needs; it does not report that its thread has failed; and handshakes that fail before a key is shown
+would need a socket monitor, on a thread of its own, anyway.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ Item = Message | Joined | Greeted | Left
 
 
 class Inbox(Protocol):
-    """Where a server gets the nodes' messages from: a `Receiver`, or its stand-in in a simulation."""
+    """The origin of the nodes' messages: a `Receiver`, or its stand-in in a simulation."""
 
     @property
     def ingest(self) -> Ingest:
