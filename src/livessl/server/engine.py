@@ -93,6 +93,7 @@ class Engine:
 
     def __init__(self, site: Site, clock: Clock, store: Store, publish: Callable[[JsonObject], None]) -> None:
         self._site = site
+        self._activity = site.activity_parameters()
         self._clock = clock
         self._store = store
         self._publish = publish
@@ -209,7 +210,7 @@ class Engine:
 
     def _array(self, status: ArrayStatus) -> JsonObject:
         ingest, settling = self._receiver.ingest, self._settling
-        described = array_status(status, self._site.node_of(status.name))
+        described = array_status(status, self._site.node_of(status.name), self._activity)
         counters: dict[str, int] = described["counters"]
         counters["duplicates"] = ingest.duplicates[status.name] + settling.duplicates.get(status.name, 0)
         counters["sequence_gaps"] = ingest.sequence_gaps[status.name]
