@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, WebSocketRoute, expect
 
 from browser import faultless_page, running_browser
 from livessl.capture.node import send_session
@@ -97,9 +98,39 @@ def test_page_claims_no_state_while_the_server_is_unreachable(browser: Browser) 
             page.goto(server.url)
             expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "starting", timeout=10_000)
         expect(page.get_by_test_id("banner")).to_contain_text("Server unreachable; reconnecting", timeout=10_000)
-        expect(page.get_by_test_id("connection")).to_have_text("disconnected")
+        expect(page.get_by_test_id("connection")).to_have_text("offline")
         expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "unknown")
         expect(page.get_by_test_id("array-north")).to_contain_text("was starting")
+
+
+@pytest.mark.parametrize(
+    ("missed", "notice"),
+    [
+        (37, "37 messages skipped (the client was too slow); event list reloaded"),
+        (1, "1 message skipped (the client was too slow); event list reloaded"),
+        (None, "Some messages skipped (the client was too slow); event list reloaded"),
+    ],
+)
+def test_page_reports_skipped_messages(browser: Browser, replayed: Server, missed: int | None, notice: str) -> None:
+    gap = json.dumps({"kind": "gap", "missed": missed, "reason": "the client was too slow"})
+
+    def pass_on_then_report(socket: WebSocketRoute) -> None:
+        server_side = socket.connect_to_server()
+
+        def pass_on(message: str | bytes) -> None:
+            socket.send(message)
+            if json.loads(message)["kind"] == "hello":
+                socket.send(gap)
+
+        server_side.on_message(pass_on)
+
+    with faultless_page(browser) as page:
+        page.route_web_socket("**/api/v1/live*", pass_on_then_report)
+        page.goto(replayed.url)
+        expect(page.get_by_test_id("gap")).to_contain_text(notice, timeout=10_000)
+        expect(page.get_by_test_id("event")).to_have_count(2)
+        page.get_by_role("button", name="Dismiss").click()
+        expect(page.get_by_test_id("gap")).to_be_hidden()
 
 
 def test_page_opens_an_event_s_details(browser: Browser, replayed: Server) -> None:

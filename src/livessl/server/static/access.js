@@ -1,4 +1,4 @@
-// Requests to the server, with an access token where the server requires one. The token is kept as long as the browser tab.
+// Requests to the server, with an access token where the server requires one; the browser tab keeps the token.
 
 const STORAGE_KEY = "livessl-token";
 /** Longest wait for an answer, in milliseconds. */
@@ -16,7 +16,7 @@ export function useToken(token) {
   sessionStorage.setItem(STORAGE_KEY, token);
 }
 
-/** The protocols to open a WebSocket with. Browsers cannot add headers to a WebSocket, so a protocol carries the token. */
+/** The protocols to open a WebSocket with: one carries the token, because browsers add no headers to a WebSocket. */
 export function protocols() {
   const token = sessionStorage.getItem(STORAGE_KEY);
   return token === null ? [] : ["livessl", `livessl.token.${token}`];
@@ -32,7 +32,8 @@ export const put = (url, value) =>
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
-  const response = await fetch(url, { ...options, cache: "no-store", headers, signal: AbortSignal.timeout(TIMEOUT_MS) });
+  const signal = AbortSignal.timeout(TIMEOUT_MS);
+  const response = await fetch(url, { ...options, cache: "no-store", headers, signal });
   if (response.status === 401) tokenNeeded(token !== null);
   return response;
 }

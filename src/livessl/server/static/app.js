@@ -166,8 +166,8 @@ function forgetResults() {
 function announce(event) {
   if (performance.now() - announcedAt < ANNOUNCE_MS) return;
   announcedAt = performance.now();
-  const placed = event.status === "located" && event.position_m;
-  write(find("announce"), `Event at ${when(event, model.serverNow())}: ${placed ? position(event.position_m) : verdict(event)}`);
+  const what = event.status === "located" && event.position_m ? position(event.position_m) : verdict(event);
+  write(find("announce"), `Event at ${when(event, model.serverNow())}: ${what}`);
 }
 
 function askForToken(sent) {

@@ -1,4 +1,4 @@
-// The arrays panel: a card per array with its state, its level against the activity threshold, and the age of its last data.
+// The arrays panel: a card per array with its state, its level beside the activity threshold, and the age of its data.
 
 import { stateIcon } from "./array-icons.js";
 import { el, write } from "./dom.js";
@@ -7,6 +7,7 @@ import { shownState } from "./model.js";
 
 /** Level at the left end of the level bar, in dBFS. */
 const LEAST_DBFS = -96;
+const BAR_LEGEND = "Hatched: noise floor. Line: activity threshold, from which on a frame counts as sound.";
 /** Clock offset, in seconds, beyond which it is shown as a problem: one frame, as the server judges it. */
 const FRAME_S = 0.05;
 /** The API's counters of problems, in words; their count precedes them. */
@@ -81,8 +82,9 @@ export class ArraysPanel {
       facts: el("ul", { className: "facts" }),
       bars: [],
     };
-    card.bar = el("div", { className: "level", role: "meter", "aria-label": `level of ${name}`, "aria-valuemin": LEAST_DBFS, "aria-valuemax": 0 },
-      card.noise, card.fill, card.threshold);
+    card.bar = el("div", {
+      className: "level", role: "meter", "aria-label": `level of ${name}`, "aria-valuemin": LEAST_DBFS, "aria-valuemax": 0,
+    }, card.noise, card.fill, card.threshold);
     card.root = el("li", { className: "array", "data-testid": `array-${name}` },
       el("div", { className: "array-head" }, card.icon, el("h3", { text: name }), card.word, card.age, card.button),
       card.reason,
@@ -117,7 +119,7 @@ export class ArraysPanel {
     const text = level === null ? "no level" : `${number(level, 1)} dBFS`;
     card.bar.setAttribute("aria-valuenow", level === null ? LEAST_DBFS : level.toFixed(1));
     card.bar.setAttribute("aria-valuetext", text);
-    card.bar.title = threshold === null ? "" : "Hatched: noise floor. Line: activity threshold, above which a frame counts as sound.";
+    card.bar.title = threshold === null ? "" : BAR_LEGEND;
     write(card.level, text);
     write(card.context, threshold === null ? "" : `noise ${number(noise, 0)}, threshold ${number(threshold, 0)}`);
   }
@@ -154,21 +156,28 @@ function facts({ drift_ppm: drift, clock, clock_offset: offset, sample_rate_hz: 
   const found = [];
   const add = (text, title, problem = false) => found.push({ text, title, problem });
   if (drift !== null) add(`drift ${signed(drift, 1)} ppm`, "Speed of the device's clock relative to the server's time");
-  if (clock !== null) add(`clock ${clock}`, "State of the fit of the device's clock to the server's time", clock === "stepped");
-  if (offset !== null) add(offsetText(offset), "Clock offset, measured from events that several arrays detected", Math.abs(offset.offset_s) > FRAME_S);
+  if (clock !== null) add(`clock ${clock}`, "State of the device's clock against the server's time", clock === "stepped");
+  if (offset !== null) add(offsetText(offset), "Clock offset measured from events", Math.abs(offset.offset_s) > FRAME_S);
   if (rate !== null) add(`${number(rate / 1000, 2)} kHz`, "Sample rate of the device");
   if (node !== null) add(`node ${node}`, "The capture node that sends this array's sound");
-  if (agreed + disagreed > 0) add(`consistent in ${agreed} of ${agreed + disagreed} events`, "Of the last events detected by three or more arrays", disagreed > agreed);
+  if (agreed + disagreed > 0) {
+    const text = `consistent in ${agreed} of ${agreed + disagreed} events`;
+    add(text, "Agreement with the other arrays in the last events of three or more arrays", disagreed > agreed);
+  }
   add(counted(frames, "frame"), "Messages that carry 50 ms of sound");
   add(counted(marks, "mark"), "Messages that report a quiet interval without its sound");
   if (backfilled > 0) add(counted(backfilled, "frame") + " backfilled", "Frames that the node had kept and sent later");
-  if (asked > 0) add(`${counted(asked, "backfill request")}, ${helped} used`, "Requests for frames of events that this array did not detect itself");
+  if (asked > 0) {
+    const text = `${counted(asked, "backfill request")}, ${helped} used`;
+    add(text, "Requests for frames of events that this array did not detect itself");
+  }
   return found;
 }
 
 function offsetText({ offset_s: offset, std_s: std, sounds, reference }) {
   if (std === 0) return "reference clock";
-  return `${signed(1000 * offset, 0)} ± ${number(1000 * std, 0)} ms relative to ${reference} (${counted(sounds, "event")})`;
+  const ms = `${signed(1000 * offset, 0)} ± ${number(1000 * std, 0)} ms`;
+  return `${ms} relative to ${reference} (${counted(sounds, "event")})`;
 }
 
 /** Show facts, objects { text, title, problem }, in a list. */

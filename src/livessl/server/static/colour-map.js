@@ -1,16 +1,20 @@
-// Power maps as coloured images that fade with age, and the colour scale: lightness grows evenly away from the background's.
+// Power maps as coloured images that fade with age; their colour scale changes evenly in lightness.
 
 /** Anchors [place, lightness, chroma, hue in degrees] in OKLCh, a colour space in which equal steps look equal. */
 const SCALES = {
-  dark: [[0, 0.175, 0.014, 258], [0.25, 0.31, 0.1, 290], [0.5, 0.47, 0.165, 352], [0.75, 0.69, 0.165, 405], [1, 0.95, 0.085, 458]],
-  light: [[0, 0.985, 0.004, 95], [0.25, 0.9, 0.07, 88], [0.5, 0.75, 0.14, 58], [0.75, 0.55, 0.18, 18], [1, 0.3, 0.12, -45]],
+  dark: [
+    [0, 0.175, 0.014, 258], [0.25, 0.31, 0.1, 290], [0.5, 0.47, 0.165, 352], [0.75, 0.69, 0.165, 405], [1, 0.95, 0.085, 458],
+  ],
+  light: [
+    [0, 0.985, 0.004, 95], [0.25, 0.9, 0.07, 88], [0.5, 0.75, 0.14, 58], [0.75, 0.55, 0.18, 18], [1, 0.3, 0.12, -45],
+  ],
 };
 /** Ages, in milliseconds, at which a map begins to fade and at which it is gone. */
 const FADE_FROM_MS = 1000;
 const FADE_TO_MS = 9000;
 /** Steps of the colour scale, as many as levels in a map message. */
 const STEPS = 256;
-/** Opacity gained per step of the scale, so that the lowest levels fade into the background instead of ending at an edge. */
+/** Opacity, of 255, gained per step of the scale, so that the lowest levels fade into the background. */
 const OPACITY_PER_STEP = 8;
 
 const gamma = (c) => (c <= 0.0031308 ? 12.92 * c : 1.055 * c ** (1 / 2.4) - 0.055);

@@ -9,7 +9,8 @@ export function el(tag, { className, text, ...attributes } = {}, ...children) {
   if (className) element.className = className;
   if (text !== undefined) element.textContent = text;
   for (const [name, value] of Object.entries(attributes)) {
-    if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value === true ? "" : value);
+    const absent = value === null || value === undefined || value === false;
+    if (!absent) element.setAttribute(name, value === true ? "" : value);
   }
   element.append(...children.filter((child) => child !== null && child !== undefined));
   return element;

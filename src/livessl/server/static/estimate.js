@@ -45,7 +45,9 @@ export class Readout {
   /** Show nothing, as before the first sound. */
   clear(link) {
     this.shown = null;
-    this.#fill({ kind: "", eventId: "", status: "", positionM: null, sigma: "–", confidence: null, level: "–", arrays: "–" });
+    this.#fill({
+      kind: "", eventId: "", status: "", positionM: null, sigma: "–", confidence: null, level: "–", arrays: "–",
+    });
     this.where.hidden = false;
     this.instead.hidden = true;
     this.root.dataset.state = "waiting";

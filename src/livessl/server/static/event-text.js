@@ -21,7 +21,11 @@ export function summary(event, nowMs) {
   return [
     el("span", { className: "when", text: when(event, nowMs) }),
     where(event, located),
-    el("span", { className: "sigma", text: located && sigma !== null ? `± ${number(sigma)} m` : "", title: "Standard deviation along the axis of largest uncertainty" }),
+    el("span", {
+      className: "sigma",
+      text: located && sigma !== null ? `± ${number(sigma)} m` : "",
+      title: "Standard deviation along the axis of largest uncertainty",
+    }),
     el("span", { className: "trust", title: "Confidence: how reliable the position is" },
       el("span", { className: "meter", "aria-hidden": "true" }, meter),
       el("span", { className: "percent", text: percent(event.confidence) })),
@@ -37,7 +41,8 @@ function where({ position_m: place, status, contributions }, located) {
     return el("span", { className: "where" }, ...coordinates, el("i", { text: "m" }));
   }
   const first = contributions?.[0];
-  const text = status === "direction-only" && first ? `azimuth ${number(first.azimuth_deg, 0)}° from ${first.array}` : "no position";
+  const directed = status === "direction-only" && first;
+  const text = directed ? `azimuth ${number(first.azimuth_deg, 0)}° from ${first.array}` : "no position";
   return el("span", { className: "where without", text });
 }
 
@@ -53,7 +58,8 @@ function withRequest(name, { contributions }) {
 
 /** The elements of an event's details. */
 export function details(event) {
-  const sigmas = event.covariance_m2?.map((row, axis) => `${"xyz"[axis]} ${number(Math.sqrt(Math.max(0, row[axis])))}`).join("  ");
+  const sigma = (row, axis) => number(Math.sqrt(Math.max(0, row[axis])));
+  const sigmas = event.covariance_m2?.map((row, axis) => `${"xyz"[axis]} ${sigma(row, axis)}`).join("  ");
   const list = el("dl", {},
     entry("position", event.position_m && position(event.position_m), "wide"),
     entry("error (1 σ)", sigmas && `${sigmas} m`, "wide"),
@@ -82,7 +88,11 @@ function contributionTable(event) {
   const rows = event.contributions.map((c) => {
     const outlier = c.agrees === false ? ` (outlier by ${number(c.off_deg, 0)}°)` : "";
     const values = [
-      number(c.active_s), number(c.level_dbfs, 1), `${number(c.azimuth_deg, 1)}°`, `${number(c.elevation_deg, 1)}°`, `${number(c.distance_m)} m`,
+      number(c.active_s),
+      number(c.level_dbfs, 1),
+      `${number(c.azimuth_deg, 1)}°`,
+      `${number(c.elevation_deg, 1)}°`,
+      `${number(c.distance_m)} m`,
     ];
     return el("tr", {},
       el("th", { text: withRequest(c.array, event) + outlier, scope: "row" }),

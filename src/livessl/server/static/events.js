@@ -18,7 +18,7 @@ export class EventList {
     list.addEventListener("keydown", (event) => this.#walk(event));
   }
 
-  /** Insert stored events, newest first, below those in `arrivedIds`, which arrived after the stored ones were requested. */
+  /** Insert stored events, newest first, below those in `arrivedIds`, which arrived after the request for them. */
   load(events, arrivedIds, nowMs) {
     const stored = new Set(events.map(({ id }) => id));
     const others = [...this.rows.values()].filter((row) => !stored.has(row.event.id));
@@ -30,7 +30,11 @@ export class EventList {
     this.#trim();
   }
 
-  /** Insert an event, at the top or, if it is late, by its time; it takes the place of its earlier version and of what it replaces. */
+  /**
+   * Insert an event: at the top or, if it is late, by its time.
+   *
+   * It takes the place of its earlier version, if there is one; the events that it replaces are removed.
+   */
   add(event, nowMs) {
     for (const id of event.replaces ?? []) this.#remove(id);
     const before = this.rows.get(event.id);
@@ -59,7 +63,8 @@ export class EventList {
   #trim() {
     for (const [id] of [...this.rows].slice(MOST_ROWS)) this.#remove(id);
     this.empty.hidden = this.rows.size > 0;
-    this.count.textContent = this.rows.size === MOST_ROWS ? `last ${MOST_ROWS}` : this.rows.size ? String(this.rows.size) : "";
+    const full = this.rows.size === MOST_ROWS;
+    this.count.textContent = full ? `last ${MOST_ROWS}` : String(this.rows.size || "");
   }
 
   #row(event, nowMs) {
@@ -67,7 +72,9 @@ export class EventList {
     if (known && JSON.stringify(known.event) === JSON.stringify(event)) return known;
     const [x, y, z] = event.position_m ?? [null, null, null];
     const opened = el("div", { className: "details", hidden: true, id: `details-${event.id}` });
-    const button = el("button", { className: "summary", type: "button", "aria-expanded": "false", "aria-controls": opened.id }, ...summary(event, nowMs));
+    const button = el("button", {
+      className: "summary", type: "button", "aria-expanded": "false", "aria-controls": opened.id,
+    }, ...summary(event, nowMs));
     const root = el("li", {
       className: "event", "data-event-id": event.id, "data-status": event.status, "data-testid": "event",
       "data-x": x, "data-y": y, "data-z": z,

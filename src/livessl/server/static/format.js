@@ -3,7 +3,9 @@
 const MINUS = "\u2212";
 const NARROW_SPACE = "\u202f";
 /** The API's latency stages, in words. */
-const STAGES = { waited: "silence after the sound", sent: "capture node", received: "network", located: "localization" };
+const STAGES = {
+  waited: "silence after the sound", sent: "capture node", received: "network", located: "localization",
+};
 
 /** A number with a true minus sign, or an en dash for a missing value. */
 export function number(value, digits = 2) {
@@ -39,7 +41,8 @@ export function milliseconds(seconds) {
 
 /** A result's latency stages as text: name and time of each. */
 export function stageText(stages) {
-  return Object.entries(stages).map(([stage, seconds]) => `${STAGES[stage] ?? stage} ${milliseconds(seconds)}`).join(", ");
+  const each = Object.entries(stages).map(([stage, seconds]) => `${STAGES[stage] ?? stage} ${milliseconds(seconds)}`);
+  return each.join(", ");
 }
 
 /** A short form of a time span in milliseconds before now. */
@@ -66,13 +69,18 @@ export function clock(ms, tenths = true) {
   return tenths ? `${text}.${Math.floor(t.getMilliseconds() / 100)}` : text;
 }
 
-/** When an event began: the time of day, with the date if it is not today's; or seconds into a recording without a date. */
+/**
+ * When an event began: the time of day, with the date if it is not today's.
+ *
+ * In a recording without a date it is the number of seconds from the recording's start.
+ */
 export function when(event, nowMs) {
   const ms = utc(event.time_utc);
   if (ms === null) return `${number(event.start_s, 2)} s`;
   const day = new Date(ms);
   const today = new Date(nowMs).toDateString() === day.toDateString();
-  return today ? clock(ms) : `${day.getFullYear()}-${twoDigits(day.getMonth() + 1)}-${twoDigits(day.getDate())} ${clock(ms)}`;
+  const date = [day.getFullYear(), twoDigits(day.getMonth() + 1), twoDigits(day.getDate())].join("-");
+  return today ? clock(ms) : `${date} ${clock(ms)}`;
 }
 
 /** Milliseconds since the epoch of an RFC 3339 text, or null. */

@@ -1,14 +1,14 @@
 // The bar at the top: site, mode, privacy, latency, array count, server time and connection; and the notices below it.
 
 import { find, write } from "./dom.js";
-import { clock, duration, milliseconds, stageText } from "./format.js";
+import { clock, counted, duration, milliseconds, stageText } from "./format.js";
 import { shownState } from "./model.js";
 
 /** How long, in milliseconds, the notice of skipped messages stays. */
 const NOTICE_MS = 20000;
 /** Time, in milliseconds, that the first connection may take before the page reports a problem. */
 const FIRST_CONTACT_MS = 1000;
-const LINK_WORDS = { live: "connected", stale: "stale", down: "disconnected" };
+const LINK_WORDS = { live: "connected", stale: "stale", down: "offline" };
 
 export class Header {
   constructor() {
@@ -31,7 +31,8 @@ export class Header {
     const positionsOnly = mode === "positions-only";
     const chip = find("privacy");
     chip.hidden = !positionsOnly && days === null;
-    write(chip, [positionsOnly ? "positions only" : null, days === null ? null : `kept ${days} d`].filter(Boolean).join(" · "));
+    const words = [positionsOnly ? "positions only" : null, days === null ? null : `kept ${days} d`];
+    write(chip, words.filter(Boolean).join(" · "));
     const sound = positionsOnly ? "No sound is stored" : "Sound may be recorded";
     chip.title = `${sound}. Events are ${days === null ? "never deleted" : `deleted after ${days} days`}.`;
   }
@@ -42,9 +43,9 @@ export class Header {
     const each = kinds.map(([name, results]) => `${name} ${milliseconds(median(results.map((one) => one.latency_s)))}`);
     write(find("vital-latency"), each.join(" · ") || "–");
     find("vital-latency").title = kinds.map(([name, results]) => {
-      const stages = results.map((one) => one.latency_stages_s).filter(Boolean);
-      if (stages.length === 0) return "";
-      return `${name}: ${stageText(Object.fromEntries(Object.keys(stages[0]).map((stage) => [stage, median(stages.map((one) => one[stage]))])))}`;
+      const all = results.map((one) => one.latency_stages_s).filter(Boolean);
+      const medians = Object.keys(all[0] ?? {}).map((stage) => [stage, median(all.map((stages) => stages[stage]))]);
+      return medians.length > 0 ? `${name}: ${stageText(Object.fromEntries(medians))}` : "";
     }).filter(Boolean).join("\n");
   }
 
@@ -54,14 +55,16 @@ export class Header {
     write(find("connection-word"), link === "down" && silentMs === null ? "connecting" : LINK_WORDS[link]);
     find("banner").hidden = link === "live" || (silentMs === null && performance.now() < FIRST_CONTACT_MS);
     write(find("banner-text"), link === "stale" ? "No message from the server" : "Server unreachable; reconnecting");
-    write(find("banner-for"), silentMs === null ? "" : link === "stale" ? ` for ${duration(silentMs / 1000)}` : ` (last contact ${duration(silentMs / 1000)} ago)`);
+    const silence = silentMs === null ? null : duration(silentMs / 1000);
+    const suffix = link === "stale" ? ` for ${silence}` : ` (last contact ${silence} ago)`;
+    write(find("banner-for"), silence === null ? "" : suffix);
   }
 
   /** Report that messages were skipped; `missed` is null where the server does not know how many. */
   showGap({ missed, reason }) {
     this.skipped = missed === null || this.skipped === null ? null : this.skipped + missed;
-    const what = this.skipped === null ? "Some messages were" : this.skipped === 1 ? "1 message was" : `${this.skipped} messages were`;
-    write(find("gap-text"), `${what} skipped${reason ? ` (${reason})` : ""}. The event list has been reloaded.`);
+    const what = this.skipped === null ? "Some messages" : counted(this.skipped, "message");
+    write(find("gap-text"), `${what} skipped${reason ? ` (${reason})` : ""}; event list reloaded`);
     find("gap").hidden = false;
     clearTimeout(this.noticeTimer);
     this.noticeTimer = setTimeout(() => this.#closeNotice(), NOTICE_MS);

@@ -14,9 +14,9 @@ const BACK_OFF_MS = [500, 800, 1300, 2100, 3400, 5000];
 /**
  * One WebSocket that reconnects for ever.
  *
- * `onMessage(message)` gets each parsed message. `onState(state, silentMs)` is called at every tick and change: state is
- * "live", "stale" (open, but silent) or "down"; `silentMs` is null before the first message ever. `onRejected()` is
- * called when a connection closes before its first message; browsers do not reveal why.
+ * `onMessage(message)` gets each parsed message. `onState(state, silentMs)` is called at every tick and change; `state`
+ * is "live", "stale" (open, but silent) or "down", and `silentMs` is null before the first message ever. `onRejected()`
+ * is called when a connection closes before its first message; browsers do not reveal why.
  */
 export class Live {
   constructor(url, { onMessage, onState, onRejected }) {

@@ -7,13 +7,15 @@ const MAGIC = 0x50414d4c; // "LMAP", little-endian
 const VIEWS = ["floor", "side", "front"];
 
 /** A map of one view from its binary message; docs/api.md describes the header. */
-export function unpack(bytes) {
+function unpack(bytes) {
   const view = new DataView(bytes);
   if (view.getUint32(0, true) !== MAGIC) throw new Error("map message: expected the magic number LMAP");
   const headerLength = view.getUint16(6, true);
   const [rows, columns] = [44, 46].map((at) => view.getUint16(at, true));
   const expected = headerLength + rows * columns;
-  if (bytes.byteLength !== expected) throw new Error(`map message: expected ${expected} bytes, got ${bytes.byteLength}`);
+  if (bytes.byteLength !== expected) {
+    throw new Error(`map message: expected ${expected} bytes, got ${bytes.byteLength}`);
+  }
   const [bottom, top, left, right] = [28, 32, 36, 40].map((at) => view.getFloat32(at, true));
   return {
     view: VIEWS[view.getUint8(5)],

@@ -43,7 +43,8 @@ export class MapPanel {
     const values = ["fused", ...names];
     if (values.join("\n") === [...this.select.options].map(({ value }) => value).join("\n")) return;
     const chosen = values.includes(this.select.value) ? this.select.value : "fused";
-    this.select.replaceChildren(...values.map((name) => new Option(name === "fused" ? "all arrays" : `${name} only`, name)));
+    const label = (name) => (name === "fused" ? "all arrays" : `${name} only`);
+    this.select.replaceChildren(...values.map((name) => new Option(label(name), name)));
     this.select.value = chosen;
     if (this.feed.choice !== chosen) this.#choose(chosen);
   }

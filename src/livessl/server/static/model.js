@@ -5,7 +5,7 @@ import { ServerClock } from "./server-clock.js";
 
 /** Age, in milliseconds, beyond which an estimate is drawn as old. */
 export const OLD_MS = 10000;
-/** Results that arrive within this many milliseconds of their sound's end count as new: the rest is transport and clock error. */
+/** Delay, in milliseconds, up to which a result counts as new: transport and errors of the clock explain as much. */
 export const LATE_MS = 3000;
 /** How long, in milliseconds, the marker of a sound in progress stays without a further update. */
 const UPDATE_SHOWN_MS = 1500;
@@ -205,7 +205,9 @@ function marker(message, bornMs) {
     status: message.status ?? "located",
     position: message.position_m,
     covariance: message.covariance_m2,
-    rays: (message.contributions ?? []).map((c) => ({ array: c.array, azimuth: c.azimuth_deg, elevation: c.elevation_deg })),
+    rays: (message.contributions ?? []).map(({ array, azimuth_deg: azimuth, elevation_deg: elevation }) => (
+      { array, azimuth, elevation }
+    )),
     bornMs,
   };
 }

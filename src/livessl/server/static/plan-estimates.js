@@ -1,4 +1,4 @@
-// Layers of a plan that show results: estimates with their uncertainty, directions, tracks, and the trail of past estimates.
+// Layers of a plan that show results: estimates with their uncertainty, directions, tracks and past estimates.
 
 import { number } from "./format.js";
 import { direction, ellipse95, rayEnd } from "./geometry.js";

@@ -27,7 +27,8 @@ export class Plan {
     this.size = null;
     canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
       const metres = this.#under(offsetX, offsetY);
-      write(pointer, metres ? metres.map((value, index) => `${this.axisNames[index]} ${number(value)}`).join("  ") : "");
+      const words = metres?.map((value, index) => `${this.axisNames[index]} ${number(value)}`);
+      write(pointer, words?.join("  ") ?? "");
     });
     canvas.addEventListener("pointerleave", () => write(pointer, ""));
   }
@@ -83,7 +84,8 @@ export class Plan {
     });
     for (const array of scene.arrays) drawArray(this, array);
     const { highlight } = scene;
-    for (const estimate of scene.estimates) if (estimate.id !== highlight?.id) drawEstimate(this, estimate, scene, false);
+    const others = scene.estimates.filter(({ id }) => id !== highlight?.id);
+    for (const estimate of others) drawEstimate(this, estimate, scene, false);
     if (highlight) drawEstimate(this, highlight, scene, true);
   }
 
@@ -147,7 +149,7 @@ export class Plan {
   }
 }
 
-/** Draw a scene on both plans: at one scale, so that they read as one drawing, unless that would waste a view's space. */
+/** Draw a scene on both plans, at one scale if that wastes no view's space, so that they read as one drawing. */
 export function drawTogether(plans, size, scene, colours) {
   const fits = plans.map((plan) => plan.fit(size));
   const common = Math.min(...fits);

@@ -1,6 +1,6 @@
 // An estimate of the server's time from the browser's clock and the time stamps of messages.
 
-/** Span of time, in milliseconds, whose time stamps are used: long enough to contain an undelayed message, short enough to follow drift. */
+/** Time span, in milliseconds, of the stamps in use: some message in it was not delayed, and clocks drift little in it. */
 const WINDOW_MS = 60000;
 /** Most time stamps used: a minute of the two messages a second that carry one. */
 const MOST_STAMPS = 120;
