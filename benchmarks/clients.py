@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from livessl.clock import SystemClock, utc_text
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 from livessl.server.app import Server
-from livessl.site_file import parse_site
+from livessl.site.load import parse_site
 
 SITE: Final = """
 site: many-clients

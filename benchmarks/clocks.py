@@ -17,16 +17,17 @@ from typing import Any, Final
 import numpy as np
 import soundfile
 
-from livessl.capture.devices import Placed, WavRecording
-from livessl.capture.line import played_messages
-from livessl.capture.recorded import Part, lines_of
 from livessl.clock import UnpacedClock
-from livessl.config import Site
-from livessl.core.clock_offsets import ClockOffset
+from livessl.core.stream.clock_offsets import ClockOffset
 from livessl.core.types import Block, Event, Output, Status
-from livessl.demo import SITE_FILE
+from livessl.lab.demo import SITE_FILE
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import Placed, WavRecording
 from livessl.simulate.scene import Scene, make_scene, read_sounds, render
-from livessl.site_file import load_site
+from livessl.site.build.fusion import make_fusion
+from livessl.site.load import load_site
+from livessl.site.models import Site
 from recordings import CLASSES, DATA
 
 RATE_HZ: Final = 16000.0
@@ -95,12 +96,12 @@ def heard_with(
             start_ns += round(offset_s * 1e9)
         placed = Placed(Drifting(recording, drift_ppm if array == late else 0.0), start_ns)
         parts.append(Part(array, placed, tuple(range(1, 5))))
-    fusion = site.make_fusion(updates=False)
+    fusion = make_fusion(site, updates=False)
     if not corrected:
         fusion.clock_offsets = None
     outputs: list[Output] = []
     now_ns = 0
-    for now_ns, batch in played_messages(*lines_of(site, parts), UnpacedClock()):
+    for now_ns, batch in played_messages(*pipelines_of(site, parts), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     outputs += fusion.flush(now_ns)
     known = {status.name: status.clock_offset for status in fusion.status(now_ns)}

@@ -20,13 +20,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import machine
-from livessl.bench.kernels import C_M_S, KINDS, PLACES_M, RATE_HZ, Blocks, array_specs
-from livessl.core.gcc import GCCPhat
+from livessl.cli.progress import counted
+from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.kernels import kernels
-from livessl.core.search import MOST_LOOK_UPS, PeakSearch, Rule
-from livessl.core.srp import SRPMapper
-from livessl.core.types import Float32Array, HeardBy
-from livessl.progress import counted
+from livessl.core.locate.peak_search import MOST_LOOK_UPS, PeakSearch, Rule
+from livessl.core.locate.srp import SRPMapper
+from livessl.core.types import Evidence, Float32Array
+from livessl.lab.bench.kernels import C_M_S, KINDS, PLACES_M, RATE_HZ, Blocks, array_specs
 from peers import room_grid
 
 COUNTS: Final = (2, 3, 4, 6, 8)
@@ -65,7 +65,7 @@ def compare(
         for kind in KINDS:
             for number in range(sounds):
                 heard = [
-                    HeardBy(s, make([x])) for s, make, x in zip(specs, gcc, blocks.sound(kind, number), strict=True)
+                    Evidence(s, make([x])) for s, make, x in zip(specs, gcc, blocks.sound(kind, number), strict=True)
                 ]
                 maps = [mapper(one.gcc) for mapper, one in zip(mappers, heard, strict=True)]
                 for rule in Rule:

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from websockets.asyncio.client import connect
 
-from livessl.bench import load
 from livessl.clock import SystemClock
 from livessl.core.types import Contribution, Estimate, Status, Update
-from livessl.messages import JsonObject, Messages, Stages
+from livessl.lab.bench import load
+from livessl.server.api.encode import JsonObject, Messages, Stages
 from livessl.server.app import Server
-from livessl.server.hub import LAGGING
-from livessl.site_file import parse_site
+from livessl.server.fanout import LAGGING
+from livessl.site.load import parse_site
 
 CLOCK = SystemClock()
 
@@ -68,7 +68,7 @@ async def _one(socket: Any, seconds: float) -> tuple[int, int]:
 
 async def tell(server: Server, message: JsonObject, until_ns: int) -> int:
     """Tell updates as fast as the clients are sent them, a burst at a time; returns how many."""
-    hub, told = server._hub, 0
+    hub, told = server.parts.fanout, 0
     while CLOCK.monotonic_ns() < until_ns:
         for _ in range(LAGGING // 2):
             hub.publish(message, CLOCK.monotonic_ns())

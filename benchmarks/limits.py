@@ -15,15 +15,15 @@ from typing import Final
 import numpy as np
 import scipy.fft
 
-from livessl.core.estimators import ESTIMATORS, Estimator, Sound
-from livessl.core.frontends import Spectra
-from livessl.core.onset import _STRONGEST, OnsetFrontEnd, OnsetGCC
+from livessl.core.correlate.onset_gcc import _STRONGEST, OnsetFrontEnd, OnsetGCC
+from livessl.core.correlate.spectra import Spectra
+from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
-from livessl.evaluate.campaign import read_clips
-from livessl.evaluate.command import HALVES
-from livessl.evaluate.localizer import LEAD_S, PRE_ROLL_FRAMES, _active
-from livessl.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M, pair
-from livessl.evaluate.unit import PEAK, convolved
+from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.command import HALVES
+from livessl.lab.evaluate.localizer import LEAD_S, PRE_ROLL_FRAMES, _active
+from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M, pair
+from livessl.lab.evaluate.unit import PEAK, convolved
 from livessl.simulate.room import impulse_responses
 
 RATE_HZ: Final = 16000.0

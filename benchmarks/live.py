@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from livessl.bench import live
-from livessl.cli import main as livessl
+from livessl.cli.main import main as livessl
 from livessl.clock import SystemClock
-from livessl.core import estimators
-from livessl.core.estimators import Localization, PowerMaps, Sound
 from livessl.core.geometry import Grid
-from livessl.core.types import ArraySpec, HeardBy
+from livessl.core.locate import estimators
+from livessl.core.locate.estimators import Localization, PowerMaps, Sound
+from livessl.core.types import ArraySpec, Evidence
+from livessl.lab.bench import live
 from livessl.server.engine import Engine
 
 
@@ -51,7 +51,7 @@ class Nowhere:
         loudest = max(float(segment.max()) for sound in sounds.values() for segment in sound.segments)
         return Localization(self._middle_m + 0.01 * loudest, 0.01 * np.eye(3), 0.5, ())
 
-    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         """A map without power."""
         return PowerMaps(self._grid, np.zeros(self._grid.size, dtype=np.float32), {})
 
@@ -60,13 +60,13 @@ def serve(site_file: Path, profile: Path | None) -> None:
     """Be the server, with the estimator above, and perhaps profiled."""
     estimators.ESTIMATORS["onset"] = Nowhere
     if profile is not None:
-        run = Engine._run
+        turn = Engine.turn
         profiler = cProfile.Profile()
 
         def profiled(engine: Engine) -> None:
-            profiler.runcall(run, engine)
+            profiler.runcall(turn, engine)
 
-        Engine._run = profiled  # type: ignore[assignment, method-assign]
+        Engine.turn = profiled  # type: ignore[assignment, method-assign]
     livessl(["serve", "--site", str(site_file)])
     if profile is not None:
         profiler.dump_stats(profile)

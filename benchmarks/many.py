@@ -3,7 +3,7 @@
     python benchmarks/many.py --sounds 12 --rt60 1 --snr 10
 
 prints the error and the time of an answer for each number of arrays that may have a part in it
-(`livessl.core.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
+(`livessl.core.locate.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
 docs/decisions/0027-sixteen-clearest-arrays.md.
 """
 
@@ -16,14 +16,15 @@ from typing import Final
 
 import numpy as np
 
-from livessl.bench import load
-from livessl.config import Site
-from livessl.core import estimators
-from livessl.core.estimators import ESTIMATORS
+from livessl.core.locate import estimators
+from livessl.core.locate.estimators import ESTIMATORS
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
-from livessl.evaluate.localizer import heard
+from livessl.lab.bench import load
+from livessl.lab.evaluate.localizer import heard
 from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
-from livessl.site_file import parse_site
+from livessl.site.build.grid import search_grid
+from livessl.site.load import parse_site
+from livessl.site.models import Site
 
 RATE_HZ: Final = 16_000.0
 QUIET_S: Final = 0.5
@@ -52,7 +53,7 @@ def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed
 def compare(arrays: int, sounds: int, rt60_s: float, snr_db: float, most: Sequence[int]) -> dict[int, FloatArray]:
     """By how many arrays may have a part: error in metres and time in seconds of every sound's answer, (sounds, 2)."""
     site = parse_site(load.site_text(arrays, 0.1, "tcp://127.0.0.1:5570", 8000))
-    estimator = ESTIMATORS["onset"](site.specs, site.search_grid(), site.c_m_s)
+    estimator = ESTIMATORS["onset"](site.specs, search_grid(site), site.c_m_s)
     rng = np.random.default_rng(3)
     x, y, _ = site.room.size_m
     active = np.arange(round(DURATION_S / FRAME_S)) >= round(QUIET_S / FRAME_S)

@@ -2,10 +2,10 @@
 
     python benchmarks/peers.py --out docs/performance
 
-Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.bench.kernels`. The work is the whole way
-from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl does,
-so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map with
-that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
+Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.lab.bench.kernels`. The work is the whole
+way from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl
+does, so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map
+with that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
 
 On the fine grid the others are timed on a random part of the nodes, the time being scaled up with the nodes: all of
 them work node by node, and what they do once a block is below a hundredth of what they do on the part.
@@ -31,19 +31,20 @@ from threadpoolctl import threadpool_limits
 
 import machine
 from livessl import wire
-from livessl.bench import kernels as bench
+from livessl.cli.progress import counted
 from livessl.clock import SystemClock
-from livessl.core import compiled, search, srp, vectorised
-from livessl.core.activity import band_bins
-from livessl.core.frontends import Spectra, whole_segment
-from livessl.core.gcc import GCCPhat, correlated, microphone_pairs
+from livessl.core.correlate.band import band_bins
+from livessl.core.correlate.gcc_phat import GCCPhat, correlated, microphone_pairs
+from livessl.core.correlate.spectra import Spectra, whole_segment
 from livessl.core.geometry import Grid, posed, tetrahedron
-from livessl.core.peaks import Peak
-from livessl.core.search import PeakSearch
-from livessl.core.srp import SRPMapper, pair_weight
+from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.locate import peak_search, srp
+from livessl.core.locate.peak_search import PeakSearch
+from livessl.core.locate.refine import Peak
+from livessl.core.locate.srp import SRPMapper, pair_weight
 from livessl.core.steering import steering_delays_s
-from livessl.core.types import ArraySpec, Float32Array, FloatArray, Frame, HeardBy, RealArray
-from livessl.progress import counted
+from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray, Frame, RealArray
+from livessl.lab.bench import kernels as bench
 
 COARSE_M: Final = 0.5
 FINE_M: Final = 0.1
@@ -221,13 +222,13 @@ PEERS: Final[dict[str, Callable[[Sequence[ArraySpec], FloatArray], Power]]] = {
 @contextmanager
 def using(form: ModuleType) -> Iterator[None]:
     """Build and run with one form of the kernels, `compiled` or `vectorised`."""
-    before = vars(search)["kernels"]
-    for module in (search, srp):
+    before = vars(peak_search)["kernels"]
+    for module in (peak_search, srp):
         setattr(module, "kernels", form)  # noqa: B010 - it is not exported, and mypy would say so
     try:
         yield
     finally:
-        for module in (search, srp):
+        for module in (peak_search, srp):
             setattr(module, "kernels", before)  # noqa: B010
 
 
@@ -254,16 +255,16 @@ class Ours:
             for spec in specs:
                 self._search.prepare(spec.name, self._gcc[spec.name].lags_s)
 
-    def heard(self, sounds: Sounds) -> list[HeardBy]:
+    def heard(self, sounds: Sounds) -> list[Evidence]:
         """Every array's GCC."""
         gccs = correlated([(self._gcc[spec.name], [x]) for spec, x in zip(self._specs, sounds, strict=True)])
-        return [HeardBy(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
+        return [Evidence(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
 
     def power(self, sounds: Sounds) -> Float32Array:
         """The summed map (G,), overwritten by the next call."""
         return self.mapped(self.heard(sounds))
 
-    def mapped(self, heard: Sequence[HeardBy]) -> Float32Array:
+    def mapped(self, heard: Sequence[Evidence]) -> Float32Array:
         """The same from the GCCs."""
         self._power[:] = 0.0
         with using(self._form):
@@ -306,7 +307,7 @@ def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) 
     def to_peak(power: Power) -> Callable[[Sounds], int]:
         return lambda sounds: int(power(sounds).argmax())
 
-    for form in (compiled, vectorised):
+    for form in (with_numba, with_numpy):
         ours = Ours(specs, grid, form)
         label = {"numba": "compiled", "NumPy": "NumPy"}[form.NAME]
         yield _Contender(f"livessl, map, {label}", spacing_m, grid.size, grid.size, to_peak(ours.power), at_part(ours))
@@ -367,9 +368,9 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
     gcc = [GCCPhat(spec, bench.RATE_HZ, bench.C_M_S) for spec in specs]
     lengths = {"block": bench.BLOCK, "1 s": bench.SEGMENT}
 
-    def evidence(kind: str, length: str, number: int) -> list[HeardBy]:
+    def evidence(kind: str, length: str, number: int) -> list[Evidence]:
         sounds = blocks.sound(kind, number, lengths[length])
-        return [HeardBy(spec, make([x])) for spec, make, x in zip(specs, gcc, sounds, strict=True)]
+        return [Evidence(spec, make([x])) for spec, make, x in zip(specs, gcc, sounds, strict=True)]
 
     heard = {
         (kind, length): [evidence(kind, length, number) for number in range({"block": 12, "1 s": 3}[length])]
@@ -377,7 +378,7 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
         for length in lengths
     }
 
-    def search_in(peaks: PeakSearch) -> Callable[[list[HeardBy]], Peak]:
+    def search_in(peaks: PeakSearch) -> Callable[[list[Evidence]], Peak]:
         return lambda one: peaks.among(one)(1)[0]
 
     rows: list[dict[str, Any]] = []
@@ -420,7 +421,7 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
             place_m = np.concatenate([part.microphones_m for part in parts[own]])[:count]
             specs.append(ArraySpec(name, place_m, bench.BAND_HZ))
             heard.append(np.concatenate(sounds[own])[:count])
-        fine, display = Ours(specs, room_grid(0.05), compiled), Ours(specs, room_grid(FINE_M), compiled)
+        fine, display = Ours(specs, room_grid(0.05), with_numba), Ours(specs, room_grid(FINE_M), with_numba)
         microphones += [{"microphones": count, "what": what} for what in ("GCC", "peak", "map")]
         cases += [
             bench.Case("GCC", _each(fine.heard, [heard])),
@@ -431,11 +432,11 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
     block = bench.Blocks(specs).sound("voice", 0)
     maps: list[dict[str, Any]] = []
     for spacing_m in MAP_SPACINGS_M:
-        ours = Ours(specs, room_grid(spacing_m), compiled)
+        ours = Ours(specs, room_grid(spacing_m), with_numba)
         maps.append({"spacing_m": spacing_m, "nodes": room_grid(spacing_m).size})
         cases.append(bench.Case("map", _each(ours.power, [block])))
     forms: list[dict[str, Any]] = []
-    for form in (compiled, vectorised):
+    for form in (with_numba, with_numpy):
         ours = Ours(specs, room_grid(FINE_M), form)
         forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
         cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))

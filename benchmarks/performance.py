@@ -22,10 +22,10 @@ from typing import Any, Final
 import numpy as np
 
 import machine
-from livessl.bench import kernels
+from livessl.cli.progress import counted
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_S
-from livessl.progress import counted
+from livessl.lab.bench import kernels
 
 HERE: Final = Path(__file__).parent
 DOCS: Final = HERE.parent / "docs"

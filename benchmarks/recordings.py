@@ -18,15 +18,15 @@ import soundfile
 import yaml
 from scipy.signal import oaconvolve
 
-from livessl import replay
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.recorded import Part, parts_from_wavs
+from livessl import offline
 from livessl.clock import UnpacedClock
-from livessl.config import Site
 from livessl.core.types import Event, Float32Array, FloatArray
-from livessl.demo import SITE_FILE
+from livessl.lab.demo import SITE_FILE
+from livessl.recordings.assign import Part, parts_from_wavs
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.simulate.scene import NamedSound, make_scene, read_sounds, render
-from livessl.site_file import load_site, parse_site
+from livessl.site.load import load_site, parse_site
+from livessl.site.models import Site
 
 DATA: Final = Path(os.environ.get("LIVESSL_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -58,7 +58,7 @@ class Found:
 
 def events_in(site: Site, parts: Sequence[Part], method: str | None = None) -> list[Event]:
     """Everything that the pipeline finds, by the site's method or another."""
-    outputs = replay.run(site, parts, UnpacedClock(), method=method)
+    outputs = offline.run(site, parts, UnpacedClock(), method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
 

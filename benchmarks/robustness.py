@@ -14,14 +14,15 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.activity import ActivityParameters, CausalActivity, band_power, exact_mask
-from livessl.core.estimators import Localization, Onset, Sound
-from livessl.core.fusion import Fusion, FusionParameters
+from livessl.core.correlate.band import band_power
 from livessl.core.geometry import Grid
+from livessl.core.locate.estimators import Localization, Onset, Sound
+from livessl.core.stream.activity import ActivityParameters, CausalActivity, exact_mask
+from livessl.core.stream.fusion import Fusion, FusionParameters
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame, Track
-from livessl.evaluate.campaign import read_clips
-from livessl.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
-from livessl.evaluate.unit import convolved
+from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
+from livessl.lab.evaluate.unit import convolved
 from livessl.simulate.moving import place_on_way, render_moving
 from livessl.simulate.room import impulse_responses
 
@@ -130,8 +131,8 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
                 heard = {name: sounds_of(first, [a, b, c], signal, active) for name, signal in signals.items()}
                 for name, estimator in estimators.items():
                     _judge(rows.setdefault(name, []), estimator, heard[""], source_m)
-                    doubted = heard[""] | {"c": replace(heard[""]["c"], doubted=True)}
-                    _judge(rows.setdefault(f"{name}, doubted", []), estimator, doubted, source_m)
+                    suspect = heard[""] | {"c": replace(heard[""]["c"], suspect=True)}
+                    _judge(rows.setdefault(f"{name}, doubted", []), estimator, suspect, source_m)
                 for name in list(signals)[1:]:
                     _judge(rows.setdefault(name, []), first, heard[name], source_m)
                 two = {name: heard[""][name] for name in "ab"}
@@ -148,7 +149,7 @@ def _judge(
     alone = {name: replace(sound, sources=1) for name, sound in sounds.items()}
     found = estimator.locate(alone)
     error_m = float(np.linalg.norm(found.position_m - source_m))
-    rows.append((error_m, is_located(found), "c" in (found.outvoted or ())))
+    rows.append((error_m, is_located(found), "c" in (found.outliers or ())))
 
 
 def noise_beside(clips: Clips, positions: int, seed: int) -> None:
@@ -303,9 +304,11 @@ def _tracks(specs: Sequence[ArraySpec], samples: Float32Array, live_sources: int
         for spec, gate, part in zip(specs, gates, np.split(samples, len(specs)), strict=True):
             piece = np.ascontiguousarray(part[:, k * FRAME : (k + 1) * FRAME])
             power = float(band_power(piece, RATE_HZ, BAND_HZ).mean())
-            raster = LEAD_NS // FRAME_NS + k
-            frames.append(Frame(spec.name, k + 1, raster, raster * FRAME_NS, RATE_HZ, piece, power, gate.push(power)))
-        outputs = fusion.step(frames, (raster + 1) * FRAME_NS)
+            frame_index = LEAD_NS // FRAME_NS + k
+            frames.append(
+                Frame(spec.name, k + 1, frame_index, frame_index * FRAME_NS, RATE_HZ, piece, power, gate.push(power))
+            )
+        outputs = fusion.step(frames, (frame_index + 1) * FRAME_NS)
         tracks += [output for output in outputs if isinstance(output, Track)]
     return tracks
 

@@ -19,7 +19,7 @@ from typing import Final
 
 import machine
 from livessl.clock import Clock, SystemClock
-from livessl.processes import free_port
+from livessl.lab.processes import free_port
 
 STARTS: Final = 15
 SITE: Final = """\

@@ -18,15 +18,15 @@ import numpy as np
 import soundfile
 
 from clocks import NEAR_M, RATE_HZ, START_NS, by_sound, scene_of
-from livessl import replay
-from livessl.capture.devices import Placed, WavRecording
-from livessl.capture.recorded import Part
+from livessl import offline
 from livessl.clock import UnpacedClock
-from livessl.config import Site
 from livessl.core.types import Event, Status
-from livessl.demo import SITE_FILE
+from livessl.lab.demo import SITE_FILE
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import Placed, WavRecording
 from livessl.simulate.scene import Scene, render
-from livessl.site_file import load_site
+from livessl.site.load import load_site
+from livessl.site.models import Site
 
 LOWER_DB: Final = (0.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
@@ -77,7 +77,7 @@ def main() -> None:
                 scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, seed), noise_dbfs=a.noise_dbfs)
                 name = f"{a.sounds}-{a.rt60:g}-{seed}{a.noise_dbfs:g}"
                 parts = parts_of(site, scene, a.cache, name, lower_db)
-                outputs = replay.run(site, parts, UnpacedClock(), ask=ask)
+                outputs = offline.run(site, parts, UnpacedClock(), ask=ask)
                 total += Counter(figures(scene, [output for output in outputs if isinstance(output, Event)]))
             print(json.dumps({"lower_db": lower_db, "ask": ask, **total}), flush=True)
 

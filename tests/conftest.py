@@ -7,7 +7,7 @@ import os
 import pytest
 from hypothesis import settings
 
-from livessl.core.search import warm_up
+from livessl.core.locate.peak_search import warm_up
 
 settings.register_profile("livessl", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("livessl")

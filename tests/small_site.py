@@ -15,14 +15,14 @@ import numpy as np
 import soundfile
 import yaml
 
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.recorded import Part
 from livessl.clock import SystemClock
-from livessl.config import Site
 from livessl.core.types import Float32Array, Frame, Mark
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
 from livessl.simulate.scene import Scene, make_scene, render
-from livessl.site_file import parse_site
+from livessl.site.load import parse_site
+from livessl.site.models import Site
 
 RATE_HZ = 16000
 SMALL: dict[str, Any] = {
@@ -46,7 +46,7 @@ SMALL: dict[str, Any] = {
 """Two tetrahedra in a small room at a low rate: quick to localize in. Addresses are chosen by the system."""
 
 FIRST_RASTER = 999
-"""A frame's raster index is its number beyond this, where a test does not say otherwise."""
+"""A frame's frame index is its number beyond this, where a test does not say otherwise."""
 
 Changes = dict[str, Any]
 """Dotted path to value; `...` takes the key away."""
@@ -128,17 +128,17 @@ def scene_parts(start_ns: int, count: int = 2) -> list[Part]:
 
 
 def frame(
-    sequence: int = 1, raster: int | None = None, array: str = "north", *, active: bool = True, seed: int = 0
+    sequence: int = 1, frame_index: int | None = None, array: str = "north", *, active: bool = True, seed: int = 0
 ) -> Frame:
     """A frame of noise as the small site's nodes send it; each later in time than the one numbered before it."""
     samples = hiss(0.05, seed=seed)
-    raster = FIRST_RASTER + sequence if raster is None else raster
-    return Frame(array, sequence, raster, raster * 50_000_000, float(RATE_HZ), samples, 0.01, active)
+    frame_index = FIRST_RASTER + sequence if frame_index is None else frame_index
+    return Frame(array, sequence, frame_index, frame_index * 50_000_000, float(RATE_HZ), samples, 0.01, active)
 
 
-def mark(sequence: int = 1, raster: int = 1000, array: str = "north", power: float = 1e-6) -> Mark:
+def mark(sequence: int = 1, frame_index: int = 1000, array: str = "north", power: float = 1e-6) -> Mark:
     """A mark of quiet."""
-    return Mark(array, sequence, raster, power, power, (power,) * 4)
+    return Mark(array, sequence, frame_index, power, power, (power,) * 4)
 
 
 def wait_until(condition: Callable[[], object], what: str, seconds: float = 10.0) -> None:

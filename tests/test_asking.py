@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from livessl import replay
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.line import played_messages
+from livessl import offline
 from livessl.capture.node import send_session
-from livessl.capture.recorded import Part, lines_of
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
-from livessl.config import Site
-from livessl.core.asking import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
-from livessl.core.segmenter import RECENT_S
-from livessl.core.settling import Settled, Settling
-from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Ask, Event, Frame, Message, Output, Status
+from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.segmenter import RECENT_S
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.simulate.scene import render
+from livessl.site.build.fusion import make_fusion
+from livessl.site.models import Site
 from small_site import RATE_HZ, running_server, scene, site_of
 
 START_NS = 1_767_225_600_000_000_000
@@ -62,8 +63,8 @@ def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[P
     ]
 
 
-def offline(*, ask: bool = True, method: str | None = None, ahead_ns: int = 0) -> list[Event]:
-    outputs = replay.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), ask=ask, method=method)
+def offline_events(*, ask: bool = True, method: str | None = None, ahead_ns: int = 0) -> list[Event]:
+    outputs = offline.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), ask=ask, method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
 
@@ -83,10 +84,10 @@ def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
 
 
 def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
-    without = offline(ask=False)
+    without = offline_events(ask=False)
     assert [event.heard_by for event in without] == [("north",)] * SOUNDS
     assert {event.status for event in without} == {Status.DIRECTION_ONLY}
-    events = offline()
+    events = offline_events()
     assert [event.id for event in events] == [event.id for event in without]
     for event in events:
         assert event.status is Status.LOCATED
@@ -98,40 +99,40 @@ def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
 
 
 def test_methods_that_cannot_weigh_an_array_ask_nobody() -> None:
-    assert told(offline(method="srp-phat")) == told(offline(method="srp-phat", ask=False))
+    assert told(offline_events(method="srp-phat")) == told(offline_events(method="srp-phat", ask=False))
 
 
 class Live:
     """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
 
     def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
-        self.lines, self.placed = lines_of(site(), parts(ahead_ns=ahead_ns))
-        self.settling = Settling(site().make_fusion(live=True), ("north", "south"))
+        self.lines, self.placed = pipelines_of(site(), parts(ahead_ns=ahead_ns))
+        self.settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
         self.way, self.deaf = way, deaf
-        self.asks: list[Ask] = []
+        self.asks: list[BackfillRequest] = []
 
-    def run(self) -> list[Output | Settled]:
-        outputs: list[Output | Settled] = []
+    def run(self) -> list[Output | FinalResults]:
+        outputs: list[Output | FinalResults] = []
         coming: list[tuple[int, list[Message]]] = []
         for k, (now_ns, batch) in enumerate(played_messages(self.lines, self.placed, UnpacedClock())):
             answers = [message for due, messages in coming if due <= k for message in messages]
             coming = [entry for entry in coming if entry[0] > k]
             new = self.settling.step([*batch, *answers], now_ns)
-            for ask in (output for output in new if isinstance(output, Ask)):
+            for ask in (output for output in new if isinstance(output, BackfillRequest)):
                 self.asks.append(ask)
                 if not self.deaf:
                     coming.append((k + self.way, self.answer(ask)))
             outputs += new
         return outputs + self.settling.flush(now_ns)
 
-    def answer(self, ask: Ask) -> list[Message]:
-        return [message for line in self.lines for message in line.ask(ask)]
+    def answer(self, ask: BackfillRequest) -> list[Message]:
+        return [message for line in self.lines for message in line.backfill(ask)]
 
 
-def settled(outputs: Sequence[Output | Settled]) -> list[Event]:
-    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+def settled(outputs: Sequence[Output | FinalResults]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
 @pytest.mark.parametrize("way", [1, 4, 8])
@@ -139,7 +140,7 @@ def test_live_answers_are_those_offline(way: int) -> None:
     """Blocks of 20 ms from each node: eight batches are 80 ms."""
     live = Live(way)
     outputs = live.run()
-    assert told(settled(outputs)) == told(offline())
+    assert told(settled(outputs)) == told(offline_events())
     assert not [output for output in outputs if isinstance(output, Event)]  # none before it was settled
     assert len(live.asks) == SOUNDS  # one for each array and event
     assert {ask.array for ask in live.asks} == {"south"}
@@ -150,13 +151,13 @@ def test_live_answers_are_those_offline(way: int) -> None:
 
 def test_old_nodes_are_asked_nothing() -> None:
     live = Live(1, answers=False)
-    assert told(settled(live.run())) == told(offline(ask=False))
+    assert told(settled(live.run())) == told(offline_events(ask=False))
     assert live.asks == []
 
 
 def test_disabled_arrays_are_asked_nothing() -> None:
     live = Live(1)
-    live.settling.spare({"south"})
+    live.settling.exclude({"south"})
     live.run()
     assert live.asks == []
 
@@ -164,7 +165,7 @@ def test_disabled_arrays_are_asked_nothing() -> None:
 def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
     live = Live(1, deaf=True)
     events = settled(live.run())
-    assert told(events) == told(offline(ask=False))
+    assert told(events) == told(offline_events(ask=False))
     assert len(live.asks) == SOUNDS
     for event in events:
         assert 0.3 + 0.3 - 0.11 < event.latency_s < 0.3 + 0.3 + 0.11  # the hang-over, and as long again
@@ -178,10 +179,10 @@ def test_arrays_are_asked_by_their_own_clocks() -> None:
     assert clocks is not None
     for k in range(3):
         clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-    live.settling = Settling(live.settling.live, ("north", "south"))
+    live.settling = TwoPassFusion(live.settling.live, ("north", "south"))
     live.settling.greet("south", None, START_NS, answers=True)
     events = settled(live.run())
-    expected = offline()
+    expected = offline_events()
     assert [event.estimate and event.estimate.arrays for event in events] == [("north", "south")] * SOUNDS
     for event, other in zip(events, expected, strict=True):
         assert abs(error_m(event) - error_m(other)) < 0.02
@@ -192,15 +193,15 @@ def test_nobody_is_asked_where_the_answer_is_sure() -> None:
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
     ]
-    fusion = site().make_fusion(updates=False)
-    fusion.askable = {"north", "south"}
+    fusion = make_fusion(site(), updates=False)
+    fusion.can_backfill = {"north", "south"}
     outputs: list[Output] = []
-    for now_ns, batch in played_messages(*lines_of(site(), loud), UnpacedClock()):
+    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
     assert all(event.estimate is not None and event.estimate.confidence >= SURE for event in events)
-    assert not [output for output in outputs if isinstance(output, Ask)]
+    assert not [output for output in outputs if isinstance(output, BackfillRequest)]
 
 
 @cache
@@ -230,10 +231,10 @@ def test_the_nearest_are_asked() -> None:
 
 
 def test_frames_that_nobody_asked_for_change_nothing() -> None:
-    fusion = site().make_fusion(updates=False)
+    fusion = make_fusion(site(), updates=False)
     samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
-    raster = START_NS // FRAME_NS
-    stray = Frame("south", 0, raster, START_NS, float(RATE_HZ), samples, 0.01, True)
+    frame_index = START_NS // FRAME_NS
+    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True)
     assert fusion.step([stray], START_NS) == []
     assert fusion.closed is None
     assert fusion.status(START_NS)[1].counters["frames"] == 0
@@ -245,13 +246,13 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
     times = 1 if speed else 4
     played = parts(times=times)
     assert speed or played[0].placed.recording.duration_s > 2 * RECENT_S
-    outputs = replay.run(site(), played, UnpacedClock())
+    outputs = offline.run(site(), played, UnpacedClock())
     expected = [output for output in outputs if isinstance(output, Event)]
     assert [event.estimate and event.estimate.arrays for event in expected] == [("north", "south")] * SOUNDS * times
     with running_server(site_of({**NODES, "server.bind": "tcp://127.0.0.1:*"})) as server:
         pace = PacedClock(START_NS, speed) if speed else UnpacedClock(START_NS)
-        send_session(site(), server.engine.endpoint, played, pace, SystemClock(), "run-1", lambda: False)
-        server.engine.wait_idle()
+        send_session(site(), server.endpoint, played, pace, SystemClock(), "run-1", lambda: False)
+        server.wait_idle()
         with urllib.request.urlopen(f"{server.url}/api/v1/events") as answer:
             found = json.load(answer)["events"][::-1]
     assert [event["id"] for event in found] == [event.id for event in expected]
@@ -267,22 +268,22 @@ def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> No
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
     ]
-    settling = Settling(site().make_fusion(live=True), ("north", "south"))
+    settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
     for name in ("north", "south"):
         settling.greet(name, None, START_NS, answers=True)
     held: list[Message] | None = []
     asked = False
-    told: list[Output | Settled] = []
-    for now_ns, batch in played_messages(*lines_of(site(), loud), UnpacedClock()):
+    told: list[Output | FinalResults] = []
+    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
         if held is not None:
             held += [message for message in batch if message.array == "south"]
             batch = [message for message in batch if message.array == "north"]
             if asked:
                 batch, held = [*batch, *held], None
         new = settling.step(batch, now_ns)
-        asked = asked or any(isinstance(output, Ask) for output in new)
-        told += [output for output in new if isinstance(output, Event | Settled)]
+        asked = asked or any(isinstance(output, BackfillRequest) for output in new)
+        told += [output for output in new if isinstance(output, Event | FinalResults)]
     assert asked
-    assert isinstance(told[0], Settled)
+    assert isinstance(told[0], FinalResults)
     assert [event.heard_by for event in settled(told)] == [("north", "south")] * SOUNDS
     assert not [output for output in told if isinstance(output, Event)]

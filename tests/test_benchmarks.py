@@ -16,19 +16,20 @@ import exactness
 import peers
 import performance
 import startup
-from livessl.bench import kernels
 from livessl.clock import SystemClock
-from livessl.core import compiled, search, srp, vectorised
 from livessl.core import kernels as kernels_in_use
 from livessl.core.geometry import Grid
-from livessl.core.peaks import FindPeaks
-from livessl.core.search import PeakSearch, Rule
-from livessl.core.types import HeardBy
+from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.locate import peak_search, srp
+from livessl.core.locate.peak_search import PeakSearch, Rule
+from livessl.core.locate.refine import FindPeaks
+from livessl.core.types import Evidence
+from livessl.lab.bench import kernels
 
 Json = dict[str, Any]
 
 RECORDED: Final = {"numba": 1.3, "NumPy": 0.65}
-"""Least time of the map on 0.1 m over that of as many bare look-ups, by kernels: `livessl.bench.kernels.measure`, four
+"""Least time of the map on 0.1 m over that of as many bare look-ups, by `livessl.lab.bench.kernels.measure`, four
 times each on one x86 core of a shared machine. NumPy's bare look-ups are slower than SciPy's sparse product."""
 
 WORSE: Final = 1.5
@@ -58,7 +59,7 @@ def test_peer_maps_what_the_formula_does(name: str, sounds: peers.Sounds) -> Non
     assert power.argmax() == truth.argmax()
 
 
-@pytest.mark.parametrize("form", [compiled, vectorised])
+@pytest.mark.parametrize("form", [with_numba, with_numpy])
 def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds) -> None:
     """Nearest of eight lags a sample: an error of 1/28 sample RMS, 0.03 rad at 6 kHz; 1e-3 of the power."""
     specs = kernels.array_specs(2)
@@ -67,7 +68,7 @@ def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds)
     power = ours.power(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.999
     assert ours.peak(sounds) == power.argmax() == truth.argmax()
-    assert vars(search)["kernels"] is vars(srp)["kernels"] is kernels_in_use.kernels  # and it was used for that alone
+    assert vars(peak_search)["kernels"] is vars(srp)["kernels"] is kernels_in_use.kernels  # used for that alone
 
 
 def test_fused_maps_are_what_the_search_is_held_against() -> None:
@@ -79,7 +80,7 @@ def test_fused_maps_are_what_the_search_is_held_against() -> None:
 def test_a_search_that_is_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     among = PeakSearch.among
 
-    def wrong(self: PeakSearch, evidence: Sequence[HeardBy], rule: Rule, *most: int) -> FindPeaks:
+    def wrong(self: PeakSearch, evidence: Sequence[Evidence], rule: Rule, *most: int) -> FindPeaks:
         find = among(self, evidence, rule, *most)
         return lambda count, *rest: [replace(peak, node=peak.node + 1) for peak in find(count, *rest)]
 

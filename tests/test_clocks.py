@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from livessl.capture.devices import Placed
-from livessl.capture.line import played_messages
-from livessl.capture.recorded import lines_of
 from livessl.clock import UnpacedClock
-from livessl.config import Site
-from livessl.core.clock_offsets import LEAST_SOUNDS, ClockOffset
-from livessl.core.fusion import Fusion
-from livessl.core.settling import Settled, Settling
-from livessl.core.streams import ArrayState, ArrayStatus
+from livessl.core.stream.array_health import ArrayState, ArrayStatus
+from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.fusion import Fusion
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
+from livessl.recordings.assign import pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import Placed
+from livessl.site.build.fusion import make_fusion
+from livessl.site.models import Site
 from small_site import RATE_HZ, scene, scene_parts, site_of
 
 START_NS = 1_767_225_600_000_000_000
@@ -47,12 +48,12 @@ def batches(ahead_s: float) -> Batches:
         replace(part, placed=Placed(part.placed.recording, START_NS + ahead_ns * (part.array == "south")))
         for part in scene_parts(START_NS, SOUNDS)
     ]
-    return list(played_messages(*lines_of(site(), parts), UnpacedClock()))
+    return list(played_messages(*pipelines_of(site(), parts), UnpacedClock()))
 
 
 def located(ahead_s: float) -> tuple[list[Event], ArrayStatus]:
     """Offline: the events, and how the array with the wrong clock is doing in the end."""
-    fusion = site().make_fusion(updates=False)
+    fusion = make_fusion(site(), updates=False)
     outputs: list[Output] = []
     for now_ns, batch in batches(ahead_s):
         outputs += fusion.step(batch, now_ns)
@@ -111,7 +112,7 @@ def test_sounds_close_to_one_another_stay_apart() -> None:
     """
 
     def told_of(*, corrected: bool) -> list[Event]:
-        fusion = site().make_fusion(updates=False)
+        fusion = make_fusion(site(), updates=False)
         if not corrected:
             fusion.clock_offsets = None
         else:
@@ -137,17 +138,17 @@ def test_sounds_close_to_one_another_stay_apart() -> None:
     assert [event.heard_by for event in events] == [("north", "south")] * 2
 
 
-def _frame(array: str, raster: int) -> Frame:
-    samples = np.random.default_rng(raster).standard_normal((4, 800)).astype(np.float32)
-    return Frame(array, 1, raster, raster * FRAME_NS, float(RATE_HZ), samples, 0.01, True)
+def _frame(array: str, frame_index: int) -> Frame:
+    samples = np.random.default_rng(frame_index).standard_normal((4, 800)).astype(np.float32)
+    return Frame(array, 1, frame_index, frame_index * FRAME_NS, float(RATE_HZ), samples, 0.01, True)
 
 
-def settled_events(outputs: Iterable[Output | Settled]) -> list[Event]:
-    return [event for output in outputs if isinstance(output, Settled) for event in output.events]
+def settled_events(outputs: Iterable[Output | FinalResults]) -> list[Event]:
+    return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
-def settling(fusion: Fusion | None = None, settled: int | None = None) -> Settling:
-    return Settling(fusion or site().make_fusion(live=True), ("north", "south"), settled)
+def settling(fusion: Fusion | None = None, settled: int | None = None) -> TwoPassFusion:
+    return TwoPassFusion(fusion or make_fusion(site(), live=True), ("north", "south"), settled)
 
 
 @pytest.mark.parametrize("step", [1, 7, 100])
@@ -155,7 +156,7 @@ def settling(fusion: Fusion | None = None, settled: int | None = None) -> Settli
 def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
     """However many messages come at a time; and none of them only from the fusion that does not wait."""
     into = settling()
-    outputs: list[Output | Settled] = []
+    outputs: list[Output | FinalResults] = []
     all_batches = batches(ahead_s)
     for at in range(0, len(all_batches), step):
         some = all_batches[at : at + step]
@@ -180,25 +181,25 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
                 kept[message.array].append(message)
         outputs = into.step(batch, now_ns)
         if k % 29 == 28:  # it is killed, and starts again with what is stored
-            fusion = site().make_fusion(live=True)
+            fusion = make_fusion(site(), live=True)
             if stored[1] is not None:
                 assert fusion.clock_offsets is not None
                 fusion.clock_offsets.restore(stored[1])
             again = settling(fusion, stored[0])
             for name in arrays:
                 if kept[name]:
-                    again.greet(name, (kept[name][0].raster, kept[name][-1].raster + 1), now_ns)
+                    again.greet(name, (kept[name][0].frame_index, kept[name][-1].frame_index + 1), now_ns)
             outputs += again.step([frame for name in arrays for frame in kept[name]], now_ns)
             for name in arrays:
                 again.greet(name, None, now_ns)
             into = again
         for output in outputs:
-            if isinstance(output, Settled):
+            if isinstance(output, FinalResults):
                 events += output.events
                 assert into.live.clock_offsets is not None
                 stored = output.until, into.live.clock_offsets.state()
         for name, settled in into.settled_of.items():
-            kept[name] = [frame for frame in kept[name] if frame.raster >= settled]
+            kept[name] = [frame for frame in kept[name] if frame.frame_index >= settled]
     events += settled_events(into.flush(now_ns))
     assert told(events) == expected
 
@@ -213,7 +214,7 @@ def test_offset_is_shown_to_the_reference() -> None:
 
 
 def _status_after(ahead_s: float) -> list[ArrayStatus]:
-    fusion = site().make_fusion(updates=False)
+    fusion = make_fusion(site(), updates=False)
     for now_ns, batch in batches(ahead_s):
         fusion.step(batch, now_ns)
     return fusion.status(now_ns)

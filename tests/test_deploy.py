@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from conftest import require
-from livessl.site_file import load_site
+from livessl.site.load import load_site
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
@@ -99,7 +99,7 @@ def test_commands_are_livessl_commands() -> None:
     for place, (command, *options) in commands().items():
         assert command == ("capture" if "node" in place else "serve"), place
         helped = subprocess.run(
-            [sys.executable, "-c", "from livessl.cli import main; raise SystemExit(main())", command, "--help"],
+            [sys.executable, "-c", "from livessl.cli.main import main; raise SystemExit(main())", command, "--help"],
             capture_output=True,
             text=True,
             check=False,

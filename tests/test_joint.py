@@ -12,16 +12,17 @@ import httpx
 import numpy as np
 import pytest
 
-from livessl import replay
-from livessl.capture.devices import ArrayRecording, DeviceError, Placed, Spliced
-from livessl.capture.line import Line
+from livessl import offline
 from livessl.capture.node import UndeliveredError, send_session
-from livessl.capture.recorded import Part, lines_of
-from livessl.cli import main
+from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.config import Site
 from livessl.core.types import Block, Event, Float32Array, Frame, Mark
-from livessl.session import read_session
+from livessl.errors import DeviceError
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.recording import ArrayRecording, Placed, Spliced
+from livessl.recordings.session import read_session
+from livessl.site.build.pipeline import make_pipeline
+from livessl.site.models import Site
 from small_site import (
     RATE_HZ,
     Changes,
@@ -45,7 +46,7 @@ NEAR_M = 0.5 * 343.0 / RATE_HZ
 
 
 def events_of(site: Site, parts: Sequence[Part]) -> list[Event]:
-    return [o for o in replay.run(site, parts, UnpacedClock(START_NS)) if isinstance(o, Event)]
+    return [o for o in offline.run(site, parts, UnpacedClock(START_NS)) if isinstance(o, Event)]
 
 
 def eight() -> Float32Array:
@@ -113,7 +114,7 @@ def test_a_line_hears_them_as_one() -> None:
     """What is heard by one of them is sound of all eight channels: one mask for all."""
     samples = hiss(2.0, 8, level=1e-4)
     samples[4:, RATE_HZ : RATE_HZ + 3200] += hiss(0.2, 4, seed=1, level=0.2)  # at the southern ones only
-    line = Line(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
+    line = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
     assert line.arrays == ["both"]
     made = line.push(Block(0, samples, START_NS)) + line.flush()
     assert {message.array for message in made} == {"both"}
@@ -129,7 +130,7 @@ def test_a_line_hears_them_as_one() -> None:
 
 def refusal(site: Site, parts: Sequence[Part]) -> str:
     with pytest.raises(DeviceError) as caught:
-        lines_of(site, parts)
+        pipelines_of(site, parts)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -248,7 +249,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [piece.array for piece in read_session(session).pieces] == ["north", "south"]
     assert read_session(session).site().joint == {"both": ("north", "south")}
     capsys.readouterr()
-    # nothing but the raster of 50 ms, which a recording's beginning may cut otherwise, is not the same
+    # nothing but the grid of frames of 50 ms, which a recording's beginning may cut otherwise, is not the same
     replayed = told(capsys, "replay", session, "--once", "--speed", "max")
     assert [event["arrays"] for event in replayed] == [["both"], ["both"]]
     for one, other in zip(replayed, joint, strict=True):
@@ -298,21 +299,21 @@ def test_option_that_is_wrong(files: Path, capsys: pytest.CaptureFixture[str], o
 def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> None:
     clock = SystemClock()
     with running_server(site_of(JOINT)) as server:
-        endpoint = server.engine.endpoint
+        endpoint = server.endpoint
         arguments = (endpoint, scene_parts(START_NS), UnpacedClock(START_NS), clock)
         with pytest.raises(UndeliveredError, match="array 'north' is joined in 'both' at the server; give node and"):
             send_session(site_of(), *arguments, "run-1", lambda: False)
         send_session(site_of(JOINT), *arguments, "run-2", lambda: False)
-        server.engine.wait_idle()
-        wait_until(lambda: server.engine.events == 2, "both events")
+        server.wait_idle()
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         read = {name: httpx.get(f"{server.url}/api/v1/{name}").json() for name in ("events", "site", "arrays")}
         image = httpx.get(f"{server.url}/api/v1/map", params={"array": "both"})
         unknown = httpx.get(f"{server.url}/api/v1/map", params={"array": "north"})
-    for event, offline in zip(
+    for event, expected in zip(
         read["events"]["events"][::-1], events_of(site_of(JOINT), scene_parts(START_NS)), strict=True
     ):
-        assert offline.estimate is not None
-        assert event["position_m"] == [round(float(x), 4) for x in offline.estimate.position_m]
+        assert expected.estimate is not None
+        assert event["position_m"] == [round(float(x), 4) for x in expected.estimate.position_m]
         assert event["arrays"] == ["both"]
     assert read["site"]["joint"] == {"both": ["north", "south"]}
     assert len(read["site"]["arrays"]["both"]["microphones_m"]) == 8

@@ -24,8 +24,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from conftest import require
-from livessl import demo
-from livessl.capture.recorded import TOGETHER_NS
+from livessl.lab import demo
+from livessl.recordings.assign import TOGETHER_NS
 
 ROOT = Path(__file__).parents[1]
 LIVESSL = [sys.executable, "-m", "livessl"]

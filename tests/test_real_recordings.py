@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import recordings as r
-from livessl.cli import main
+from livessl.cli.main import main
 
 pytestmark = [pytest.mark.recordings, pytest.mark.timeout(300)]
 

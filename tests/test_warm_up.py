@@ -12,9 +12,9 @@ from livessl.core.kernels import kernels
 SCRIPT = """
 import numpy as np
 from livessl.core import compiled
-from livessl.core.estimators import Onset, Sound
+from livessl.core.locate.estimators import Onset, Sound
 from livessl.core.geometry import Grid, posed, tetrahedron
-from livessl.core.search import warm_up
+from livessl.core.locate.peak_search import warm_up
 from livessl.core.types import ArraySpec
 
 def known():

@@ -23,7 +23,7 @@ from small_site import frame, mark
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=16)
 TEXTS = st.none() | st.text(st.characters(exclude_categories=["Cs"]), max_size=100)
-RASTERS = st.integers(-wire.MAX_RASTER, wire.MAX_RASTER)
+RASTERS = st.integers(-wire.MAX_FRAME_INDEX, wire.MAX_FRAME_INDEX)
 POWERS = st.floats(min_value=0, max_value=wire.MAX_POWER)
 RATES = st.floats(min_value=1.0, max_value=wire.MAX_RATE_HZ)
 SAMPLES = hnp.arrays(
@@ -35,7 +35,7 @@ FRAMES = st.builds(
     Frame,
     array=NAMES,
     sequence=st.integers(0, 2**63 - 1),
-    raster=RASTERS,
+    frame_index=RASTERS,
     time_ns=st.integers(-(2**63), 2**63 - 1),
     sample_rate_hz=RATES,
     samples=SAMPLES,
@@ -46,7 +46,7 @@ MARKS = st.builds(
     Mark,
     array=NAMES,
     sequence=st.integers(0, 2**63 - 1),
-    raster=RASTERS,
+    frame_index=RASTERS,
     power=POWERS,
     noise_power=POWERS,
     channel_power=st.lists(POWERS, max_size=16).map(tuple),
@@ -99,7 +99,7 @@ def assert_same(got: WireMessage, sent: WireMessage) -> None:
     if isinstance(sent, Frame):
         assert isinstance(got, Frame)
         assert_array_equal(got.samples.view(np.uint32), sent.samples.view(np.uint32))  # to the bit: -0.0 is not 0.0
-        fields = ("array", "sequence", "raster", "time_ns", "sample_rate_hz", "power", "active")
+        fields = ("array", "sequence", "frame_index", "time_ns", "sample_rate_hz", "power", "active")
         assert [getattr(got, name) for name in fields] == [getattr(sent, name) for name in fields]
     else:
         assert got == sent
@@ -299,8 +299,8 @@ def test_samples_must_be_such_as_a_converter_gives() -> None:
         ({"power": math.inf}, "power"),
         ({"power": math.nan}, "power"),
         ({"power": 1e300}, "power"),
-        ({"raster": 2**62}, "raster"),
-        ({"raster": -(2**62)}, "raster"),
+        ({"frame_index": 2**62}, "frame index"),
+        ({"frame_index": -(2**62)}, "frame index"),
         ({"samples": np.zeros((1, 10), dtype=np.float32)}, "2 to 16 channels, got 1"),
         ({"samples": np.zeros((17, 10), dtype=np.float32)}, "2 to 16 channels, got 17"),
         ({"samples": np.zeros((4, 0), dtype=np.float32)}, "samples, got 0"),
@@ -311,7 +311,7 @@ def test_frame_outside_the_limits_is_refused(values: dict[str, Any], expected: s
     good: dict[str, Any] = {
         "array": "north",
         "sequence": 1,
-        "raster": 1,
+        "frame_index": 1,
         "time_ns": 1,
         "sample_rate_hz": 16000.0,
         "samples": np.zeros((4, 10), dtype=np.float32),
@@ -330,14 +330,14 @@ def test_frame_outside_the_limits_is_refused(values: dict[str, Any], expected: s
         ({"channel_power": (0.0, math.inf)}, "powers from 0"),
         ({"channel_power": (0.0,) * 17}, "at most 16 channels"),
         ({"drift_ppm": math.nan}, "finite drift"),
-        ({"raster": 2**62}, "raster"),
+        ({"frame_index": 2**62}, "frame index"),
     ],
 )
 def test_mark_outside_the_limits_is_refused(values: dict[str, Any], expected: str) -> None:
     good: dict[str, Any] = {
         "array": "north",
         "sequence": 1,
-        "raster": 1,
+        "frame_index": 1,
         "power": 0.0,
         "noise_power": 0.0,
         "channel_power": (0.0,) * 4,

@@ -1,6 +1,6 @@
 """`python -m livessl`: the command line."""
 
-from livessl.cli import main
+from livessl.cli.main import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -9,3 +9,7 @@ class UseError(Exception):
 
 class RunError(Exception):
     """What was asked for went wrong when it ran."""
+
+
+class DeviceError(UseError):
+    """A device or recording that cannot be used: what, expected, got, cure."""

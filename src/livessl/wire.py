@@ -30,7 +30,7 @@ MAX_RATE_HZ: Final = 384_000.0
 MAX_POWER: Final = 1e80
 """Of samples that a float32 can hold; sums of such powers do not overflow."""
 
-MAX_RASTER: Final = (2**63 - 1) // FRAME_NS - 1
+MAX_FRAME_INDEX: Final = (2**63 - 1) // FRAME_NS - 1
 """Site times are 64-bit nanoseconds: until the year 2262."""
 
 MAX_JSON_BYTES: Final = 64 * 1024
@@ -43,8 +43,10 @@ _MAGIC: Final = b"LSSL"
 _HEAD: Final = struct.Struct("<4sBBq")
 _SENT: Final = struct.Struct("<q")
 _SENT_AT: Final = _HEAD.size - _SENT.size
-_FRAME: Final = struct.Struct("<BQqqdd?BI")  # name length, sequence, raster, time, rate, power, active, channels, n
-_MARK: Final = struct.Struct("<BQqddQQdBB")  # name length, sequence, raster, powers, overflows, lost, drift, clock, K
+# name length, sequence, frame index, time, rate, power, active, channels, samples a channel
+_FRAME: Final = struct.Struct("<BQqqdd?BI")
+# name length, sequence, frame index, powers, overflows, lost frames, drift, clock state, channels
+_MARK: Final = struct.Struct("<BQqddQQdBB")
 _CLOCK_STATES: Final = tuple(ClockState)
 
 
@@ -69,7 +71,7 @@ class Hello:
     problem : str or None
         What is wrong with its device now, in words.
     backlog : dict of str to (int, int)
-        Of the arrays that have kept frames from before this connection: their oldest raster index, and the one from
+        Of the arrays that have kept frames from before this connection: their oldest frame index, and the one from
         which on frames are live. What lies between comes in order of time, as the live sound leaves room; another
         greeting says when all of it has been sent.
     answers : bool
@@ -94,10 +96,10 @@ class Ack:
     run_id : str
         Of the node's greeting.
     received : dict of str to int
-        Raster index, of each array, up to which the server has all frames that the node sent: they need not be sent
+        Frame index, of each array, up to which the server has all frames that the node sent: they need not be sent
         again while this server lives.
     settled : int or None
-        Raster index before which everything has become events, and these are stored: no frame of it is needed again.
+        Frame index before which everything has become events, and these are stored: no frame of it is needed again.
     who_are_you : bool
         The server does not know this connection, or misses frames of it: greet, and send again.
     refused : str or None
@@ -122,7 +124,7 @@ class Request:
     run_id : str
         Of the node's greeting.
     wanted : dict of str to (int, int)
-        Of each array the first raster index, by its own clock, and the one after the last.
+        Of each array the first frame index, by its own clock, and the one after the last.
     """
 
     run_id: str
@@ -204,7 +206,7 @@ def _encode_frame(frame: Frame) -> bytes:
     fixed = _FRAME.pack(
         len(name),
         frame.sequence,
-        frame.raster,
+        frame.frame_index,
         frame.time_ns,
         frame.sample_rate_hz,
         frame.power,
@@ -217,7 +219,7 @@ def _encode_frame(frame: Frame) -> bytes:
 
 def _decode_frame(body: bytes) -> Frame:
     fixed = _unpack(_FRAME, body, "frame")
-    name_length, sequence, raster, time_ns, rate, power, active, channels, n = fixed
+    name_length, sequence, frame_index, time_ns, rate, power, active, channels, n = fixed
     if not MIN_MICROPHONES <= channels <= MAX_MICROPHONES:
         raise WireError(f"frame: expected 2 to 16 channels, got {channels}")
     if not 0 < n <= MAX_FRAME_SAMPLES:
@@ -226,7 +228,7 @@ def _decode_frame(body: bytes) -> Frame:
         raise WireError(
             f"frame: expected 0 < rate <= {MAX_RATE_HZ:g} Hz and 0 <= power <= {MAX_POWER:g}, got {rate} and {power}"
         )
-    _check_raster(raster, "frame")
+    _check_frame_index(frame_index, "frame")
     name, start = _name(body, _FRAME.size, name_length)
     if len(body) - start != 4 * channels * n:
         raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
@@ -236,7 +238,7 @@ def _decode_frame(body: bytes) -> Frame:
         raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
     if largest > MAX_SAMPLE:
         raise WireError(f"frame of array {name!r}: expected samples up to {MAX_SAMPLE:g}, got {largest:g}")
-    return Frame(name, sequence, raster, time_ns, rate, samples, power, active)
+    return Frame(name, sequence, frame_index, time_ns, rate, samples, power, active)
 
 
 def _encode_mark(mark: Mark) -> bytes:
@@ -244,7 +246,7 @@ def _encode_mark(mark: Mark) -> bytes:
     fixed = _MARK.pack(
         len(name),
         mark.sequence,
-        mark.raster,
+        mark.frame_index,
         mark.power,
         mark.noise_power,
         mark.overflows,
@@ -258,10 +260,10 @@ def _encode_mark(mark: Mark) -> bytes:
 
 def _decode_mark(body: bytes) -> Mark:
     fixed = _unpack(_MARK, body, "mark")
-    name_length, sequence, raster, power, noise, overflows, lost, drift, clock, channels = fixed
+    name_length, sequence, frame_index, power, noise, overflows, lost, drift, clock, channels = fixed
     if clock >= len(_CLOCK_STATES) or channels > MAX_MICROPHONES:
         raise WireError(f"mark: expected a known clock state and at most 16 channels, got {clock} and {channels}")
-    _check_raster(raster, "mark")
+    _check_frame_index(frame_index, "mark")
     name, start = _name(body, _MARK.size, name_length)
     if len(body) - start != 8 * channels:
         raise WireError(f"mark: expected {8 * channels} bytes of channel powers, got {len(body) - start}")
@@ -270,7 +272,7 @@ def _decode_mark(body: bytes) -> Mark:
         raise WireError(f"mark of array {name!r}: expected powers from 0 to {MAX_POWER:g}")
     if not math.isfinite(drift):
         raise WireError(f"mark of array {name!r}: expected a finite drift, got {drift}")
-    return Mark(name, sequence, raster, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])
+    return Mark(name, sequence, frame_index, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])
 
 
 def _decode_json(type_: type[_Json], body: bytes) -> WireMessage:
@@ -290,13 +292,15 @@ def _decode_json(type_: type[_Json], body: bytes) -> WireMessage:
         if not valid(fields[name]):
             raise WireError(f"{what}: field {name!r} has a wrong type or value")
     for name in {"backlog", "wanted"} & fields.keys():
-        fields[name] = {array: tuple(rasters) for array, rasters in fields[name].items()}
+        fields[name] = {array: tuple(frame_indices) for array, frame_indices in fields[name].items()}
     return type_(**fields)
 
 
-def _check_raster(raster: int, what: str) -> None:
-    if abs(raster) > MAX_RASTER:
-        raise WireError(f"{what}: expected a raster index from -{MAX_RASTER} to {MAX_RASTER}, got {raster}")
+def _check_frame_index(frame_index: int, what: str) -> None:
+    if abs(frame_index) > MAX_FRAME_INDEX:
+        raise WireError(
+            f"{what}: expected a frame index from -{MAX_FRAME_INDEX} to {MAX_FRAME_INDEX}, got {frame_index}"
+        )
 
 
 def _is_unicode(value: Any) -> bool:
@@ -316,12 +320,12 @@ def _is_rate(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_RATE_HZ
 
 
-def _is_raster(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_RASTER
+def _is_frame_index(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_FRAME_INDEX
 
 
 def _is_span(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_raster, value)) and value[0] < value[1]
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_frame_index, value)) and value[0] < value[1]
 
 
 def _is_flag(value: Any) -> bool:
@@ -344,8 +348,8 @@ _FIELDS: Final[dict[type[_Json], dict[str, Any]]] = {
     },
     Ack: {
         "run_id": _is_name,
-        "received": _is_map_of(_is_raster),
-        "settled": lambda value: value is None or _is_raster(value),
+        "received": _is_map_of(_is_frame_index),
+        "settled": lambda value: value is None or _is_frame_index(value),
         "who_are_you": _is_flag,
         "refused": _is_text,
     },

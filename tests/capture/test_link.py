@@ -18,7 +18,7 @@ from livessl import wire
 from livessl.capture.link import BACKLOG_FRAMES, BEHIND_NS, SILENT_NS, Dealer, Link
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
-from livessl.core.types import Ask, Frame, Mark, Message
+from livessl.core.types import BackfillRequest, Frame, Mark, Message
 from livessl.server.receiver import Receiver
 from small_site import FIRST_RASTER, frame, mark, site_of, wait_until
 
@@ -76,8 +76,8 @@ class Router:
 
     def ack(self, settled: int | None = None, **received: int) -> None:
         """Say which frames are here, by number, and before which all is settled."""
-        rasters = {array: FIRST_RASTER + number for array, number in received.items()}
-        self.say(wire.encode(wire.Ack("run-1", rasters, None if settled is None else FIRST_RASTER + settled)))
+        frame_indices = {array: FIRST_RASTER + number for array, number in received.items()}
+        self.say(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
 
     def hellos(self) -> list[wire.Hello]:
         return [message for message in self.got if isinstance(message, wire.Hello)]
@@ -291,8 +291,8 @@ def test_spool_is_bounded_and_counts_what_it_drops() -> None:
             def all_taken() -> bool:
                 link.service()
                 if router.read() and router.frames():
-                    rasters = {"north": router.frames()[-1]}
-                    router.say(wire.encode(wire.Ack("run-1", rasters)))
+                    frame_indices = {"north": router.frames()[-1]}
+                    router.say(wire.encode(wire.Ack("run-1", frame_indices)))
                 return link.pending == 0
 
             wait_until(all_taken, "what was kept")
@@ -523,8 +523,11 @@ def test_a_clock_set_back_an_hour_stops_nothing() -> None:
                 link.close(bye=False)
 
 
-def remembered(ask: Ask) -> list[Message]:
-    return [frame(0, raster=raster, array=ask.array, active=False) for raster in range(ask.first, ask.last + 1)]
+def remembered(ask: BackfillRequest) -> list[Message]:
+    return [
+        frame(0, frame_index=frame_index, array=ask.array, active=False)
+        for frame_index in range(ask.first, ask.last + 1)
+    ]
 
 
 def test_what_the_server_asks_for_is_sent_and_not_kept() -> None:
@@ -539,7 +542,9 @@ def test_what_the_server_asks_for_is_sent_and_not_kept() -> None:
         assert last.answers
         router.say(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
         together(link, router, lambda: len(sounds(router)) == 3, "the answer")
-        assert [(m.array, m.raster, m.sequence) for m in sounds(router)] == [("south", k, 0) for k in (700, 701, 702)]
+        assert [(m.array, m.frame_index, m.sequence) for m in sounds(router)] == [
+            ("south", k, 0) for k in (700, 701, 702)
+        ]
         assert link.kept == link.pending == 0
         router.say(wire.encode(wire.Request("another run", {"south": (700, 703)})))
         router.ack()

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from livessl import wire
-from livessl.capture.devices import ArrayRecording, Placed
 from livessl.capture.link import Link
 from livessl.capture.node import (
     AHEAD_NS,
@@ -25,11 +24,12 @@ from livessl.capture.node import (
     capture_recordings,
     send_session,
 )
-from livessl.capture.recorded import Part
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.config import Site
 from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
+from livessl.recordings.assign import Part
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.receiver import Item, Joined, Left, Receiver
+from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, mark, site_of, wait_until
 
 START_NS = 1_767_225_600_000_000_000
@@ -107,8 +107,8 @@ def assert_whole(there: There, first: int = FIRST) -> None:
     for array in ARRAYS:
         messages = there.messages(array)
         assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
-        assert [m.raster - first for m in messages if isinstance(m, Frame) and m.active] == [20, 21, 22, 23]
-        assert messages[-1].raster == first + 29
+        assert [m.frame_index - first for m in messages if isinstance(m, Frame) and m.active] == [20, 21, 22, 23]
+        assert messages[-1].frame_index == first + 29
 
 
 def test_session_arrives_whole_and_is_said_good_bye_to() -> None:
@@ -206,7 +206,7 @@ def test_recordings_arrive_whole() -> None:
         wait_until(lambda: there.of(Left), "the good-bye")
         assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
         for array in ARRAYS:
-            frames = [m.raster - first for m in there.messages(array) if isinstance(m, Frame)]
+            frames = [m.frame_index - first for m in there.messages(array) if isinstance(m, Frame)]
             assert sorted(frames) == list(range(12, 30))  # live ones overtake what was cut before the connection
 
 
@@ -293,8 +293,8 @@ def test_device_is_entered_heard_and_left() -> None:
     assert device.left
     for array in ARRAYS:
         frames = [m for m in there.messages(array) if isinstance(m, Frame)]
-        assert [frame.raster - FIRST for frame in frames if frame.active] == [*range(10, 20)]
-        assert there.messages(array)[-1].raster == FIRST + 29
+        assert [frame.frame_index - FIRST for frame in frames if frame.active] == [*range(10, 20)]
+        assert there.messages(array)[-1].frame_index == FIRST + 29
 
 
 def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCaptureFixture) -> None:
@@ -314,7 +314,7 @@ def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCap
         assert isinstance(left, Left)
         assert left.hello.problem is None
         assert len(there.of(Joined)) == 1
-        assert there.messages("south")[-1].raster == FIRST + 29
+        assert there.messages("south")[-1].frame_index == FIRST + 29
     assert seen <= {None, unplugged}
     assert caplog.text.count("is not connected") == 1
     assert "device 'UMC1820' delivers sound" in caplog.text
@@ -329,7 +329,7 @@ def test_device_is_left_when_told_to_stop() -> None:
 
     there, device = captured([None] * 100, after_twenty)
     assert device.left
-    assert all(m.raster < FIRST + 20 for m in there.messages("north"))
+    assert all(m.frame_index < FIRST + 20 for m in there.messages("north"))
 
 
 def test_full_scale_and_beyond_arrive_as_they_are() -> None:

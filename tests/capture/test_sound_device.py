@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from conftest import require
 from livessl.capture import sound_device
-from livessl.capture.devices import DeviceError
 from livessl.capture.sound_device import SoundDevice, input_devices
 from livessl.clock import UnpacedClock
-from livessl.config import SoundDeviceConfig
 from livessl.core.types import FRAME_NS
+from livessl.errors import DeviceError
+from livessl.site.models import SoundDeviceConfig
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -377,7 +377,7 @@ import sys
 import numpy as np
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.config import SoundDeviceConfig
+from livessl.site.models import SoundDeviceConfig
 
 with SoundDevice(SoundDeviceConfig(name="virtual", sample_rate_hz=48000), 4, SystemClock()) as device:
     blocks = []
@@ -399,7 +399,7 @@ WATCHER = """
 import json
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.config import SoundDeviceConfig
+from livessl.site.models import SoundDeviceConfig
 
 clock, last = SystemClock(), None
 end_ns = clock.now_ns() + 60_000_000_000
@@ -545,7 +545,7 @@ def test_records_each_channel_of_a_card_in_its_place(card: VirtualCard, tmp_path
     assert recorded["samples"].shape == (4, count * BLOCK)
     assert not recorded["overflow"].any()
     assert_array_equal(recorded["first_index"], BLOCK * np.arange(count))
-    # Stamps serve to put frames on a raster of 50 ms, so most must lie nearer than that to an even run.
+    # Stamps serve to put frames on a frame index of 50 ms, so most must lie nearer than that to an even run.
     even_ns = recorded["stamp_ns"][0] + recorded["first_index"] / RATE_HZ * 1e9
     assert np.median(np.abs(recorded["stamp_ns"] - even_ns)) < FRAME_NS
 

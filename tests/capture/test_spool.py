@@ -22,8 +22,8 @@ from small_site import frame
 SIZE = len(wire.encode(frame()))
 
 
-def rasters(spool: Spool) -> list[tuple[str, int]]:
-    return [(kept.array, kept.raster) for kept in spool.frames()]
+def frame_indices(spool: Spool) -> list[tuple[str, int]]:
+    return [(kept.array, kept.frame_index) for kept in spool.frames()]
 
 
 def contents(spool: Spool) -> list[bytes]:
@@ -33,7 +33,7 @@ def contents(spool: Spool) -> list[bytes]:
 def filled(directory: Path | None, numbers: range = range(1, 11), **limits: float) -> Spool:
     spool = Spool(directory, **limits)  # type: ignore[arg-type]
     for k in numbers:
-        spool.append(frame(k, raster=k, array="south" if k % 3 == 0 else "north"))
+        spool.append(frame(k, frame_index=k, array="south" if k % 3 == 0 else "north"))
     return spool
 
 
@@ -44,7 +44,9 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | None:
 
 def test_frames_come_back_unchanged_in_order_of_time(place: Path | None) -> None:
     spool = Spool(place)
-    frames = [frame(k, raster=r, array=a, seed=k) for k, (a, r) in enumerate([("a", 3), ("b", 1), ("a", 5), ("b", 4)])]
+    frames = [
+        frame(k, frame_index=r, array=a, seed=k) for k, (a, r) in enumerate([("a", 3), ("b", 1), ("a", 5), ("b", 4)])
+    ]
     for one in frames:
         spool.append(one)
     assert contents(spool) == [wire.encode(frames[k]) for k in (1, 0, 3, 2)]
@@ -54,7 +56,7 @@ def test_frames_come_back_unchanged_in_order_of_time(place: Path | None) -> None
 def test_what_is_settled_is_forgotten(place: Path | None) -> None:
     spool = filled(place)
     spool.forget("north", 6)
-    assert rasters(spool) == [("south", 3), ("south", 6), ("north", 7), ("north", 8), ("south", 9), ("north", 10)]
+    assert frame_indices(spool) == [("south", 3), ("south", 6), ("north", 7), ("north", 8), ("south", 9), ("north", 10)]
     spool.forget("south", 100)
     spool.forget("nobody", 100)
     assert len(spool) == 3
@@ -63,23 +65,23 @@ def test_what_is_settled_is_forgotten(place: Path | None) -> None:
 
 def test_oldest_go_first_and_are_told(place: Path | None) -> None:
     spool = filled(place, range(1, 5), max_bytes=4 * SIZE)
-    _, gone = spool.append(frame(5, raster=5))
-    assert [(kept.array, kept.raster) for kept in gone] == [("north", 1)]
-    assert [raster for _, raster in rasters(spool)] == [2, 3, 4, 5]
+    _, gone = spool.append(frame(5, frame_index=5))
+    assert [(kept.array, kept.frame_index) for kept in gone] == [("north", 1)]
+    assert [frame_index for _, frame_index in frame_indices(spool)] == [2, 3, 4, 5]
     spool.close()
 
 
 def test_age_is_bounded(place: Path | None) -> None:
     spool = filled(place, range(1, 40), max_age_s=0.5)
-    assert [raster for _, raster in rasters(spool)] == list(range(29, 40))
+    assert [frame_index for _, frame_index in frame_indices(spool)] == list(range(29, 40))
     spool.close()
 
 
 def test_clock_set_back_takes_the_future_away(place: Path | None) -> None:
     spool = filled(place, range(1, 9))
-    _, gone = spool.append(frame(9, raster=5))
-    assert sorted(kept.raster for kept in gone) == [5, 7, 8]
-    assert rasters(spool) == [("north", 1), ("north", 2), ("south", 3), ("north", 4), ("north", 5), ("south", 6)]
+    _, gone = spool.append(frame(9, frame_index=5))
+    assert sorted(kept.frame_index for kept in gone) == [5, 7, 8]
+    assert frame_indices(spool) == [("north", 1), ("north", 2), ("south", 3), ("north", 4), ("north", 5), ("south", 6)]
     spool.close()
 
 
@@ -90,7 +92,7 @@ def test_frames_outlive_the_node(tmp_path: Path) -> None:
     again = Spool(tmp_path)
     assert contents(again) == expected
     assert again.torn == 0
-    again.append(frame(11, raster=11))
+    again.append(frame(11, frame_index=11))
     assert len(Spool(tmp_path)) == 11
     spool.close()
     again.close()
@@ -103,7 +105,7 @@ def test_node_that_is_killed_leaves_whole_frames(tmp_path: Path) -> None:
     if child == 0:
         spool = Spool(tmp_path)
         for k in range(1, 100_000):
-            spool.append(frame(k, raster=k))
+            spool.append(frame(k, frame_index=k))
             if k == 20:
                 os.write(told, b"!")
         os._exit(1)
@@ -111,7 +113,7 @@ def test_node_that_is_killed_leaves_whole_frames(tmp_path: Path) -> None:
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     again = Spool(tmp_path)
-    got = [raster for _, raster in rasters(again)]
+    got = [frame_index for _, frame_index in frame_indices(again)]
     assert len(got) >= 20
     assert got == list(range(1, len(got) + 1))
     for data in contents(again):
@@ -137,7 +139,7 @@ def test_torn_or_changed_tail_ends_a_segment(
     whole = max(0, len(torn) - 8) // (SIZE + 8)
     if flip is None:
         assert len(again) == whole
-    assert [raster for _, raster in rasters(again)] == list(range(1, len(again) + 1))
+    assert [frame_index for _, frame_index in frame_indices(again)] == list(range(1, len(again) + 1))
     for kept in again.frames():
         assert wire.decode(again.read(kept)) is not None
     again.close()
@@ -153,7 +155,9 @@ def test_segments_go_when_nothing_of_them_is_needed(tmp_path: Path, monkeypatch:
     assert len(contents(spool)) == 5
     spool.close()
     again = Spool(tmp_path)
-    assert [raster for _, raster in rasters(again)] == list(range(4, 11))  # two more than needed: they share a segment
+    assert [frame_index for _, frame_index in frame_indices(again)] == list(
+        range(4, 11)
+    )  # two more than needed: they share a segment
     again.forget("north", 100)
     again.forget("south", 100)
     assert list(tmp_path.iterdir()) == []
@@ -176,16 +180,16 @@ def test_full_disk_costs_nothing_while_memory_lasts(tmp_path: Path, caplog: pyte
     spool = Spool(tmp_path)
     with disk_of(SIZE // 2):
         for k in range(1, 8):
-            spool.append(frame(k, raster=k))
-    assert [raster for _, raster in rasters(spool)] == list(range(1, 8))
+            spool.append(frame(k, frame_index=k))
+    assert [frame_index for _, frame_index in frame_indices(spool)] == list(range(1, 8))
     for data in contents(spool):
         assert isinstance(wire.decode(data), Frame)
-    spool.append(frame(8, raster=8))
+    spool.append(frame(8, frame_index=8))
     assert len(contents(spool)) == 8
     assert caplog.text.count("kept in memory now: free space") == 1
     spool.close()
     again = Spool(tmp_path)
-    assert [raster for _, raster in rasters(again)] == [8]
+    assert [frame_index for _, frame_index in frame_indices(again)] == [8]
     again.close()
 
 

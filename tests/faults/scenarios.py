@@ -17,7 +17,7 @@ def nothing(world: World) -> None:
 
 def server_killed(world: World) -> None:
     """With -9 at any moment: between two turns, just before events are stored, or just after."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 40))
         _kill_server(world)
         world.run(world.rng.randint(0, 60))
@@ -26,7 +26,7 @@ def server_killed(world: World) -> None:
 
 def links_cut(world: World) -> None:
     """One node's or both, for up to a minute."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 100))
         names = world.rng.choice([["a"], ["b"], ["a", "b"]])
         world.cut.update(names)
@@ -37,7 +37,7 @@ def links_cut(world: World) -> None:
 
 def connections_reset(world: World) -> None:
     """What was on its way is gone, in both directions."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 30))
         world.reset(world.rng.choice("ab"))
 
@@ -49,14 +49,14 @@ def stalls(world: World) -> None:
 
 def links_narrow(world: World) -> None:
     """Room for a frame in each interval, for less, or for hardly one in a second; marks take some of it too."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.bytes_per_tick = world.rng.choice([40, 80, 150, 300, 600])
         world.run(world.rng.choice([20, 100, 400, 800]))
 
 
 def cut_then_narrow(world: World) -> None:
     """What was kept while a link was cut has to follow over one that hardly carries what is heard."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.bytes_per_tick = inf
         world.run(world.rng.randint(1, 60))
         names = world.rng.choice([["a"], ["b"], ["a", "b"]])
@@ -70,7 +70,7 @@ def cut_then_narrow(world: World) -> None:
 
 def nodes_stopped(world: World) -> None:
     """With SIGSTOP for up to two seconds; the device's buffer holds what is heard meanwhile."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 60))
         node = world.nodes[world.rng.choice("ab")]
         node.stopped = True
@@ -80,7 +80,7 @@ def nodes_stopped(world: World) -> None:
 
 def disk_full(world: World) -> None:
     """The database takes nothing for a while, and the server is killed meanwhile or not."""
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 60))
         world.store.full = True
         world.run(world.rng.randint(1, 100))
@@ -93,7 +93,7 @@ def disk_full(world: World) -> None:
 def everything(world: World) -> None:
     """All of it, and messages that take up to 0.3 s."""
     world.delay_ticks = (0, 6)
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 50))
         match world.rng.randint(0, 4):
             case 0:
@@ -122,7 +122,7 @@ def everything(world: World) -> None:
 def _kill_server(world: World) -> None:
     how = world.rng.choice(["between", "before", "after"])
     world.store.dies = None if how == "between" else how
-    while world.store.dies is not None and world.raster < world.end:
+    while world.store.dies is not None and world.frame_index < world.end:
         world.tick()
     world.kill_server()
 
@@ -171,7 +171,7 @@ def nodes_killed(seed: int, spools: Path, expected: list[Event]) -> str | None:
     through is told as undisturbed. Returns what is wrong.
     """
     world = World(seed, spools=spools)
-    while world.raster < world.end:
+    while world.frame_index < world.end:
         world.run(world.rng.randint(1, 100))
         name = world.rng.choice("ab")
         world.kill_node(name)

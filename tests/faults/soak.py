@@ -28,21 +28,19 @@ from unittest.mock import patch
 from mutation import mutated, originals
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
-from world import START, Event, HandClock, Microphones, Post, World
+from world import START, Event, Microphones, Post, World
 
 from clients import Listener, Log, open_client
 from livessl import wire
-from livessl.capture.devices import ArrayRecording, Placed
-from livessl.capture.line import played_messages
-from livessl.capture.recorded import Part, lines_of
 from livessl.clock import UnpacedClock, utc_ns
-from livessl.config import Site
 from livessl.core.types import FRAME_NS, Frame, Message
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
-from livessl.server.engine import Engine
 from livessl.server.latency import Arrival
-from livessl.server.refusals import Refusals
 from livessl.simulate.scene import make_scene, render
+from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
 
 SECOND = 20
@@ -116,7 +114,7 @@ class Sample(NamedTuple):
 Tell = Callable[[Sample], None]
 
 Heard = Mapping[int, Sequence[Frame]]
-"""What an array's node sends of a sound, by raster interval since the sound's recording began."""
+"""What an array's node sends of a sound, by frame index since the sound's recording began."""
 
 
 def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
@@ -146,12 +144,12 @@ def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
 def _by_interval(site: Site, part: Part) -> dict[int, list[Frame]]:
     found: dict[int, list[Frame]] = {}
     run_up: list[Frame] = []
-    for _, batch in played_messages(*lines_of(site, [part]), UnpacedClock()):
+    for _, batch in played_messages(*pipelines_of(site, [part]), UnpacedClock()):
         for message in batch:
             if isinstance(message, Frame):
                 run_up.append(message)
-                if message.active or message.raster - 1 in found:
-                    found[message.raster], run_up = run_up, []
+                if message.active or message.frame_index - 1 in found:
+                    found[message.frame_index], run_up = run_up, []
     return found
 
 
@@ -162,25 +160,27 @@ class Player(Microphones):
     sounds: Sequence[Mapping[str, Heard]] = ()
     sent: Counter[str] = field(default_factory=Counter)
 
-    def hear(self, raster: int) -> list[Message]:
-        messages = self._heard(raster)
+    def hear(self, frame_index: int) -> list[Message]:
+        messages = self._heard(frame_index)
         self.sent.update(type(message).__name__ for message in messages)
         return messages
 
-    def _heard(self, raster: int) -> list[Message]:
-        slot, since = divmod(raster - START, SLOT)
+    def _heard(self, frame_index: int) -> list[Message]:
+        slot, since = divmod(frame_index - START, SLOT)
         played = sound_of(slot, len(self.sounds))
         if played is None:
-            return super().hear(raster)
-        began = raster - since + played[0]
-        frames = self.sounds[played[1]][self.array].get(raster - began, ())
+            return super().hear(frame_index)
+        began = frame_index - since + played[0]
+        frames = self.sounds[played[1]][self.array].get(frame_index - began, ())
         if not frames:
-            return super().hear(raster)
+            return super().hear(frame_index)
         messages: list[Message] = []
         for frame in frames:
             self.sequence += 1
-            at = frame.raster + began
-            messages.append(replace(frame, sequence=self.sequence, raster=at, time_ns=frame.time_ns + began * FRAME_NS))
+            at = frame.frame_index + began
+            messages.append(
+                replace(frame, sequence=self.sequence, frame_index=at, time_ns=frame.time_ns + began * FRAME_NS)
+            )
         return messages
 
 
@@ -196,32 +196,12 @@ def sound_of(slot: int, count: int) -> tuple[int, int] | None:
 class _Post(Post):
     """As the receiver, its books on arrivals included."""
 
-    endpoint = "nowhere"
-
-    def __init__(self, site: Site, clock: HandClock) -> None:
-        super().__init__(site, clock)
-        self.refusals = Refusals(clock)
-        self.enrolled: list[str] = []
-
     def receive(self, routing_id: bytes, data: bytes) -> list[tuple[bytes, wire.Ack]]:
         before = len(self.queue)
         replies = super().receive(routing_id, data)
         if len(self.queue) > before and isinstance(item := self.queue[-1], Message):
-            self.arrivals.note(item.raster, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+            self.arrivals.note(item.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
         return replies
-
-    def start(self) -> None:
-        """There is no thread."""
-
-    def stop(self) -> None:
-        """There is no socket."""
-
-
-class _Driven(Engine):
-    """An engine whose turns are taken from outside."""
-
-    def start(self) -> None:
-        self.maps.start()
 
 
 class Soak(World):
@@ -263,9 +243,9 @@ class Soak(World):
 
     def start_server(self) -> None:
         self.site = self._soaked
-        with patch("livessl.server.engine.Receiver", _Post), patch("livessl.server.app.Engine", _Driven):
-            self.http = Server(self.site, self.clock, on_event=self._note)
-        self.server = self.http.engine
+        self.post = _Post(self.site, self.clock)
+        self.http = Server(self.site, self.clock, on_event=self._note, receiver=self.post, stepped=True)
+        self.server = self.http.parts
 
     def _note(self, event: Event) -> None:
         self.slots.add((utc_ns(event["time_utc"]) // FRAME_NS - START) // SLOT)
@@ -286,40 +266,42 @@ class Soak(World):
     @property
     def hours(self) -> float:
         """That have passed."""
-        return (self.raster - START) / HOUR
+        return (self.frame_index - START) / HOUR
 
     def tick(self) -> None:
         """An interval passes, or in quiet half a second at once: what else there is to do then is much the same."""
-        step = STRIDE if self.raster % STRIDE == 0 and self._is_quiet() else 1
+        step = STRIDE if self.frame_index % STRIDE == 0 and self._is_quiet() else 1
         self.clock.time_ns += step * FRAME_NS
-        self.raster += step
+        self.frame_index += step
         for node in self.nodes.values():
             if not node.stopped:  # else its device's buffer holds what is heard
-                first = self.raster - step if node.next_raster is None else node.next_raster
-                node.link.send([m for raster in range(first, self.raster) for m in node.microphones.hear(raster)])
-                node.next_raster = self.raster
+                first = self.frame_index - step if node.next_raster is None else node.next_raster
+                node.link.send(
+                    [m for frame_index in range(first, self.frame_index) for m in node.microphones.hear(frame_index)]
+                )
+                node.next_raster = self.frame_index
         self._serve()
 
     def _is_quiet(self) -> bool:
-        slot, since = divmod(self.raster - START, SLOT)
+        slot, since = divmod(self.frame_index - START, SLOT)
         played = sound_of(slot, len(self._rendered))
         return played is None or not -STRIDE < since - played[0] < CLIP
 
     def run(self, ticks: int) -> None:
-        end = self.raster + ticks
-        while self.raster < end:
+        end = self.frame_index + ticks
+        while self.frame_index < end:
             self.tick()
-            if self.raster % SECOND == 0:
+            if self.frame_index % SECOND == 0:
                 self._breathe()
-            if (self.raster - START) % self._sample == 0:
+            if (self.frame_index - START) % self._sample == 0:
                 kept = sum(node.link.kept for node in self.nodes.values())
                 self.memory.append(Sample(self.hours, resident_mb(), kept))
                 self._tell(self.memory[-1])
 
     def _breathe(self) -> None:
         """Wait until the server's loop has told all that it was given; else it would fall behind by hours."""
-        if self.http.engine.failure is not None:
-            raise RuntimeError("the server has failed") from self.http.engine.failure
+        if self.http.parts.failure is not None:
+            raise RuntimeError("the server has failed") from self.http.parts.failure
         assert self.http._loop is not None
         asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result()
 
@@ -538,8 +520,8 @@ def soak(
         begin_mb = resident_mb()
         end = START + round(hours * HOUR)
         for ticks in world.disturbances():
-            world.run(min(ticks, end - world.raster))
-            if world.raster >= end:
+            world.run(min(ticks, end - world.frame_index))
+            if world.frame_index >= end:
                 break
         world.run(SLOT)  # the last sound's end
         sounds = {slot for slot in range(round(hours * HOUR) // SLOT) if sound_of(slot, SOUNDS) is not None}
@@ -548,7 +530,7 @@ def soak(
         return Outcome(
             hours=hours,
             sounds=len(sounds),
-            events=world.http.engine.events,
+            events=world.http.parts.event_log.published,
             unheard=len(sounds - world.slots),
             messages=dict(world.sent),
             begin_mb=round(begin_mb, 1),
@@ -558,7 +540,7 @@ def soak(
             end_mb=round(resting[-1], 1),
             peak_mb=round(max(sample.resident_mb for sample in world.memory), 1),
             resting=len(resting) / len(after),
-            stored=world.http._store.count(),
+            stored=world.http.parts.store.count(),
             faults=dict(world.faults),
             clients=dict(crowd.heard),
             seconds=round(time.monotonic() - began_s, 1),

@@ -64,7 +64,7 @@ def test_a_narrow_link_carries_nothing_twice() -> None:
     links_narrow(world)
     world.recover()
     assert world.server is not None
-    arrays = world.server.arrays()
+    arrays = world.server.array_states.describe()
     assert sum(array["counters"]["backfilled"] for array in arrays) > 200
     assert [array["counters"][what] for array in arrays for what in ("sequence_gaps", "duplicates")] == [0] * 4
 
@@ -72,7 +72,7 @@ def test_a_narrow_link_carries_nothing_twice() -> None:
 def test_late_events_are_marked_and_name_what_they_replace() -> None:
     world = World(1)
     both = next(sound for sound in world.groups() if sum(bool(sound & a) for _, a in world.sounds) == 2)
-    world.run(min(both) - world.raster - 20)
+    world.run(min(both) - world.frame_index - 20)
     world.cut.add("a")
     world.run(max(both) - min(both) + 50)
     provisional = world.published_events[-1]
@@ -94,7 +94,7 @@ def test_late_event_of_another_id_takes_the_place_of_what_was_told() -> None:
         for (north, a), (south, b) in pairwise(world.sounds)
         if (north, south) == ("north", "south") and 0 < min(b) - min(a) < 3 and max(b) - min(a) < 30
     )
-    world.run(first - world.raster - 20)
+    world.run(first - world.frame_index - 20)
     world.cut.add("a")
     world.run(20 + 70)
     provisional = world.published_events[-1]
@@ -112,7 +112,7 @@ def test_dead_array_delays_nobody() -> None:
     world = World(2)
     world.run(20)
     world.kill_node("b")
-    world.run(world.end - world.raster + 20)
+    world.run(world.end - world.frame_index + 20)
     heard = [e for e in world.published_events if e["heard_by"] == ["north"]]
     assert len(heard) == len([1 for array, _ in world.sounds if array == "north"])
     assert max(event["latency_s"] for event in heard) < 0.6

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import pytest
 from soak import GROWTH, READERS, Outcome, soak
 
-from livessl.core.settling import Settling
+from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.core.types import Message
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(120)]
@@ -32,14 +32,14 @@ def steady(directory: Path) -> Outcome:
 
 def leaking(directory: Path) -> Outcome:
     kept: list[Message | bytes] = []
-    take = Settling._take
+    take = TwoPassFusion._take
 
-    def hoard(self: Settling, message: Message, now_ns: int) -> bool:
+    def hoard(self: TwoPassFusion, message: Message, now_ns: int) -> bool:
         kept.append(message)
         kept.append(bytes(MARK_BYTES))
         return take(self, message, now_ns)
 
-    with patch.object(Settling, "_take", hoard):
+    with patch.object(TwoPassFusion, "_take", hoard):
         return steady(directory)
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any, ClassVar
-from unittest.mock import patch
 
 import numpy as np
 
@@ -21,18 +20,22 @@ from livessl import wire
 from livessl.capture.link import Dealer, Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
-from livessl.config import Site
-from livessl.core.estimators import ESTIMATORS, Localization, PowerMaps, Sound
-from livessl.core.types import FRAME_NS, Frame, HeardBy, Mark, Message
-from livessl.server.engine import Engine
+from livessl.core.locate.estimators import ESTIMATORS, Localization, PowerMaps, Sound
+from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
+from livessl.server.app import assemble
+from livessl.server.fanout import Fanout
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrivals
+from livessl.server.parts import Parts
 from livessl.server.receiver import Greeted, Item, Joined, Left
+from livessl.server.refusals import Refusals
+from livessl.server.sinks import Sinks
 from livessl.server.store import Query, Store, StoreError
+from livessl.site.models import Site
 from small_site import RATE_HZ, site_of
 
 START = 20 * 1_767_225_600
-"""Raster index at which every world begins."""
+"""Frame index at which every world begins."""
 
 HANG_OVER, PRE_ROLL = 6, 8
 BUFFERED = 30
@@ -71,7 +74,7 @@ class Fingerprint:
                 position += (k + 1) * np.array([segment.sum(), (segment * ramp).sum() / (n + 1), segment.shape[1]])
         return Localization(position, 0.01 * np.eye(3), 0.5, ())
 
-    def power_maps(self, evidence: Sequence[HeardBy], separately: Collection[str] | None = None) -> PowerMaps:
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         raise AssertionError("nobody looks at maps here")
 
 
@@ -147,40 +150,57 @@ class Microphones:
     sequence: int = 0
     began: int | None = None
 
-    def hear(self, raster: int) -> list[Message]:
+    def hear(self, frame_index: int) -> list[Message]:
         if self.began is None:
-            self.began = raster
-        if not any(raster - k in self.active for k in range(HANG_OVER + 1) if raster - k >= self.began):
-            return [Mark(self.array, self.sequence, raster, 1e-7, 1e-7, (1e-7,) * 4)]
+            self.began = frame_index
+        if not any(frame_index - k in self.active for k in range(HANG_OVER + 1) if frame_index - k >= self.began):
+            return [Mark(self.array, self.sequence, frame_index, 1e-7, 1e-7, (1e-7,) * 4)]
         messages: list[Message] = []
-        if raster in self.active and not any(raster - k in self.active for k in range(1, HANG_OVER + 1)):
+        if frame_index in self.active and not any(frame_index - k in self.active for k in range(1, HANG_OVER + 1)):
             quiet = 0
-            while quiet < PRE_ROLL and raster - quiet - 1 >= self.began and self._is_quiet(raster - quiet - 1):
+            while (
+                quiet < PRE_ROLL and frame_index - quiet - 1 >= self.began and self._is_quiet(frame_index - quiet - 1)
+            ):
                 quiet += 1
-            messages += [self._frame(r) for r in range(raster - quiet, raster)]
-        return [*messages, self._frame(raster)]
+            messages += [self._frame(r) for r in range(frame_index - quiet, frame_index)]
+        return [*messages, self._frame(frame_index)]
 
-    def _is_quiet(self, raster: int) -> bool:
-        return not any(raster - k in self.active for k in range(HANG_OVER + 1))
+    def _is_quiet(self, frame_index: int) -> bool:
+        return not any(frame_index - k in self.active for k in range(HANG_OVER + 1))
 
-    def _frame(self, raster: int) -> Frame:
+    def _frame(self, frame_index: int) -> Frame:
         self.sequence += 1
-        rng = np.random.default_rng([raster, len(self.array), ord(self.array[0])])
+        rng = np.random.default_rng([frame_index, len(self.array), ord(self.array[0])])
         samples = (rng.integers(-8, 8, (4, 10)) / 16).astype(np.float32)  # sums of these are exact
-        active = raster in self.active
+        active = frame_index in self.active
         power = 1e-2 * rng.uniform(0.5, 1.0) if active else float(rng.choice([1e-7, 2e-3]))
-        return Frame(self.array, self.sequence, raster, raster * FRAME_NS, float(RATE_HZ), samples, power, active)
+        return Frame(
+            self.array, self.sequence, frame_index, frame_index * FRAME_NS, float(RATE_HZ), samples, power, active
+        )
 
 
 class Post:
     """The receiver without its socket and thread."""
 
+    endpoint = "nowhere"
+
     def __init__(self, site: Site, clock: HandClock) -> None:
         self.ingest = Ingest(site)
         self.arrivals = Arrivals()
-        self.failure = None
+        self.refusals = Refusals(clock)
+        self.enrolled: list[str] = []
+        self.failure: BaseException | None = None
         self.queue: deque[Item] = deque()
         self._clock = clock
+
+    def start(self) -> None:
+        """There is no thread."""
+
+    def stop(self) -> None:
+        """There is no socket."""
+
+    def request(self, request: BackfillRequest) -> None:
+        raise AssertionError("no node here answers requests for missing frames")
 
     def take(self, most: int, wait_s: float) -> list[Item]:
         return [self.queue.popleft() for _ in range(min(most, len(self.queue)))]
@@ -213,17 +233,17 @@ class FragileStore(Store):
         self.dies: str | None = None
         self.full = False
 
-    def add(self, event: Event, time_ns: int, *, provisional: bool = False) -> None:
+    def add(self, event: Event, time_ns: int, *, early: bool = False) -> None:
         if self.full:
             raise StoreError("disk full")
-        super().add(event, time_ns, provisional=provisional)
+        super().add(event, time_ns, early=early)
 
-    def settle(self, *arguments: Any) -> None:
+    def finalize(self, *arguments: Any) -> None:
         if self.full:
             raise StoreError("disk full")
         if self.dies == "before":
             raise DiedError
-        super().settle(*arguments)
+        super().finalize(*arguments)
         if self.dies == "after":
             raise DiedError
 
@@ -270,9 +290,9 @@ class World:
         self.bytes_per_tick = inf  # of each node's link
         self._spools = spools
         self._connections = self._runs = 0
-        self.raster = START
+        self.frame_index = START
         self.sounds = self._make_sounds(sounds)
-        self.server: Engine | None = None
+        self.server: Parts | None = None
         self.nodes: dict[str, Node] = {}
         self.down: dict[str, list[tuple[int, int]]] = {name: [] for name in self.array_of}
         self.start_server()
@@ -281,7 +301,7 @@ class World:
 
     @property
     def end(self) -> int:
-        """The raster interval after the last sound."""
+        """The frame index after the last sound."""
         return max(max(active) for _, active in self.sounds) + 2 * HANG_OVER
 
     def _make_sounds(self, count: int) -> list[tuple[str, frozenset[int]]]:
@@ -300,8 +320,10 @@ class World:
     def start_server(self) -> None:
         fusion = self.site.fusion.model_copy(update={"method": "fingerprint"})
         site = self.site.model_copy(update={"fusion": fusion})
-        with patch("livessl.server.engine.Receiver", Post):
-            self.server = Engine(site, self.clock, self.store, self.published.append)
+        self.post = Post(site, self.clock)
+        self.server = assemble(
+            site, self.clock, self.store, Sinks(()), Fanout(), self.published.append, receiver=self.post
+        )
 
     def kill_server(self) -> None:
         self.server = None
@@ -315,17 +337,19 @@ class World:
         link = Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
         self.nodes[name] = Node(name, self._microphones(array), link)
         if self.down[name]:
-            self.down[name][-1] = (self.down[name][-1][0], self.raster)
+            self.down[name][-1] = (self.down[name][-1][0], self.frame_index)
 
     def _microphones(self, array: str) -> Microphones:
-        return Microphones(array, frozenset(r for of, rasters in self.sounds for r in rasters if of == array))
+        return Microphones(
+            array, frozenset(r for of, frame_indices in self.sounds for r in frame_indices if of == array)
+        )
 
     def kill_node(self, name: str) -> None:
         """Its files stay as they are; whatever was in memory is gone."""
         node = self.nodes.pop(name)
         node.link._spool.close()
         self.wires.pop(name, None)
-        self.down[name].append((self.raster, 2**62))
+        self.down[name].append((self.frame_index, 2**62))
 
     def reset(self, name: str) -> None:
         """The connection breaks: what was on its way is lost, in both directions."""
@@ -369,16 +393,18 @@ class World:
             self.wires.pop(node, None)
 
     def tick(self) -> None:
-        """One raster interval passes."""
+        """One frame index passes."""
         self.clock.time_ns += FRAME_NS // 2
         self._serve()
         self.clock.time_ns += FRAME_NS - FRAME_NS // 2
-        self.raster += 1
+        self.frame_index += 1
         for node in self.nodes.values():
-            first = self.raster - 1 if node.next_raster is None else node.next_raster
+            first = self.frame_index - 1 if node.next_raster is None else node.next_raster
             if not node.stopped:  # else its device's buffer holds what is heard
-                node.link.send([m for raster in range(first, self.raster) for m in node.microphones.hear(raster)])
-                first = self.raster
+                node.link.send(
+                    [m for frame_index in range(first, self.frame_index) for m in node.microphones.hear(frame_index)]
+                )
+                first = self.frame_index
             node.next_raster = first
         self._serve()
         for node in self.nodes.values():
@@ -388,7 +414,7 @@ class World:
     def _serve(self) -> None:
         if self.server is None:
             return
-        post: Post = self.server._receiver  # type: ignore[assignment]
+        post = self.post
         replies: list[tuple[bytes, wire.Ack]] = []
         for name, connection in self.wires.items():
             while name not in self.cut and connection.up and connection.up[0][0] <= self.clock.time_ns:
@@ -402,7 +428,7 @@ class World:
                 down.append((self._arrival(down), wire.encode(ack)))
         try:
             while True:
-                self.server._turn()
+                self.server.engine.turn()
                 if not post.queue:
                     break
         except DiedError:
@@ -426,7 +452,7 @@ class World:
             if name not in self.nodes:
                 self.start_node(name)
             self.nodes[name].stopped = False
-        self.run(max(0, self.end - self.raster) + ticks)
+        self.run(max(0, self.end - self.frame_index) + ticks)
 
     def events(self) -> list[Event]:
         """What is stored, oldest first, without what depends on when it was found out."""

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from livessl import wire
-from livessl.core.types import Ask
+from livessl.core.types import BackfillRequest
 from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Arrival, Ingest
 from livessl.wire import Ack, Bye, Hello, Request
 from small_site import frame, mark, site_of
@@ -230,7 +230,7 @@ def test_a_node_is_told_once_that_it_may_be_asked() -> None:
 
 def test_requests_go_to_nodes_that_know_them() -> None:
     into = ingest()
-    asks = [Ask("north", 100, 110), Ask("south", 100, 104)]
+    asks = [BackfillRequest("north", 100, 110), BackfillRequest("south", 100, 104)]
     tell(into, HELLO)
     assert into.requests(asks) == []
     tell(into, replace(HELLO, answers=True))
@@ -242,7 +242,7 @@ def test_requests_go_to_nodes_that_know_them() -> None:
 def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
     into = joined()
     tell(into, frame(1))
-    asked = frame(0, raster=700, active=False)
+    asked = frame(0, frame_index=700, active=False)
     assert tell(into, asked).message is not None
     assert tell(into, asked).message is not None
     assert (into.duplicates["north"], into.sequence_gaps["north"]) == (0, 0)

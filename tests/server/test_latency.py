@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
+from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS, Estimate, Event, Status, Update
-from livessl.messages import Messages, Stages
+from livessl.server.api.encode import Messages, Stages
 from livessl.server.latency import KEPT, Arrival, Arrivals, Latency
 from small_site import site_of
 
@@ -52,20 +53,22 @@ def test_nobody_knows_what_nobody_stamped() -> None:
 
 def test_old_intervals_are_forgotten() -> None:
     arrivals = Arrivals()
-    for raster in range(RASTER, RASTER + KEPT):
-        arrivals.note(raster, Arrival(END_NS, END_NS))
+    for frame_index in range(RASTER, RASTER + KEPT):
+        arrivals.note(frame_index, Arrival(END_NS, END_NS))
     assert arrivals.stages(UPDATE, END_NS) is not None
     arrivals.note(RASTER + KEPT, Arrival(END_NS, END_NS))
     assert arrivals.stages(UPDATE, END_NS) is None
 
 
 def test_histograms_hold_each_stage_and_the_sum() -> None:
-    latency = Latency()
-    stages = Stages(waited=0.3, sent=0.010, received=0.001, located=0.004)
-    latency.located("event", stages)
-    told = Messages(site_of(), 0, utc=True).event(EVENT, stages)
+    arrivals = Arrivals()
+    arrivals.note(RASTER, Arrival(END_NS + 10 * MS, END_NS + 11 * MS))
+    latency = Latency(UnpacedClock(END_NS + 15 * MS), arrivals)
+    stages = latency.located(EVENT)
+    assert stages == Stages(waited=0.3, sent=0.010, received=0.001, located=0.004)
+    message = Messages(site_of(), 0, utc=True).event(EVENT, stages)
     for seconds in (0.005, 0.002):  # to two clients
-        latency.delivered(told, seconds)
+        latency.delivered(message, seconds)
     registry = CollectorRegistry()
     registry.register(latency.histogram)
 

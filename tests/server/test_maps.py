@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from livessl.clock import SystemClock
-from livessl.core.estimators import PowerMaps
 from livessl.core.geometry import Grid
-from livessl.core.types import GCC, ArraySpec, HeardBy, Window
+from livessl.core.locate.estimators import PowerMaps
+from livessl.core.types import GCC, ArraySpec, Evidence, Window
 from livessl.server.maps import HEADER, INTERVAL_NS, Maps
 from small_site import wait_until
 
@@ -39,7 +39,7 @@ class Artist:
 
 
 def window(time_ns: int) -> Window:
-    return Window(time_ns, (HeardBy(SPEC, GCC_OF_NOTHING),))
+    return Window(time_ns, (Evidence(SPEC, GCC_OF_NOTHING),))
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ import zmq
 from livessl import wire
 from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.clock import Clock
-from livessl.core.types import Ask, Frame, Mark, Message
-from livessl.keys import NodeKeys
+from livessl.core.types import BackfillRequest, Frame, Mark, Message
+from livessl.site.keys import NodeKeys
 
 BACKLOG_FRAMES: Final = 16
 """Kept frames on their way at a time: what live sound may have to wait behind, a quarter of a second at 3 MB/s."""
@@ -153,7 +153,7 @@ class Link:
         *,
         spool: Spool | None = None,
         dealer: Dealer | None = None,
-        recent: Callable[[Ask], list[Message]] | None = None,
+        recent: Callable[[BackfillRequest], list[Message]] | None = None,
     ) -> None:
         self.endpoint = endpoint
         self._clock = clock
@@ -199,7 +199,7 @@ class Link:
 
     @property
     def settled(self) -> int | None:
-        """Before this raster interval the server needs nothing more, by its last word; None where it has not said."""
+        """Before this frame index the server needs nothing more, by its last word; None where it has not said."""
         return self._settled
 
     @property
@@ -346,7 +346,7 @@ class Link:
             self._hello = replace(self._hello, answers=True)
             self._say_hello()
         for array, (first, last) in request.wanted.items():
-            self._answers.extend(self._recent(Ask(array, first, last - 1)))
+            self._answers.extend(self._recent(BackfillRequest(array, first, last - 1)))
 
     def _acknowledge(self, ack: wire.Ack) -> None:
         if ack.who_are_you:
@@ -374,7 +374,7 @@ class Link:
             self._line_up()
 
     def _is_received(self, kept: Kept) -> bool:
-        return kept.array in self._received and kept.raster <= self._received[kept.array]
+        return kept.array in self._received and kept.frame_index <= self._received[kept.array]
 
     def _line_up(self) -> None:
         """Everything that the server has not got follows in order of time; what is cut from now on is live."""
@@ -439,10 +439,10 @@ class Link:
 
 
 def _spans(frames: Iterable[Kept]) -> dict[str, tuple[int, int]]:
-    """Of each array the raster interval of its first frame, and that after its last."""
+    """Of each array the frame index of its first frame, and that after its last."""
     spans: dict[str, tuple[int, int]] = {}
     for kept in frames:
-        spans[kept.array] = (spans.get(kept.array, (kept.raster, 0))[0], kept.raster + 1)
+        spans[kept.array] = (spans.get(kept.array, (kept.frame_index, 0))[0], kept.frame_index + 1)
     return spans
 
 

@@ -7,17 +7,20 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from livessl import wire
-from livessl.capture.devices import Device, Placed
-from livessl.capture.line import Line, played_messages
+from livessl.capture.device import Device
 from livessl.capture.link import Link
-from livessl.capture.recorded import Part, lines_of
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
-from livessl.config import NodeConfig, Site
-from livessl.core.segmenter import RECENT_S
-from livessl.core.types import FRAME_NS, Ask, Message
+from livessl.core.stream.pipeline import Pipeline
+from livessl.core.stream.segmenter import RECENT_S
+from livessl.core.types import FRAME_NS, BackfillRequest, Message
 from livessl.errors import RunError
-from livessl.keys import node_keys
+from livessl.recordings.assign import Part, pipelines_of
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import Placed
+from livessl.site.build.pipeline import make_pipeline
+from livessl.site.keys import node_keys
+from livessl.site.models import NodeConfig, Site
 
 DRAIN_NS: Final = 3_000_000_000
 """How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""
@@ -50,8 +53,8 @@ Progress = Callable[[int], None]
 def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: str, stop: Stop) -> None:
     """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
     config: NodeConfig = site.nodes[name]
-    line = Line(site, config.arrays, device.sample_rate_hz)
-    link = _link(site, name, config.server, [line], clock, run_id, _spool(site, name))
+    pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz)
+    link = _link(site, name, config.server, [pipeline], clock, run_id, _spool(site, name))
     problem = None
     try:
         with device:
@@ -62,7 +65,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
                     link.tell(problem)
-                link.send(line.push(block))
+                link.send(pipeline.push(block))
     finally:
         link.close(bye=True)
 
@@ -85,9 +88,9 @@ def capture_recordings(
     UndeliveredError
         Where the server has not acknowledged everything.
     """
-    lines, placed = lines_of(site, parts)
-    link = _link(site, name, site.nodes[name].server, lines, clock, run_id, _spool(site, name))
-    for end_ns in _sent(link, lines, placed, clock, stop):
+    pipelines, placed = pipelines_of(site, parts)
+    link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
+    for end_ns in _sent(link, pipelines, placed, clock, stop):
         if progress is not None:
             progress(end_ns)
     _finish(link, clock, stop)
@@ -112,15 +115,15 @@ def send_session(
     UndeliveredError
         Where the server refuses it, or has not acknowledged everything.
     """
-    lines, placed = lines_of(site, parts)
-    link = _link(site, "replay", endpoint, lines, clock, run_id, Spool(), replay=True)
+    pipelines, placed = pipelines_of(site, parts)
+    link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
         raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
     lead = _Lead(link, clock)
     end_ns = 0
-    for end_ns in _sent(link, lines, placed, pace, lambda: stop() or link.refused is not None):
+    for end_ns in _sent(link, pipelines, placed, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while (link.pending > MAX_PENDING or lead.exceeds(AHEAD_NS, end_ns)) and not (stop() or link.refused):
@@ -161,25 +164,27 @@ def _link(
     site: Site,
     name: str,
     endpoint: str,
-    lines: Sequence[Line],
+    pipelines: Sequence[Pipeline],
     clock: Clock,
     run_id: str,
     spool: Spool,
     *,
     replay: bool = False,
 ) -> Link:
-    rates = {array: line.sample_rate_hz for line in lines for array in line.arrays}
+    rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
 
-    def recent(ask: Ask) -> list[Message]:
-        return [message for line in lines for message in line.ask(ask)]
+    def recent(ask: BackfillRequest) -> list[Message]:
+        return [message for pipeline in pipelines for message in pipeline.backfill(ask)]
 
     hello = wire.Hello(name, run_id, rates, replay)
     return Link(endpoint, hello, clock, node_keys(site, name), spool=spool, recent=recent)
 
 
-def _sent(link: Link, lines: Sequence[Line], placed: Sequence[Placed], pace: Clock, stop: Stop) -> Iterator[int]:
-    """Send what the lines make of their recordings, block by block; yields the site time reached."""
-    for end_ns, batch in played_messages(lines, placed, pace):
+def _sent(
+    link: Link, pipelines: Sequence[Pipeline], placed: Sequence[Placed], pace: Clock, stop: Stop
+) -> Iterator[int]:
+    """Send what the pipelines make of their recordings, block by block; yields the site time reached."""
+    for end_ns, batch in played_messages(pipelines, placed, pace):
         if stop():
             return
         link.send(batch)

@@ -1,137 +1,14 @@
-"""Recording sessions for replay: one file for each array and unbroken stretch, with the time of its first sample."""
+"""Recording what an audio device delivers, for as long as wanted."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
-from types import TracebackType
-from typing import Final, Literal
+from collections.abc import Callable
 
-import numpy as np
-import soundfile
-
-from livessl.capture.devices import Device, played
-from livessl.capture.recorded import Part
-from livessl.clock import Clock
-from livessl.config import Site
-from livessl.core.timeline import Timeline
-from livessl.core.types import Block
-from livessl.session import Piece, piece, write_session
-
-FLAC_MAX_CHANNELS: Final = 8
-
-Format = Literal["flac", "wav"]
-_WRITTEN: Final = {"flac": ("FLAC", "PCM_24"), "wav": ("RF64", "FLOAT")}
-"""libsndfile's names. RF64 is WAV without its limit of 4 GiB, which 16 channels reach in 23 minutes at 48 kHz."""
+from livessl.capture.device import Device
+from livessl.recordings.recorder import Recorder
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class _Open:
-    file: soundfile.SoundFile
-    array: str
-    name: str
-    first_index: int
-    place: int
-    """In the list of pieces."""
-
-
-class Recorder:
-    """Writes a device's blocks; a gap begins new files.
-
-    Parameters
-    ----------
-    directory : Path
-        An empty or new folder.
-    site : Site
-    channels : mapping of array name to channels
-        Device channels from 1.
-    sample_rate_hz : float
-    kind : {"flac", "wav"}
-        24-bit FLAC, or float WAV. Arrays of more than eight microphones are always WAV, which FLAC cannot hold.
-    pieces : list of Piece or None
-        What the session holds so far; recorders that write one session share it.
-    """
-
-    def __init__(
-        self,
-        directory: Path,
-        site: Site,
-        channels: Mapping[str, Sequence[int]],
-        sample_rate_hz: float,
-        kind: Format = "flac",
-        pieces: list[Piece] | None = None,
-    ) -> None:
-        self._directory = directory
-        self._site = site
-        self._channels = {name: np.array(numbers) - 1 for name, numbers in channels.items()}
-        self._rate_hz = sample_rate_hz
-        self._kind = kind
-        self._timeline = Timeline(sample_rate_hz)
-        self._open: list[_Open] = []
-        self._pieces: list[Piece] = [] if pieces is None else pieces
-        self._next_index: int | None = None
-        self._stretch = 0
-        directory.mkdir(parents=True, exist_ok=True)
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close_stretch()
-
-    @property
-    def recorded(self) -> bool:
-        """Whether there is anything to replay."""
-        return bool(self._pieces)
-
-    def push(self, block: Block) -> None:
-        """Write a block."""
-        if block.samples.shape[1] == 0:
-            return
-        if block.overflow or block.first_index != self._next_index:
-            self._close_stretch()
-            self._open_stretch(block)
-        self._timeline.update(block.first_index, block.stamp_ns)
-        for item in self._open:
-            item.file.write(block.samples[self._channels[item.array]].T)
-        self._next_index = block.first_index + int(block.samples.shape[1])
-
-    def _open_stretch(self, first: Block) -> None:
-        """Begin new files, and write down when: a crash later loses no start. One stamp must do until they end."""
-        self._timeline = Timeline(self._rate_hz)
-        for array, channels in self._channels.items():
-            kind = "wav" if len(channels) > FLAC_MAX_CHANNELS else self._kind
-            name = f"{array}-{self._stretch:03d}.{kind}"
-            container, subtype = _WRITTEN[kind]
-            file = soundfile.SoundFile(
-                self._directory / name,
-                "w",
-                samplerate=round(self._rate_hz),
-                channels=len(channels),
-                format=container,
-                subtype=subtype,
-            )
-            self._open.append(_Open(file, array, name, first.first_index, len(self._pieces)))
-            self._pieces.append(piece(array, name, first.stamp_ns))
-        self._stretch += 1
-        write_session(self._directory, self._site, self._pieces)
-
-    def _close_stretch(self) -> None:
-        """Finish the open files, and write down their start as all of their stamps tell it."""
-        if not self._open:
-            return
-        for item in self._open:
-            item.file.close()
-            self._pieces[item.place] = piece(item.array, item.name, self._timeline.time_ns(item.first_index))
-        self._open.clear()
-        write_session(self._directory, self._site, self._pieces)
 
 
 def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) -> None:
@@ -145,22 +22,3 @@ def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) 
             recorder.push(block)
             if over():
                 break
-
-
-def record_parts(
-    directory: Path, site: Site, parts: Sequence[Part], clock: Clock, over: Callable[[], bool], kind: Format = "flac"
-) -> bool:
-    """Record what plays instead of a device, at the clock's speed, until it ends or `over`; True if there was any."""
-    pieces: list[Piece] = []
-    recorders = [
-        Recorder(directory, site, {part.array: part.channels}, part.placed.recording.sample_rate_hz, kind, pieces)
-        for part in parts
-    ]
-    with ExitStack() as stack:
-        for recorder in recorders:
-            stack.enter_context(recorder)
-        for _, index, block in played([part.placed for part in parts], clock):
-            recorders[index].push(block)
-            if over():
-                break
-    return bool(pieces)

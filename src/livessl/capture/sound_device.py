@@ -20,10 +20,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.capture.devices import DeviceError
 from livessl.clock import Clock
-from livessl.config import SoundDeviceConfig
 from livessl.core.types import Block, Float32Array
+from livessl.errors import DeviceError
+from livessl.site.models import SoundDeviceConfig
 
 WAIT_S: Final = 0.25
 """Longest silence of the iterator: the caller serves its network link at least so often."""

@@ -42,7 +42,7 @@ class Kept:
     """One frame: in memory with its `data`, else in a segment."""
 
     array: str
-    raster: int
+    frame_index: int
     size: int
     data: bytes | None
     segment: int = 0
@@ -97,7 +97,7 @@ class Spool:
 
     def frames(self) -> list[Kept]:
         """All that is kept, in order of time."""
-        return list(heapq.merge(*self._kept.values(), key=lambda kept: kept.raster))
+        return list(heapq.merge(*self._kept.values(), key=lambda kept: kept.frame_index))
 
     def append(self, frame: Frame) -> tuple[Kept, list[Kept]]:
         """Keep a frame; what was made of it, and what had to go.
@@ -106,10 +106,10 @@ class Spool:
         """
         gone = self._clear_from(frame)
         data = wire.encode(frame)
-        kept = self._on_disk(frame, data) or Kept(frame.array, frame.raster, len(data), data)
+        kept = self._on_disk(frame, data) or Kept(frame.array, frame.frame_index, len(data), data)
         self._add(kept)
-        while self._has_too_much(frame.raster):
-            oldest = min((frames for frames in self._kept.values() if frames), key=lambda frames: frames[0].raster)
+        while self._has_too_much(frame.frame_index):
+            oldest = min((frames for frames in self._kept.values() if frames), key=lambda frames: frames[0].frame_index)
             gone.append(self._release(oldest.popleft()))
         return kept, gone
 
@@ -135,9 +135,9 @@ class Spool:
         return data
 
     def forget(self, array: str, before: int) -> None:
-        """No frame of an array before this raster interval is needed any more."""
+        """No frame of an array before this frame index is needed any more."""
         frames = self._kept.get(array)
-        while frames and frames[0].raster < before:
+        while frames and frames[0].frame_index < before:
             self._release(frames.popleft())
 
     def close(self) -> None:
@@ -150,12 +150,12 @@ class Spool:
     def _clear_from(self, frame: Frame) -> list[Kept]:
         frames = self._kept.setdefault(frame.array, deque())
         gone = []
-        while frames and frames[-1].raster >= frame.raster:
+        while frames and frames[-1].frame_index >= frame.frame_index:
             gone.append(self._release(frames.pop()))
         return gone
 
     def _has_too_much(self, newest: int) -> bool:
-        oldest = min(frames[0].raster for frames in self._kept.values() if frames)
+        oldest = min(frames[0].frame_index for frames in self._kept.values() if frames)
         too_old = newest - oldest > self._max_rasters
         return too_old or self._bytes > self._max_bytes or self._bytes_in_memory > MEMORY_BYTES
 
@@ -204,7 +204,7 @@ class Spool:
             self.close()  # a torn record ends it: the next frame begins a new one
             return None
         offset, self._written = self._written, self._written + len(record)
-        return Kept(frame.array, frame.raster, len(data), None, self._segment, offset)
+        return Kept(frame.array, frame.frame_index, len(data), None, self._segment, offset)
 
     def _next_segment(self) -> None:
         self.close()
@@ -224,7 +224,7 @@ class Spool:
         self._needed[self._segment] += 1  # by us, while we read it
         while (data := _record(content, offset)) is not None and (frame := _frame(data)) is not None:
             self._clear_from(frame)
-            self._add(Kept(frame.array, frame.raster, len(data), None, self._segment, offset))
+            self._add(Kept(frame.array, frame.frame_index, len(data), None, self._segment, offset))
             offset += _RECORD.size + len(data)
         self._needed[self._segment] -= 1
         self.torn += offset != len(content)

@@ -1,1 +1,4 @@
-"""The pure core: numpy in, numpy out. It knows no sockets, clocks, files, threads, logs or configuration."""
+"""The pure core: NumPy arrays in, NumPy arrays out.
+
+It contains no sockets, clocks, files, threads, logging or configuration.
+"""

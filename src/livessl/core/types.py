@@ -19,7 +19,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 FRAME_NS: Final = 50_000_000
-"""Length of a frame and step of the time raster, in nanoseconds: the paper's 50 ms."""
+"""Length of a frame and step of the grid of frames, in nanoseconds: the paper's 50 ms."""
 
 FRAME_S: Final = FRAME_NS / 1e9
 """Length of a frame in seconds."""
@@ -92,7 +92,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One raster interval of one array's sound.
+    """One frame index of one array's sound.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ class Frame:
     sequence : int
         Counts the array's frames since its node started, from 1. 0 is a frame that the server asked for, and the node
         would not have sent.
-    raster : int
-        Index on the site-time raster: `time_ns` of the interval's start divided by 50 ms.
+    frame_index : int
+        Index on the grid of 50 ms: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
         Site time (UTC since the epoch) of the first sample.
     sample_rate_hz : float
@@ -117,7 +117,7 @@ class Frame:
 
     array: str
     sequence: int
-    raster: int
+    frame_index: int
     time_ns: int
     sample_rate_hz: float
     samples: Float32Array
@@ -135,11 +135,11 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Says "alive, and quiet in this raster interval", and how the node is.
+    """Says "alive, and quiet in this frame index", and how the node is.
 
     Parameters
     ----------
-    array, raster
+    array, frame_index
         As in `Frame`.
     sequence : int
         Of the array's last frame; 0 before the first. Marks have no number of their own: one that is not sent is no
@@ -160,7 +160,7 @@ class Mark:
 
     array: str
     sequence: int
-    raster: int
+    frame_index: int
     power: float
     noise_power: float
     channel_power: tuple[float, ...]
@@ -240,7 +240,7 @@ class ArraySpec:
 
 
 @dataclass(frozen=True, slots=True)
-class HeardBy:
+class Evidence:
     """One array's evidence of one sound.
 
     Parameters
@@ -432,16 +432,16 @@ class Window:
     ----------
     time_ns : int
         Site time at the middle of the window.
-    evidence : tuple of HeardBy
+    evidence : tuple of Evidence
         One for each array that heard it.
     """
 
     time_ns: int
-    evidence: tuple[HeardBy, ...]
+    evidence: tuple[Evidence, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class BackfillRequest:
     """A wish for an array's frames of a time at which it sent none.
 
     Parameters
@@ -459,5 +459,5 @@ class Ask:
 Message = Frame | Mark
 """What a node sends about sound."""
 
-Output = Update | Event | Track | Window | Ask
+Output = Update | Event | Track | Window | BackfillRequest
 """What fusion says."""

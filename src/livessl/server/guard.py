@@ -10,8 +10,8 @@ from typing import Final
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from livessl.keys import ServerKeys
 from livessl.server.refusals import Refusals
+from livessl.site.keys import ServerKeys
 
 DOOR: Final = "nodes"
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from livessl import wire
-from livessl.config import Site
-from livessl.core.types import Ask, Frame, Mark, Message
+from livessl.core.types import BackfillRequest, Frame, Mark, Message
+from livessl.site.models import Site
 
 ACK_NS: Final = 250_000_000
 """Every node hears from us at least this often."""
@@ -44,7 +44,7 @@ class Peer:
 
     def is_backlog(self, message: Message) -> bool:
         """Whether it is older than what the node calls live."""
-        return message.array in self.hello.backlog and message.raster < self.hello.backlog[message.array][1]
+        return message.array in self.hello.backlog and message.frame_index < self.hello.backlog[message.array][1]
 
     def greet(self, hello: wire.Hello) -> None:
         """Take in what the node says that it has kept: it has nothing older, and nothing at all where it says none."""
@@ -58,7 +58,7 @@ class Peer:
         """The frame is here, and with it all before it in the order that it belongs to."""
         waits = frame.array in self.hello.backlog and not self.is_backlog(frame)
         known = self.live if waits else self.received
-        known[frame.array] = max(known.get(frame.array, frame.raster), frame.raster)
+        known[frame.array] = max(known.get(frame.array, frame.frame_index), frame.frame_index)
 
 
 @dataclass(slots=True)
@@ -185,7 +185,7 @@ class Ingest:
                 due.append((peer.routing_id, self._ack(peer)))
         return due
 
-    def requests(self, asks: Iterable[Ask]) -> list[tuple[bytes, wire.Request]]:
+    def requests(self, asks: Iterable[BackfillRequest]) -> list[tuple[bytes, wire.Request]]:
         """What to send to whom; nothing to nodes that are gone, or do not know requests."""
         found = []
         for ask in asks:

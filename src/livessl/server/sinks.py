@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Protocol
 
-from livessl.config import SinkConfig
 from livessl.errors import RunError
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
+from livessl.site.models import SinkConfig
 
 _log = logging.getLogger(__name__)
 

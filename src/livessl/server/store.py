@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
-from livessl.messages import JsonObject
+from livessl.server.api.encode import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """About 10 MB. A file has no such limit."""
@@ -60,6 +60,21 @@ class Query:
     before: Cursor | None = None
 
 
+class Finalized(NamedTuple):
+    """How far the final pass has come.
+
+    Parameters
+    ----------
+    until : int or None
+        Frame index before which all events are final; None if there are none yet.
+    clocks : JsonObject or None
+        What was known of the arrays' clocks then.
+    """
+
+    until: int | None
+    clocks: JsonObject | None
+
+
 class StoreError(RunError):
     """The file cannot be used, or takes no more."""
 
@@ -98,8 +113,8 @@ class Store:
                 f"server.events_db: cannot use {path}: {error}; name a file in a writable folder"
             ) from error
 
-    def add(self, event: JsonObject, time_ns: int, *, provisional: bool = False) -> None:
-        """Keep an event; one of the same id is replaced. A provisional one stays until its time is settled.
+    def add(self, event: JsonObject, time_ns: int, *, early: bool = False) -> None:
+        """Keep an event in place of one of the same id; an early one stays early until its time is final.
 
         Raises
         ------
@@ -108,20 +123,20 @@ class Store:
         """
         with self._kept(f"event {event['id']!r} was") as db:
             self._insert(db, event, time_ns)
-            if provisional:
+            if early:
                 db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
 
-    def settle(
+    def finalize(
         self,
         site: str,
         events: Sequence[tuple[JsonObject, int]],
         replaced: Iterable[str],
-        raster: int,
+        frame_index: int,
         clocks: JsonObject,
     ) -> None:
-        """Keep events that stay, in place of others; before a raster interval all others stay too. All or nothing.
+        """Keep events that stay, in place of others; before a frame index all others stay too. All or nothing.
 
-        With them goes what is known of the clocks, by which the raster intervals of arrays are those of the site.
+        With them goes what is known of the clocks, by which the frame indices of arrays are those of the site.
 
         Raises
         ------
@@ -135,19 +150,19 @@ class Store:
             db.execute(
                 "DELETE FROM provisional WHERE NOT EXISTS (SELECT 1 FROM events WHERE events.id = provisional.id "
                 "AND time_ns >= ?)",
-                (raster * FRAME_NS,),
+                (frame_index * FRAME_NS,),
             )
-            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, raster))
+            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, frame_index))
             db.execute("INSERT OR REPLACE INTO clocks VALUES (?, ?)", (site, json.dumps(clocks)))
 
-    def settled(self, site: str) -> tuple[int | None, JsonObject | None]:
-        """The raster interval before which all sound of the site has become events that stay; what clocks were then."""
+    def finalized(self, site: str) -> Finalized:
+        """Return how far the final pass of the site has come."""
         sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
         rows = self._reading.rows(sql, (site,))
         if not rows:
-            return None, None
-        raster, clocks = rows[0]
-        return int(raster), None if clocks is None else json.loads(clocks)
+            return Finalized(None, None)
+        frame_index, clocks = rows[0]
+        return Finalized(int(frame_index), None if clocks is None else json.loads(clocks))
 
     def disabled(self, site: str) -> frozenset[str]:
         """The arrays of the site that are not to be used."""
@@ -170,17 +185,17 @@ class Store:
         with self._kept(f"that array {array!r} is {'enabled' if enabled else 'disabled'} was") as db:
             db.execute(sql, (site, array))
 
-    def provisional(self, raster: int) -> list[JsonObject]:
-        """Events before a raster interval that may still be replaced.
+    def early_events(self) -> list[tuple[int, JsonObject]]:
+        """Return the events that are still early, oldest first, each with its start in nanoseconds of site time.
 
         Raises
         ------
         StoreError
-            Where the file cannot be read.
+            If the file cannot be read.
         """
-        sql = "SELECT json FROM events JOIN provisional USING (id) WHERE time_ns < ? ORDER BY time_ns"
+        sql = "SELECT time_ns, json FROM events JOIN provisional USING (id) ORDER BY time_ns"
         try:
-            return [json.loads(text) for (text,) in self._writing.rows(sql, (raster * FRAME_NS,))]
+            return [(time_ns, json.loads(text)) for time_ns, text in self._writing.rows(sql)]
         except sqlite3.Error as error:
             raise StoreError(f"server.events_db: cannot read: {error}; release the file") from error
 

@@ -1,1 +1,4 @@
-"""Simulated sound: a room by the image method, sources in it, and what the arrays would record."""
+"""Simulated sound: a room by the image method, sources in it, and what microphones would record.
+
+It knows no fusion and no server.
+"""

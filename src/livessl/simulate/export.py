@@ -9,9 +9,9 @@ from typing import Final
 
 import soundfile
 
-from livessl.config import Site
-from livessl.session import piece, write_session
+from livessl.recordings.session import piece, write_session
 from livessl.simulate.scene import Scene, render, truth
+from livessl.site.models import Site
 
 TRUTH_FILE: Final = "truth.jsonl"
 

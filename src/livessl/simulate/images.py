@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.jit import jit
+from livessl.core.kernels.jit import jit
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 _SHELLS: Final = 48

@@ -1,1 +1,0 @@
-"""How fast livessl is on the machine at hand: measured by running it."""

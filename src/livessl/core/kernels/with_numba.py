@@ -1,0 +1,398 @@
+"""The kernels, compiled by numba: what `livessl.core.kernels.with_numpy` does, faster.
+
+Each function has its twin there, which says what it does: the same arguments, the same answers; of the searching and
+mapping ones to the last bit.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from livessl.core.kernels.jit import jit
+from livessl.core.kernels.with_numpy import BLOCKS, MINIMUM, NO_LAG, PRODUCT, RUNS, SILENT_POWER
+
+NAME: Final = "numba"
+
+_compiled = jit(error_model="numpy")
+
+
+@_compiled
+def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low, high):  # type: ignore[no-untyped-def]
+    """Lowest and highest lag of every pair over the nodes of every cell."""
+    n_x, n_y, n_z = len(x_m), len(y_m), len(z_m)
+    cells_y, cells_z = -(-n_y // edge), -(-n_z // edge)
+    distance = np.empty((len(microphones_m), n_z), np.float32)
+    low[:] = NO_LAG
+    high[:] = 0
+    for x in range(n_x):
+        for y in range(n_y):
+            first = (x // edge * cells_y + y // edge) * cells_z
+            for m in range(len(microphones_m)):
+                d_x, d_y, at_z = x_m[x] - microphones_m[m, 0], y_m[y] - microphones_m[m, 1], microphones_m[m, 2]
+                flat = d_x * d_x + d_y * d_y
+                for z in range(n_z):
+                    d_z = z_m[z] - at_z
+                    distance[m, z] = np.sqrt(flat + d_z * d_z)
+            for p in range(len(pairs)):
+                nearer, further = distance[pairs[p, 0]], distance[pairs[p, 1]]
+                for cell in range(cells_z):
+                    least, most = np.int32(NO_LAG), np.int32(0)
+                    for z in range(cell * edge, min((cell + 1) * edge, n_z)):
+                        lag = np.int32((further[z] - nearer[z]) * scale + offset)
+                        least, most = min(least, lag), max(most, lag)
+                    low[p, first + cell] = min(low[p, first + cell], np.uint16(least))
+                    high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
+
+
+@_compiled
+def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
+    """Windows of sound, weighed, and zeros after them."""
+    length = len(window)
+    for t in range(len(windows)):
+        for m in range(len(samples)):
+            cut, out = samples[m, t * hop : t * hop + length], windows[t, m]
+            for n in range(length):
+                out[n] = cut[n] * window[n]
+            out[length:] = np.float32(0.0)
+
+
+@_compiled
+def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    spectra, low, pairs, weights, noise, whitened, levels
+):
+    """Whitened cross spectra, weighed and summed over frames, and the microphones' own sums."""
+    microphones, bins = spectra.shape[1], whitened.shape[1]
+    real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
+    power = np.empty((microphones, bins), np.float32)
+    mean, share = np.empty(bins, np.float32), np.empty(bins, np.float32)
+    own, summed = np.zeros((microphones, bins), np.float32), np.zeros((2, len(pairs), bins), np.float32)
+    together = np.zeros(bins + 2, np.float32)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for t in range(len(spectra)):
+        weight = weights[t]
+        if not weight.any():
+            continue
+        together[:] = zero
+        for m in range(microphones):
+            spectrum, u, v, square = spectra[t, m, low : low + bins], real[m], imaginary[m], power[m]
+            for b in range(bins):
+                u[b], v[b] = spectrum[b].real, spectrum[b].imag
+                square[b] = u[b] * u[b] + v[b] * v[b]
+                together[b + 1] += square[b]
+        together[0], together[bins + 1] = together[1], together[bins]
+        for b in range(bins):
+            mean[b] = (together[b] + together[b + 1] + together[b + 2]) / np.float32(3 * microphones)
+            share[b] = min(noise[t, b], mean[b]) / mean[b] if mean[b] > zero else zero
+        for m in range(microphones):
+            u, v, square, floor = real[m], imaginary[m], power[m], SILENT_POWER * power[m].max()
+            for b in range(bins):
+                over = square[b] + share[b] * (mean[b] - square[b])
+                factor = one / np.sqrt(over) if square[b] > floor else zero
+                u[b] *= factor
+                v[b] *= factor
+                own[m, b] += weight[b] * (u[b] * u[b] + v[b] * v[b])
+        for p in range(len(pairs)):
+            u_i, v_i, u_k, v_k = real[pairs[p, 0]], imaginary[pairs[p, 0]], real[pairs[p, 1]], imaginary[pairs[p, 1]]
+            of_real, of_imaginary = summed[0, p], summed[1, p]
+            for b in range(bins):
+                of_real[b] += weight[b] * (u_i[b] * u_k[b] + v_i[b] * v_k[b])
+                of_imaginary[b] += weight[b] * (u_i[b] * v_k[b] - v_i[b] * u_k[b])
+    for p in range(len(pairs)):
+        for b in range(bins):
+            whitened[p, b] = complex(summed[0, p, b], summed[1, p, b])
+    for m in range(microphones):
+        levels[m] = own[m].sum()
+
+
+@_compiled
+def onset_weights(  # type: ignore[no-untyped-def]
+    spectra, low, quiet, heard, least, decay, warm_up, noise_hops, loud, strongest, noise, past, weights, noises,
+):  # fmt: skip
+    """Weights of the next windows by how direct they are."""
+    microphones, bins = spectra.shape[1], len(noise)
+    one, zero, two, every = np.float32(1.0), np.float32(0.0), np.float32(2.0), np.float32(noise_hops)
+    power = np.empty(bins + 2, np.float32)
+    smooth = np.empty(bins, np.float32)
+    for t in range(len(spectra)):
+        weight = weights[t]
+        power[:] = zero
+        for m in range(microphones):
+            spectrum = spectra[t, m, low : low + bins]
+            for b in range(bins):
+                power[b + 1] += spectrum[b].real * spectrum[b].real + spectrum[b].imag * spectrum[b].imag
+        power[0], power[bins + 1] = power[1], power[bins]
+        for b in range(bins):
+            smooth[b] = (power[b] + power[b + 1] + power[b + 2]) / np.float32(3 * microphones)
+        if heard[0] == 0:
+            noise[:], past[:] = smooth, smooth
+        if heard[1] >= warm_up or heard[0] >= noise_hops:
+            for b in range(bins):
+                interference = max(max(noise[b], past[b]), least)
+                direct = max(smooth[b] - interference, zero)
+                weight[b] = min(direct * direct / (interference * (interference + two * direct)), strongest)
+        else:
+            weight[:] = zero
+        noises[t] = noise
+        heard[0] += 1
+        heard[1] += quiet
+        share = one / np.float32(min(heard[1], noise_hops)) if quiet else one / every
+        settled = quiet and heard[1] > warm_up
+        for b in range(bins):
+            now = smooth[b]
+            past[b] = max(past[b] * decay, now)
+            if settled:
+                now = min(now, loud * max(noise[b], least))
+            elif not quiet:
+                now = min(now, noise[b])
+            noise[b] += (now - noise[b]) * share
+
+
+def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
+    """What `add_power` wants of the places that nodes look up: these."""
+    return places
+
+
+@_compiled
+def look_up(values, places, out):  # type: ignore[no-untyped-def]
+    """Bare look-ups: how fast a map could be at best."""
+    for n in range(len(places)):
+        out[n] = values[places[n]]
+
+
+@_compiled
+def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
+    """Add one array's power at every node."""
+    for node in range(len(table)):
+        total = np.float32(0.0)
+        for p in range(table.shape[1]):
+            total += values[p, table[node, p]]
+        power[node] += weight * total
+
+
+@_compiled
+def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
+    """Mean square of a GCC, further than something from one lag of each pair."""
+    total, count = 0.0, 0
+    for p in range(len(values)):
+        row, square = values[p], np.float32(0.0)
+        for lag in range(len(lags_s)):
+            if abs(lags_s[lag] - but_s[p]) > apart_s:
+                square += row[lag] * row[lag]
+                count += 1
+        total += float(square)
+    return total / count if count else 0.0
+
+
+@_compiled
+def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
+    """Summed power at points off the grid."""
+    power = np.zeros(len(points_m))
+    distance = np.empty(len(microphones_m))
+    for n in range(len(points_m)):
+        for m in range(len(microphones_m)):
+            x, y = points_m[n, 0] - microphones_m[m, 0], points_m[n, 1] - microphones_m[m, 1]
+            z = points_m[n, 2] - microphones_m[m, 2]
+            distance[m] = np.sqrt((x * x + y * y) + z * z)
+        for r in range(len(pairs)):
+            lag_s = (distance[pairs[r, 1]] - distance[pairs[r, 0]]) / c_m_s
+            place = (lag_s - first_s[r]) / step_s[r]
+            left = min(max(np.int64(place), 1), last[r])
+            at = np.uint64(start[r] + left)
+            one = np.uint64(1)
+            before, here, after, beyond = values[at - one], values[at], values[at + one], values[at + one + one]
+            share = place - left
+            rest = 1.0 - share
+            curvature = rest * (after - 2.0 * here + before) + share * (beyond - 2.0 * after + here)
+            power[n] += weight[r] * (rest * here + share * after - 0.5 * rest * share * curvature)
+    return power
+
+
+@_compiled
+def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
+    """Maxima over runs of blocks of lags."""
+    length = values.shape[1]
+    for r in range(len(values)):
+        row, of_blocks, size = values[r], maxima[r], block[r]
+        of_blocks[:BLOCKS] = -np.inf
+        for b in range(min(BLOCKS, -(-length // size))):
+            most = row[b * size]
+            for lag in range(b * size + 1, min((b + 1) * size, length)):
+                most = max(most, row[lag])
+            of_blocks[b] = most
+        for level in range(1, maxima.shape[1] // BLOCKS):
+            further = RUNS[level] - RUNS[level - 1]
+            before, now = of_blocks[(level - 1) * BLOCKS : level * BLOCKS], of_blocks[level * BLOCKS :]
+            shifted = before[further:]
+            for b in range(len(shifted)):
+                now[b] = max(before[b], shifted[b])
+            for b in range(BLOCKS - further, BLOCKS):
+                now[b] = before[b]
+
+
+@_compiled
+def _joined(rule, total, power):  # type: ignore[no-untyped-def]
+    if rule == MINIMUM:
+        return min(total, power)
+    if rule == PRODUCT:
+        return total * max(power, np.float32(0.0))
+    return total + power
+
+
+@_compiled
+def _start(rule):  # type: ignore[no-untyped-def]
+    if rule == MINIMUM:
+        return np.float32(np.inf)
+    return np.float32(1.0) if rule == PRODUCT else np.float32(0.0)
+
+
+@_compiled
+def bounds(maxima, places, rows, first_row, weight, rule, bound):  # type: ignore[no-untyped-def]
+    """What no node of each of some cells exceeds."""
+    bound[:] = _start(rule)
+    total = np.empty(len(bound), np.float32)
+    for a in range(len(weight)):
+        total[:] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            row, of_cells = maxima[r], places[rows[r]]
+            for c in range(len(bound)):
+                total[c] += row[of_cells[c]]
+        for c in range(len(bound)):
+            bound[c] = _joined(rule, bound[c], weight[a] * total[c])
+
+
+@_compiled
+def _covered(first, nodes, shape, boxes):  # type: ignore[no-untyped-def]
+    """Whether a cube of nodes lies wholly in one of the boxes."""
+    for box in boxes:
+        inside = True
+        for axis in range(3):
+            last = min(first[axis] + nodes, shape[axis]) - 1
+            inside = inside and first[axis] >= box[axis, 0] and last <= box[axis, 1]
+        if inside:
+            return True
+    return False
+
+
+@_compiled
+def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row, weight, rule,
+    values, boxes, best, best_node, distance, total, fused,
+):  # fmt: skip
+    """The best node of one cell, if it is better than what is known."""
+    n_x, n_y, n_z = min(edge, len(x_m) - first[0]), min(edge, len(y_m) - first[1]), min(edge, len(z_m) - first[2])
+    count = n_x * n_y * n_z
+    fused[:count] = _start(rule)
+    for a in range(len(weight)):
+        for m in range(first_microphone[a], first_microphone[a + 1]):
+            to = distance[m - first_microphone[a]]
+            n = 0
+            for x in range(first[0], first[0] + n_x):
+                d_x = x_m[x] - microphones_m[m, 0]
+                for y in range(first[1], first[1] + n_y):
+                    d_y = y_m[y] - microphones_m[m, 1]
+                    flat = d_x * d_x + d_y * d_y
+                    for z in range(first[2], first[2] + n_z):
+                        d_z = z_m[z] - microphones_m[m, 2]
+                        to[n] = flat + d_z * d_z
+                        n += 1
+            for n in range(count):
+                to[n] = np.sqrt(to[n])
+        total[:count] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            nearer, further, row = distance[pairs[r, 0]], distance[pairs[r, 1]], values[r]
+            for n in range(count):
+                total[n] += row[np.uint32(np.int32((further[n] - nearer[n]) * scale[a] + offset[a]))]
+        for n in range(count):
+            fused[n] = _joined(rule, fused[n], weight[a] * total[n])
+    for n in range(count):
+        if fused[n] >= best:
+            x, y, z = first[0] + n // (n_y * n_z), first[1] + n // n_z % n_y, first[2] + n % n_z
+            node = (x * len(y_m) + y) * len(z_m) + z
+            better = fused[n] > best or node < best_node
+            if better and not _covered((x, y, z), 1, (len(x_m), len(y_m), len(z_m)), boxes):
+                best, best_node = fused[n], node
+    return best, best_node
+
+
+@_compiled
+def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    values, maxima, rows, first_row, weight, rule, places, leaf_places, top_bound, cell_bound, bounded,
+    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
+):  # fmt: skip
+    """The highest node outside some boxes, by branch and bound."""
+    shape = (len(x_m), len(y_m), len(z_m))
+    top_edge = edge * per_top
+    tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
+    children = per_top**3
+    child_bound = np.empty(children, np.float32)
+    leaf_edge = edge // 2 if leaf_places.shape[2] else edge
+    leaf_bound = np.empty(max(1, leaf_places.shape[2]), np.float32)
+    distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
+    total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
+    spent = 0
+    best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
+    first_top = np.argmax(top_bound)
+    order = np.array([first_top])
+    for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
+        if turn == 1:
+            left = np.flatnonzero(top_bound >= best)
+            order = left[np.argsort(-top_bound[left])]
+        for top in order:
+            if top_bound[top] < best:
+                break
+            if turn == 1 and top == first_top:
+                continue
+            t_x, t_y, t_z = top // (tops_y * tops_z), top // tops_z % tops_y, top % tops_z
+            t_x, t_y, t_z = t_x * top_edge, t_y * top_edge, t_z * top_edge
+            if top_bound[top] == best and (t_x * shape[1] + t_y) * shape[2] + t_z > best_node:
+                continue
+            if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
+                continue
+            if not bounded[top]:
+                if spent > most and best > -np.inf:
+                    return best_node, best, False
+                spent += children * len(rows)
+                bounds(maxima, places[top], rows, first_row, weight, rule, cell_bound[top])
+                bounded[top] = True
+            child_bound[:] = cell_bound[top]
+            while True:
+                child = np.argmax(child_bound)
+                bound = child_bound[child]
+                if bound < best or bound == -np.inf:
+                    break
+                child_bound[child] = -np.inf
+                c_x, c_y, c_z = child // (per_top * per_top), child // per_top % per_top, child % per_top
+                first = (t_x + c_x * edge, t_y + c_y * edge, t_z + c_z * edge)
+                if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
+                    continue  # a cube at the volume's edge has cells outside it
+                if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
+                    continue
+                if _covered(first, edge, shape, boxes):
+                    continue
+                if leaf_places.shape[2] == 0:
+                    leaf_bound[0] = bound
+                else:
+                    spent += len(leaf_bound) * len(rows)
+                    bounds(maxima, leaf_places[top * children + child], rows, first_row, weight, rule, leaf_bound)
+                while True:
+                    leaf = np.argmax(leaf_bound)
+                    if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
+                        break
+                    leaf_bound[leaf] = -np.inf
+                    at = (
+                        first[0] + leaf // 4 * leaf_edge,
+                        first[1] + leaf // 2 % 2 * leaf_edge,
+                        first[2] + leaf % 2 * leaf_edge,
+                    )
+                    if at[0] >= shape[0] or at[1] >= shape[1] or at[2] >= shape[2]:
+                        continue
+                    if spent > most and best > -np.inf:
+                        return best_node, best, False
+                    spent += leaf_edge**3 * len(rows)
+                    best, best_node = _best_of_cell(
+                        at, leaf_edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
+                        weight, rule, values, boxes, best, best_node, distance, total, fused,
+                    )  # fmt: skip
+    return best_node, best, True

@@ -1,0 +1,205 @@
+"""The peak of a power map: found on the grid, refined below it, with a covariance and a confidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
+from livessl.core.geometry import Grid
+from livessl.core.kernels import kernels
+from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
+from livessl.core.types import BoolArray, Evidence, Float32Array, FloatArray, IntArray
+
+CANDIDATES: Final = 2
+"""Nodes followed to the top: between two nodes a lower one on the grid may be the higher one in truth."""
+
+RIVAL_DISTANCE_M: Final = 1.0
+"""A second peak is another place if it is further away than this."""
+
+_NEWTON_STEPS: Final = 30
+_CONVERGED_M: Final = 1e-4
+"""Steps below a tenth of a millimetre change nothing that anyone could measure."""
+
+_SUBDIVISIONS: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A node and the fused power there; and whether it is known to be the highest, or only of what was looked at."""
+
+    node: int
+    power: float
+    proven: bool = True
+
+
+class FindPeaks(Protocol):
+    """Finds the highest nodes, best first: each the highest of those far enough from the ones before it."""
+
+    def __call__(self, count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        """Up to `count` peaks that differ by more than `apart_nodes` along some axis, none of them in a box.
+
+        Boxes (3, 2) are the first and last node along each axis. Of equal nodes the first in the grid's order is taken.
+        """
+        ...
+
+
+def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
+    """What finds the peaks of a whole map (G,)."""
+
+    def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        left = power.reshape(grid.shape).copy()
+        for box in without:
+            left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
+        found: list[Peak] = []
+        for _ in range(count):
+            node = int(left.argmax())
+            highest = float(left.flat[node])
+            if highest == -np.inf:
+                break
+            found.append(Peak(node, highest))
+            box = box_around(grid, node, apart_nodes)
+            left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
+        return found
+
+    return find
+
+
+def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
+    """First and last node along each axis (3, 2) of what lies at most so many nodes from one."""
+    at = np.array(np.unravel_index(node, grid.shape))
+    return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
+
+
+def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
+    """Nodes (3, 2), first and last along each axis, that are the same place as a position; 1 and 0 where there is none.
+
+    That is at most `RIVAL_DISTANCE_M` away along every axis, or a quarter of the volume's size where that is less.
+    """
+    reach_m = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
+    box = np.empty((3, 2), dtype=np.int64)
+    for axis in range(3):
+        near = np.flatnonzero(np.abs(grid.axis_m(axis) - position_m[axis]) <= reach_m)
+        box[axis] = (near[0], near[-1]) if len(near) else (1, 0)
+    return box
+
+
+def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
+    """From nodes to the highest top near any of them.
+
+    A finer local grid around every start, all looked at in one go; from the best place on each, Newton steps that only
+    ever go up.
+
+    Parameters
+    ----------
+    functional : SRPFunctional
+    starts_m : (N, 3) or (3,) float64
+    grid : Grid
+
+    Returns
+    -------
+    position_m : (3,) float64
+        Inside the grid's bounds.
+    value : float
+        The functional there.
+    """
+    near = np.atleast_2d(starts_m)[:, None] + _offsets_m(grid)
+    values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
+    best = values.argmax(axis=1)
+    tops = [_climb(functional, near[n, k], float(values[n, k]), grid) for n, k in enumerate(best)]
+    return max(tops, key=lambda top: top[1])
+
+
+def _offsets_m(grid: Grid) -> FloatArray:
+    """A cell's finer local grid, relative to its node: (n, 3)."""
+    fraction = np.linspace(-0.5, 0.5, _SUBDIVISIONS + 1)
+    offsets = [fraction * edge if edge > 0 else np.zeros(1) for edge in grid.cell_m]
+    return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
+
+
+def _climb(functional: SRPFunctional, position_m: FloatArray, value: float, grid: Grid) -> tuple[FloatArray, float]:
+    axes = list(grid.free_axes)
+    across = np.ix_(axes, axes)
+    lower_m, upper_m = grid.lower_m, grid.upper_m
+    reach = float(grid.cell_m.max()) / _SUBDIVISIONS
+    for _ in range(_NEWTON_STEPS):
+        gradient, hessian = functional.derivatives(position_m)
+        step = np.zeros(3)
+        step[axes] = _ascent(gradient[axes], hessian[across])
+        length = math.sqrt(step @ step)
+        if length > reach:
+            step, length = step * (reach / length), reach
+        climbed = False
+        while length > _CONVERGED_M:
+            trial = np.minimum(np.maximum(position_m + step, lower_m), upper_m)
+            trial_value = float(functional.value(trial[None])[0])
+            if trial_value > value:
+                position_m, value, climbed = trial, trial_value, True
+                break
+            step, length = step / 2.0, length / 2.0
+        if not climbed:
+            break
+    return position_m, value
+
+
+def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
+    """Newton step with every curvature taken as a hill's, so that it leads up from a saddle, too."""
+    eigenvalues, eigenvectors = np.linalg.eigh(hessian)
+    strength = np.maximum(np.abs(eigenvalues), 1e-3 * np.abs(eigenvalues).max(initial=0.0) + 1e-12)
+    return np.asarray(eigenvectors @ ((eigenvectors.T @ gradient) / strength))
+
+
+def rival_power(find: FindPeaks, grid: Grid, position_m: FloatArray) -> float:
+    """Highest power outside a position's `neighbourhood`; 0 where there is no outside."""
+    rivals = find(1, without=[neighbourhood(position_m, grid)])
+    return rivals[0].power if rivals else 0.0
+
+
+def margin(power: float, rival_power: float) -> float:
+    """How far a place stands out from the best other one: 1 - (power there) / (power here), 0 to 1."""
+    return float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
+
+
+def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
+    """How far the peak stands out: its `margin` over the highest power outside its `neighbourhood`."""
+    return margin(first.power, rival_power(find, grid, position_m))
+
+
+def laplace_covariance_m2(
+    functional: SRPFunctional, evidence: Sequence[Evidence], position_m: FloatArray, grid: Grid
+) -> FloatArray:
+    """Covariance (3, 3) from the map's curvature at the peak: C = (sum lambda (-Hess SRP) + prior)^-1.
+
+    The scale lambda = g / s^2 of each array makes the map a log-likelihood: g is the mean height of its GCCs at the
+    peak, s^2 their mean square over the other lags, which holds noise and reflections alike. It follows from
+    var(tau) = s^2 kappa / (g kappa)^2, kappa the mean square angular frequency: noise of power s^2 and slope variance
+    s^2 kappa moves a peak of curvature g kappa. The prior is the search volume's own variance, L^2/12 along each axis,
+    so that what the arrays cannot tell stays as wide as the volume and no wider.
+    """
+    axes = list(grid.free_axes)
+    information = np.diag(12.0 / np.maximum(grid.upper_m - grid.lower_m, 1e-9) ** 2)
+    for heard, term in zip(evidence, functional.pair_terms(position_m), strict=True):
+        hill = np.maximum(-term.curvature, 0.0)
+        weight = pair_weight(len(heard.spec.microphones_m))
+        curvature = weight * (term.gradient_s_m.T * hill) @ term.gradient_s_m
+        information += _scale(heard, term) * curvature
+    covariance = np.zeros((3, 3))
+    if axes:
+        covariance[np.ix_(axes, axes)] = np.linalg.inv(information[np.ix_(axes, axes)])
+    return covariance
+
+
+def noise(heard: Evidence, term: PairTerms, live: BoolArray) -> float:
+    """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
+    lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
+    return float(kernels.mean_square(heard.gcc.values[live], heard.gcc.lags_s, term.lags_s[live], lobe_s))
+
+
+def _scale(heard: Evidence, term: PairTerms) -> float:
+    elsewhere = noise(heard, term, np.ones(len(heard.gcc.values), dtype=np.bool_))
+    height = float(term.values.mean())
+    return max(height, 0.0) / elsewhere if elsewhere > 0 else 0.0

@@ -1,0 +1,101 @@
+"""Activity detection on 50 ms frames: the paper's rule, exact over a finished event and causal for live use.
+
+The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active where its mean power is at
+least a tenth of the reference power. Exact, the reference is the event's maximum; live, a decaying maximum, never so
+low that the background could reach a tenth of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.types import FRAME_S, BoolArray, FloatArray
+
+THRESHOLD: Final = 0.1
+"""Active at or above this share of the reference power: the paper's 10 %."""
+
+_FLOOR_SMOOTHING: Final = 5
+"""Frames averaged before the minimum is taken: a 50 ms frame of low-pitched noise alone scatters by several dB."""
+
+
+def is_active(power: FloatArray, reference: float | FloatArray, threshold: float = THRESHOLD) -> BoolArray:
+    """The rule: active where power >= threshold * reference, and there is any power at all."""
+    return np.asarray((power >= threshold * np.asarray(reference)) & (power > 0.0))
+
+
+def exact_mask(power: FloatArray, threshold: float = THRESHOLD) -> BoolArray:
+    """Which frames of a finished event are active: its own maximum is the reference. `power` (n,)."""
+    return is_active(power, float(power.max()), threshold) if len(power) else np.zeros(0, dtype=np.bool_)
+
+
+def runs(mask: BoolArray) -> list[tuple[int, int]]:
+    """Segments of consecutive active frames, as (start, stop) indices."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class ActivityParameters:
+    """Numbers of the causal form.
+
+    Parameters
+    ----------
+    threshold : float
+        The rule's share of the reference.
+    release_s : float
+        Time constant of the decaying maximum. 1 s is 4 dB a second: slower than any room's decay, so that
+        reverberation ends a sound instead of becoming one.
+    floor_window_s : float
+        The background is the least smoothed power in this time.
+    floor_factor : float
+        Sound is this much above the background.
+    min_power : float
+        Below this nothing is sound, full scale squared.
+    pre_roll_s, hang_over_s : float
+        What is kept before the first and after the last active frame.
+    """
+
+    threshold: float = THRESHOLD
+    release_s: float = 1.0
+    floor_window_s: float = 3.0
+    floor_factor: float = 4.0
+    min_power: float = 1e-9
+    pre_roll_s: float = 0.4
+    hang_over_s: float = 0.3
+
+    def least_power(self, floor_power: float) -> float:
+        """Return the least power, full scale squared, at which a frame can be active over a background."""
+        return max(self.floor_factor * floor_power, self.min_power)
+
+
+class CausalActivity:
+    """The rule, frame by frame, knowing only the past."""
+
+    def __init__(self, parameters: ActivityParameters) -> None:
+        self._parameters = parameters
+        self._keep = float(np.exp(-FRAME_S / parameters.release_s))
+        self._maximum = 0.0
+        self._latest: deque[float] = deque(maxlen=_FLOOR_SMOOTHING)
+        self._smoothed: deque[float] = deque(maxlen=max(1, round(parameters.floor_window_s / FRAME_S)))
+
+    @property
+    def floor_power(self) -> float:
+        """The background, full scale squared; 0 before anything is known."""
+        return min(self._smoothed, default=0.0)
+
+    def prime(self, floor_power: float) -> None:
+        """Start from a background already seen."""
+        self._smoothed.append(floor_power)
+
+    def push(self, power: float) -> bool:
+        """Whether the next frame, of this mean power, is active."""
+        parameters = self._parameters
+        self._maximum = max(self._maximum * self._keep, power)
+        reference = max(self._maximum, parameters.least_power(self.floor_power) / parameters.threshold)
+        self._latest.append(power)
+        self._smoothed.append(sum(self._latest) / len(self._latest))
+        return bool(is_active(np.asarray(power), reference, parameters.threshold))

@@ -1,0 +1,72 @@
+"""From the blocks of one device to the messages of the arrays on its channels. It never waits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.segmenter import Segmenter
+from livessl.core.stream.timeline import Framer
+from livessl.core.types import ArraySpec, BackfillRequest, Block, IntArray, Message
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """One array on a device: its geometry, and the device channel of each microphone.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+    channels : (K,) int64
+        Device channels, counted from 0, in the order of the array's microphones.
+    """
+
+    spec: ArraySpec
+    channels: IntArray
+
+
+class Pipeline:
+    """Cuts the blocks of one device into frames, for every array that shares its clock.
+
+    Parameters
+    ----------
+    wirings : sequence of Wiring
+        The arrays on the device.
+    sample_rate_hz : float
+        Nominal rate of the device.
+    parameters : ActivityParameters
+        How sound is told from the background.
+    """
+
+    def __init__(self, wirings: Sequence[Wiring], sample_rate_hz: float, parameters: ActivityParameters) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.framer = Framer(sample_rate_hz)
+        self._segmenters = [Segmenter(wiring.spec, wiring.channels, sample_rate_hz, parameters) for wiring in wirings]
+
+    @property
+    def arrays(self) -> list[str]:
+        """Names of the arrays on it."""
+        return [segmenter.array for segmenter in self._segmenters]
+
+    def push(self, block: Block) -> list[Message]:
+        """Return the messages that a block completes."""
+        return [
+            message
+            for cut in self.framer.push(block)
+            for segmenter in self._segmenters
+            for message in segmenter.push(cut, self.framer)
+        ]
+
+    def backfill(self, request: BackfillRequest) -> list[Message]:
+        """Return the remembered frames that a request names; none where the array is on another device."""
+        return [
+            message
+            for segmenter in self._segmenters
+            if segmenter.array == request.array
+            for message in segmenter.ask(request.first, request.last)
+        ]
+
+    def flush(self) -> list[Message]:
+        """Return the messages held back, at the end of the sound."""
+        return [message for segmenter in self._segmenters for message in segmenter.flush(self.framer)]

@@ -1,0 +1,212 @@
+"""Sample index to site time, and the cutting of blocks into frames; it reads no clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array
+
+MEMORY_S: Final = 60.0
+"""How far back the line fit looks: long against a block's jitter, short against a crystal's warming up."""
+
+STEP_NS: Final = 200_000_000
+"""A stamp this far off the line is no jitter: scheduling delays stay below it."""
+
+STEP_BLOCKS: Final = 3
+"""So many such stamps in a row are a step of the clock; fewer are late callbacks."""
+
+LOCKED_S: Final = 2.0
+"""Sound needed before the fit is trusted."""
+
+_SLOPE_RIDGE_S2: Final = 1e4
+"""Prior on the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
+
+_BOUNDARY: Final = 0.4
+"""Rounding of frame index boundaries to samples. Not a half: at 22.05 kHz every other boundary would be a tie."""
+
+
+class Timeline:
+    """Running line fit of (sample index, arrival stamp): one block's stamp is noise, the line is not.
+
+    Exponentially forgetting least squares of the stamps' residuals from the nominal rate.
+
+    Parameters
+    ----------
+    sample_rate_hz : float
+        Nominal rate of the device.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._rate_hz = sample_rate_hz
+        self._suspects = 0
+        self.steps = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the fit: the next stamp starts a new one."""
+        self._origin: tuple[int, int] | None = None
+        self._weight = self._mean_x_s = self._mean_y_ns = self._cxx = self._cxy = 0.0
+        self._last_x_s = 0.0
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a fit at all."""
+        return self._origin is not None
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster than nominal the device's clock runs, parts per million."""
+        return -self._slope_ns_s / 1e3
+
+    @property
+    def state(self) -> ClockState:
+        """How far the fit can be trusted."""
+        if self._last_x_s >= LOCKED_S:
+            return ClockState.LOCKED
+        return ClockState.STEPPED if self.steps else ClockState.SETTLING
+
+    def update(self, index: int, stamp_ns: int) -> bool:
+        """Take in one block's stamp; returns True where the clock has stepped and the fit starts anew."""
+        if self._origin is None:
+            self._origin = (index, stamp_ns)
+        stepped = False
+        if abs(stamp_ns - self.time_ns(index)) > STEP_NS:
+            self._suspects += 1
+            if self._suspects < STEP_BLOCKS:
+                return False
+            self.restart()
+            self._origin = (index, stamp_ns)
+            self.steps += 1
+            stepped = True
+        self._suspects = 0
+        x_s, y_ns = self._residual(index, stamp_ns)
+        keep = float(np.exp(-(x_s - self._last_x_s) / MEMORY_S))
+        self._last_x_s = x_s
+        self._weight = keep * self._weight + 1.0
+        dx, dy = x_s - self._mean_x_s, y_ns - self._mean_y_ns
+        self._mean_x_s += dx / self._weight
+        self._mean_y_ns += dy / self._weight
+        self._cxx = keep * self._cxx + dx * (x_s - self._mean_x_s)
+        self._cxy = keep * self._cxy + dx * (y_ns - self._mean_y_ns)
+        return stepped
+
+    def time_ns(self, index: int) -> int:
+        """Site time of a sample, nanoseconds since the epoch."""
+        first, start_ns = self._known_origin()
+        x_s = (index - first) / self._rate_hz
+        return start_ns + round(x_s * 1e9 + self._mean_y_ns + self._slope_ns_s * (x_s - self._mean_x_s))
+
+    def index_at(self, time_ns: int) -> float:
+        """Sample index, with its fraction, at a site time: the inverse of `time_ns`."""
+        first, start_ns = self._known_origin()
+        slope = self._slope_ns_s
+        x_s = (time_ns - start_ns - self._mean_y_ns + slope * self._mean_x_s) / (1e9 + slope)
+        return first + x_s * self._rate_hz
+
+    @property
+    def _slope_ns_s(self) -> float:
+        return self._cxy / (self._cxx + _SLOPE_RIDGE_S2)
+
+    def _known_origin(self) -> tuple[int, int]:
+        if self._origin is None:
+            raise RuntimeError("timeline: asked for a time before the first stamp")
+        return self._origin
+
+    def _residual(self, index: int, stamp_ns: int) -> tuple[float, float]:
+        first, start_ns = self._known_origin()
+        x_s = (index - first) / self._rate_hz
+        return x_s, (stamp_ns - start_ns) - x_s * 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """One frame index of all of a device's channels: `samples` (channels, n) from site time `time_ns` on."""
+
+    frame_index: int
+    time_ns: int
+    samples: Float32Array
+
+
+class Framer:
+    """Cuts a device's blocks on the grid of 50 ms; frames are contiguous, now and then a sample longer.
+
+    Parameters
+    ----------
+    sample_rate_hz : float
+        Nominal rate of the device.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self.timeline = Timeline(sample_rate_hz)
+        self.overflows = 0
+        self.lost_frames = 0
+        self._frame_samples = sample_rate_hz * FRAME_NS / 1e9
+        self._parts: list[Float32Array] = []
+        self._begin = self._end = 0
+        self._raster: int | None = None
+
+    def push(self, block: Block) -> list[Cut]:
+        """Take in a block; return the frames it completes. A gap drops the frame that it tears."""
+        count = block.samples.shape[1]
+        if count == 0:
+            return []
+        if block.overflow:
+            self.overflows += 1
+        gap = self.timeline.started and (block.overflow or block.first_index != self._end)
+        if gap:
+            self._tear()
+            if block.overflow:  # how many samples are missing is unknown, so the line no longer holds
+                self.timeline.restart()
+        if self.timeline.update(block.first_index, block.stamp_ns):
+            self._tear()
+        if self._raster is None:
+            self._begin = self._end = block.first_index
+        self._parts.append(block.samples)
+        self._end = block.first_index + count
+        return self._cut()
+
+    def _tear(self) -> None:
+        if self._raster is not None:
+            self.lost_frames += 1
+        self._parts.clear()
+        self._raster = None
+
+    def _boundary(self, frame_index: int) -> int:
+        return int(np.floor(self.timeline.index_at(frame_index * FRAME_NS) + _BOUNDARY))
+
+    def _cut(self) -> list[Cut]:
+        if self._raster is None:
+            frame_index = self.timeline.time_ns(self._begin) // FRAME_NS
+            while self._boundary(frame_index) < self._begin:
+                frame_index += 1
+            start = self._boundary(frame_index)
+            if start >= self._end:
+                self._parts.clear()
+                return []
+            self._drop(start - self._begin)
+            self._raster = frame_index
+        cuts: list[Cut] = []
+        while (stop := self._boundary(self._raster + 1)) <= self._end:
+            length = stop - self._begin
+            if not 0.5 * self._frame_samples <= length <= 1.5 * self._frame_samples:
+                self._tear()  # the line moved by more than half a frame: start over on the new frame index
+                break
+            cuts.append(Cut(self._raster, self.timeline.time_ns(self._begin), self._take(length)))
+            self._raster += 1
+        return cuts
+
+    def _joined(self) -> Float32Array:
+        return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts, axis=1)
+
+    def _drop(self, count: int) -> None:
+        self._parts = [self._joined()[:, count:]]
+        self._begin += count
+
+    def _take(self, count: int) -> Float32Array:
+        joined = self._joined()
+        self._parts = [joined[:, count:]]
+        self._begin += count
+        return joined[:, :count]

@@ -1,1 +1,0 @@
-"""The paper's experiments on our own code: campaigns of simulated rooms, their results, claims and figures."""

@@ -1,0 +1,177 @@
+"""The demo: a simulated scene through real processes and real sockets, and how far off each answer was."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from livessl.clock import Clock, utc_ns, utc_text
+from livessl.core.types import FRAME_NS
+from livessl.errors import RunError
+from livessl.lab import processes
+from livessl.server.api.encode import JsonObject
+from livessl.simulate.export import TRUTH_FILE, write_scene
+from livessl.simulate.scene import Scene, make_scene, synthesised_sounds
+from livessl.site.load import load_site, parse_site
+from livessl.site.models import Site
+
+SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
+
+LEAD_NS: Final = 5_000_000_000
+"""From the command to the scene's first sample: the nodes must be up by then."""
+
+MATCH_S: Final = 1.0
+"""An event that begins this near to a source's start is its event."""
+
+RATE_HZ: Final = 44100.0
+SEED: Final = 1
+
+
+class DemoError(RunError):
+    """The demo could not run."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One source of the scene, and the event that was made of it."""
+
+    name: str
+    start_s: float
+    true_position_m: tuple[float, float, float]
+    event: JsonObject | None
+
+    @property
+    def located(self) -> bool:
+        """Whether there is a position."""
+        return self.event is not None and self.event["status"] == "located"
+
+    @property
+    def error_m(self) -> float | None:
+        """Distance from the truth."""
+        return (
+            None
+            if self.event is None or self.event["position_m"] is None
+            else math.dist(self.event["position_m"], self.true_position_m)
+        )
+
+
+def prepare(directory: Path, http_port: int, events: int, progress: Callable[[int, int], None]) -> tuple[Site, Scene]:
+    """Simulate the demo's scene into a folder, with a site file on free ports."""
+    _need_free("127.0.0.1", http_port)
+    data = yaml.safe_load(SITE_FILE.read_text(encoding="utf-8"))
+    endpoint = f"tcp://127.0.0.1:{processes.free_port()}"
+    data["server"] = {"bind": endpoint, "http": {"host": "127.0.0.1", "port": http_port}}
+    for node in data["nodes"].values():
+        node["server"] = endpoint
+        (array,) = node["arrays"]
+        node["device"] = {"type": "wav", "files": {array: f"{array}.wav"}}
+    site = parse_site(yaml.safe_dump(data), str(SITE_FILE))
+    rt60_s = load_site(SITE_FILE).nodes["north-pc"].device.rt60_s  # type: ignore[union-attr]
+    scene = make_scene(
+        site.room.size_m,
+        rt60_s=rt60_s,
+        sounds=synthesised_sounds(RATE_HZ, SEED),
+        count=events,
+        sample_rate_hz=RATE_HZ,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=SEED,
+    )
+    write_scene(directory, site, scene, seed=SEED, progress=progress)
+    (directory / "site.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    return site, scene
+
+
+@contextmanager
+def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[tuple[str, int]]:
+    """Server and nodes as processes while the context lasts; yields the dashboard's address and the scene's start, ns.
+
+    The scene starts when the server is there: the first time on a machine that takes some seconds.
+
+    Raises
+    ------
+    NotStartedError
+        Where one of them does not come up.
+    """
+    http = site.server.http
+    url = f"http://{http.host}:{http.port}"
+    common = ["--site", str(directory / "site.yaml")]
+    started = [processes.start("serve", *common)]
+    try:
+        processes.wait_until_ready(url, started, clock)
+        start_ns = (clock.now_ns() + LEAD_NS) // FRAME_NS * FRAME_NS
+        for node in site.nodes:
+            extra = ["--loop"] if loop else []
+            at = utc_text(start_ns)
+            started.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
+        yield url, start_ns
+    finally:
+        processes.end(started)
+
+
+def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObject]:
+    """Events from the WebSocket, as any subscriber gets them, until a time or for ever."""
+    with connect(f"ws{url.removeprefix('http')}/api/v1/live?kinds=event", open_timeout=10) as live:
+        while until_ns is None or clock.now_ns() < until_ns:
+            try:
+                message = json.loads(live.recv(timeout=0.5))
+            except TimeoutError:
+                continue
+            except ConnectionClosed as error:
+                raise DemoError("the server ended") from error
+            if message["kind"] == "event":
+                yield message
+
+
+def read_truth(directory: Path) -> list[dict[str, Any]]:
+    """The scene's sources."""
+    return [json.loads(line) for line in (directory / TRUTH_FILE).read_text(encoding="utf-8").splitlines()]
+
+
+def match(
+    truth: Sequence[dict[str, Any]], events: Sequence[JsonObject], start_ns: int, period_s: float
+) -> list[Outcome]:
+    """For each source the event nearest in time, within `MATCH_S`; scene time repeats after `period_s`."""
+    outcomes = []
+    for source in truth:
+        near = [(abs(_scene_time_s(event, start_ns, period_s) - source["start_s"]), event) for event in events]
+        best = min(near, key=lambda pair: pair[0], default=None)
+        event = best[1] if best is not None and best[0] <= MATCH_S else None
+        x, y, z = source["position_m"]
+        outcomes.append(Outcome(source["name"], source["start_s"], (x, y, z), event))
+    return outcomes
+
+
+def nearest_source(truth: Sequence[dict[str, Any]], event: JsonObject, start_ns: int, period_s: float) -> Outcome:
+    """The source that an event was made of."""
+    time_s = _scene_time_s(event, start_ns, period_s)
+    source = min(truth, key=lambda entry: abs(entry["start_s"] - time_s))
+    x, y, z = source["position_m"]
+    return Outcome(source["name"], source["start_s"], (x, y, z), event)
+
+
+def _scene_time_s(event: JsonObject, start_ns: int, period_s: float) -> float:
+    return ((utc_ns(event["time_utc"]) - start_ns) / 1e9) % period_s
+
+
+def _need_free(host: str, port: int) -> None:
+    """Fail before anything is simulated; and never take another server's answers for the demo's."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise DemoError(
+                f"--port {port}: cannot be used: {reason}; stop what listens there or choose another"
+            ) from error

@@ -1,0 +1,265 @@
+"""Everything that is known about a site before it has heard a sound. It draws and prints nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.correlate.gcc_phat import microphone_pairs
+from livessl.core.geometry import Grid
+from livessl.core.steering import alias_free_hz
+from livessl.core.types import ArraySpec, FloatArray
+from livessl.lab.plan import prediction
+from livessl.simulate.room import absorption
+from livessl.site.build.grid import search_grid
+from livessl.site.models import Site
+
+ANGLES_DEG: Final = (0.0, 30.0, 60.0, 80.0)
+"""Directions from broadside at which the angular error is told."""
+
+DISTANCES_M: Final = (1.0, 2.0, 3.0, 4.0)
+"""Distances at which the direct-to-reverberant ratio is told."""
+
+SHARES: Final = (5, 25, 50, 75, 95)
+"""Percentiles that are told."""
+
+HEIGHT_M: Final = 1.5
+"""Where sounds are expected unless told otherwise: a mouth, a table, a door handle lie around it."""
+
+CALIBRATION_M: Final = 0.002
+"""Microphones measured with a tape and a good will; the paper's own calibration left 0.7 mm."""
+
+SOUND_S: Final = 0.5
+"""Length of the expected sound; with reverberation it hardly counts, see `prediction.observation_s`."""
+
+RATE_HZ: Final = 44100.0
+"""Sample rate of an array that no node captures."""
+
+MAP_NODES: Final = 600
+"""Points of the floor map: a third of a metre apart in a room of 8 x 10 m."""
+
+BAND_NODES: Final = 4000
+"""Points of the search volume at which pairs' bands are looked at."""
+
+LATTICE: Final = 150
+"""Places that are tried for an array, about."""
+
+WORTH_WHILE: Final = 0.95
+"""A move is advised if it lowers the median error at least to this share."""
+
+MOST_MOVES: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """A predicted error (ny, nx), metres, over the floor map, and its radial and tangential parts."""
+
+    total_m: FloatArray
+    radial_m: FloatArray
+    tangential_m: FloatArray
+
+    def percentile_m(self, share: float) -> float:
+        """Percentile of the whole error over the map, metres."""
+        return float(np.percentile(self.total_m, share))
+
+
+@dataclass(frozen=True, slots=True)
+class PairPlan:
+    """Two microphones: channels from 1, distance, and percentiles over the room of the frequency kept on the grid."""
+
+    channels: tuple[int, int]
+    spacing_m: float
+    alias_free_hz: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayPlan:
+    """What one array can do.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+    sample_rate_hz : float
+        Of the node that captures it.
+    sample_rate_known : bool
+        False where no node says so, and `RATE_HZ` is taken.
+    angle_error_deg : tuple of float
+        At `ANGLES_DEG`, of its widest pair; NaN where there is no such direction.
+    diffuse_correlation : float
+        Of its widest pair, averaged over its band.
+    pairs : tuple of PairPlan
+    alias_free_hz : tuple of float
+        Percentiles `SHARES` over points and pairs.
+    beyond_grid : float
+        Share of points and pairs that keep less than the band on this grid.
+    alone : Errors
+        Predicted for this array without the others.
+    """
+
+    spec: ArraySpec
+    sample_rate_hz: float
+    sample_rate_known: bool
+    angle_error_deg: tuple[float, ...]
+    diffuse_correlation: float
+    pairs: tuple[PairPlan, ...]
+    alias_free_hz: tuple[float, ...]
+    beyond_grid: float
+    alone: Errors
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A site's plan; the map's columns are at `x_m`, its rows at `y_m`, all at `height_m`.
+
+    Of a site with one array, `addition` says where a second one like it would go.
+    """
+
+    site: Site
+    rt60_s: float
+    absorption: float
+    conditions: prediction.Conditions
+    height_m: float
+    x_m: FloatArray
+    y_m: FloatArray
+    arrays: tuple[ArrayPlan, ...]
+    fused: Errors
+    moves: tuple[prediction.Move, ...]
+    addition: prediction.Move | None
+
+
+def make_plan(
+    site: Site,
+    rt60_s: float,
+    height_m: float | None = None,
+    calibration_m: float = CALIBRATION_M,
+    progress: Callable[[int, int], None] | None = None,
+) -> Plan:
+    """Work a site's plan out.
+
+    Parameters
+    ----------
+    site : Site
+    rt60_s : float
+        Reverberation time; 0 is anechoic.
+    height_m : float or None
+        Height of the map. None is the search plane's, or `HEIGHT_M`, or half the search volume's where that is lower.
+    calibration_m : float
+        Standard deviation of a microphone's place along any direction, above 0.
+    progress : callable or None
+        Called with (arrays tried at other places, arrays).
+
+    Raises
+    ------
+    ValueError
+        Where the room cannot have the reverberation time, or the height lies outside the search volume.
+    """
+    alpha = absorption(rt60_s, site.room.size_m, site.c_m_s)
+    conditions = prediction.Conditions(
+        prediction.critical_distance_m(alpha, site.room.size_m),
+        prediction.observation_s(SOUND_S, rt60_s),
+        calibration_m,
+        site.c_m_s,
+    )
+    volume = _volume(site)
+    floor = _floor(volume, height_m)
+    points = floor.nodes_m()
+    extent = volume.upper_m - volume.lower_m
+    information = [prediction.information_1_m2(spec, points, conditions) for spec in site.specs]
+    arrays = tuple(
+        _array_plan(site, spec, volume, _errors(own, floor, extent, spec.centre_m))
+        for spec, own in zip(site.specs, information, strict=True)
+    )
+    middle = np.mean([spec.centre_m for spec in site.specs], axis=0)
+    room, step = site.room.size_m, _step_m(site.room.size_m)
+    moves = prediction.best_moves(site.specs, points, conditions, room, extent, step, progress)
+    addition = None
+    if len(site.specs) == 1:
+        addition = prediction.best_addition(site.specs[0], points, conditions, room, extent, step)
+    return Plan(
+        site=site,
+        rt60_s=rt60_s,
+        absorption=alpha,
+        conditions=conditions,
+        height_m=floor.bounds_m[2][0],
+        x_m=floor.axis_m(0),
+        y_m=floor.axis_m(1),
+        arrays=arrays,
+        fused=_errors(np.sum(information, axis=0), floor, extent, middle),
+        moves=tuple(move for move in moves if move.after_m <= WORTH_WHILE * move.before_m)[:MOST_MOVES],
+        addition=addition,
+    )
+
+
+def _volume(site: Site) -> Grid:
+    """What of the search volume is in the room (some is: the site was checked), with the site's own spacing."""
+    grid = search_grid(site)
+    low = np.maximum(grid.lower_m, 0.0)
+    high = np.minimum(grid.upper_m, site.room.size_m)
+    x, y, z = ((float(a), float(b)) for a, b in zip(low, high, strict=True))
+    return Grid((x, y, z), grid.spacing_m)
+
+
+def _floor(volume: Grid, height_m: float | None) -> Grid:
+    low, high = volume.bounds_m[2]
+    usual = max(HEIGHT_M, low) if high >= HEIGHT_M else (low + high) / 2.0
+    height = usual if height_m is None else height_m
+    if not low <= height <= high:
+        raise ValueError(f"height: expected {low:g} to {high:g} m, where the site searches, got {height:g} m")
+    x, y, _ = volume.bounds_m
+    return _thinned(Grid((x, y, (height, height)), volume.spacing_m), MAP_NODES)
+
+
+def _thinned(grid: Grid, most: int) -> Grid:
+    """The same volume with about so many nodes, or fewer."""
+    spacing = grid.spacing_m
+    while Grid(grid.bounds_m, spacing).size > most:
+        spacing *= 1.05
+    return Grid(grid.bounds_m, spacing)
+
+
+def _step_m(room_size_m: tuple[float, float, float]) -> float:
+    """Step of the lattice of places: half a metre, in a large room more, in tenths of a metre."""
+    x, y, _ = room_size_m
+    return max(0.5, float(np.ceil(10.0 * np.sqrt(x * y / LATTICE)) / 10.0))
+
+
+def _errors(information: FloatArray, floor: Grid, extent_m: FloatArray, origin_m: FloatArray) -> Errors:
+    covariance = prediction.covariance_m2(information, extent_m)
+    parts = prediction.radial_tangential_m(covariance, floor.nodes_m(), origin_m)
+    total, radial, tangential = (
+        part.reshape(floor.shape[:2]).T for part in (prediction.position_error_m(covariance), *parts)
+    )
+    return Errors(total, radial, tangential)
+
+
+def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> ArrayPlan:
+    node = site.node_of(spec.name)
+    known_hz = site.nodes[node].device.sample_rate_hz if node is not None else None
+    rate_hz = known_hz or RATE_HZ
+    pairs = microphone_pairs(len(spec.microphones_m))
+    points = _thinned(volume, BAND_NODES).nodes_m()
+    kept = alias_free_hz(points, spec.microphones_m, pairs, site.grid.spacing_m, site.c_m_s)
+    apart = np.linalg.norm(spec.microphones_m[pairs[:, 0]] - spec.microphones_m[pairs[:, 1]], axis=1)
+    errors = prediction.angle_error_deg(np.array(ANGLES_DEG), spec.aperture_m, rate_hz, site.c_m_s)
+    return ArrayPlan(
+        spec=spec,
+        sample_rate_hz=rate_hz,
+        sample_rate_known=known_hz is not None,
+        angle_error_deg=tuple(float(error) for error in errors),
+        diffuse_correlation=prediction.band_diffuse_correlation(spec.band_hz, spec.aperture_m, site.c_m_s),
+        pairs=tuple(
+            PairPlan((int(i) + 1, int(k) + 1), float(spacing), _shares(limits))
+            for (i, k), spacing, limits in zip(pairs, apart, kept, strict=True)
+        ),
+        alias_free_hz=_shares(kept),
+        beyond_grid=float((kept < spec.band_hz[1]).mean()),
+        alone=alone,
+    )
+
+
+def _shares(limits_hz: FloatArray) -> tuple[float, ...]:
+    """Percentiles; "lower", as an interpolation with an infinite limit would be none."""
+    return tuple(float(value) for value in np.percentile(limits_hz, SHARES, method="lower"))

@@ -1,0 +1,123 @@
+"""What is wrong with a plan, in words: each with what, where and the cure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Final
+
+import numpy as np
+
+from livessl.core.types import FloatArray
+from livessl.lab.plan.design import ArrayPlan, Plan
+from livessl.lab.plan.prediction import CLEARANCE_M
+from livessl.site.build.grid import search_grid
+
+FLAT_M: Final = 0.01
+"""Microphones that lie so near to one plane, root mean square, are in it."""
+
+IN_LINE_M: Final = 0.3
+"""Arrays that lie so near to one line, root mean square, are in it."""
+
+MOSTLY: Final = 0.5
+"""A share of points and pairs above which a grid is too coarse."""
+
+OF_RATE: Final = 0.45
+"""Correlations are interpolated well up to this share of the sample rate."""
+
+_WALLS: Final = (("x = 0", "x = {:g} m"), ("y = 0", "y = {:g} m"), ("the floor", "the ceiling"))
+
+
+def warnings(plan: Plan) -> list[str]:
+    """Everything that a user should think about before drilling holes."""
+    found = [*_together(plan)]
+    for array in plan.arrays:
+        found += _near_walls(plan, array)
+        found += _size(plan, array)
+        found += _sampling(plan, array)
+    return found
+
+
+def _together(plan: Plan) -> Iterator[str]:
+    if plan.site.joint:
+        yield (
+            f"joint arrays ({', '.join(plan.site.joint)}) are not planned as such: the error above is that of the maps "
+            "of the arrays that they join, summed"
+        )
+    if len(plan.arrays) == 1:
+        yield "one array alone tells a direction, but hardly a distance; set up a second one, metres apart"
+    centres = np.array([array.spec.centre_m for array in plan.arrays])
+    if len(centres) >= 3 and _scatter_m(centres)[1] < IN_LINE_M:
+        yield (
+            "all arrays stand in one line, so that a sound further along it has hardly a distance; "
+            "move one of them metres to the side"
+        )
+    microphones = np.concatenate([array.spec.microphones_m for array in plan.arrays])
+    if _scatter_m(microphones)[2] < FLAT_M and _searched_on_both_sides(plan, microphones):
+        yield (
+            "all microphones lie in one plane: a place and its mirror image behind it sound alike, and the error above "
+            "knows nothing of it; raise a microphone, tilt an array, or let grid.bounds_m end at the plane"
+        )
+
+
+def _searched_on_both_sides(plan: Plan, microphones_m: FloatArray) -> bool:
+    grid, middle = search_grid(plan.site), microphones_m.mean(axis=0)
+    normal = np.linalg.svd(microphones_m - middle)[2][2]
+    corners = np.array(list(product(*grid.bounds_m)))
+    height = (corners - middle) @ normal
+    return bool(height.min() < -grid.spacing_m and height.max() > grid.spacing_m)
+
+
+def _scatter_m(points_m: FloatArray) -> FloatArray:
+    """Root mean square spread (3,) along the points' own axes, largest first."""
+    spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False) / np.sqrt(len(points_m))
+    return np.concatenate([spread, np.zeros(3)])[:3]
+
+
+def _near_walls(plan: Plan, array: ArrayPlan) -> Iterator[str]:
+    for axis, names in enumerate(_WALLS):
+        length = plan.site.room.size_m[axis]
+        across = array.spec.microphones_m[:, axis]
+        for name, gap, k in (
+            (names[0], float(across.min()), int(across.argmin())),
+            (names[1].format(length), float(length - across.max()), int(across.argmax())),
+        ):
+            if gap < CLEARANCE_M - 1e-9:
+                wall = name if axis == 2 else f"the wall {name}"
+                yield (
+                    f"array {array.spec.name!r}: microphone {k + 1} is {gap:.2f} m from {wall}, whose reflection comes "
+                    f"too soon to be told from the sound; keep {CLEARANCE_M:g} m"
+                )
+
+
+def _size(plan: Plan, array: ArrayPlan) -> Iterator[str]:
+    aperture, (_, high) = array.spec.aperture_m, array.spec.band_hz
+    if aperture > plan.conditions.critical_m:
+        yield (
+            f"array {array.spec.name!r}: with {aperture:.2f} m it is wider than the critical distance of "
+            f"{plan.conditions.critical_m:.2f} m at RT60 {plan.rt60_s:g} s: hardly a sound stands out at all of its "
+            "microphones, and false peaks are likely, which the error above does not count; "
+            "build it smaller, and set several far apart"
+        )
+    if aperture * high / plan.site.c_m_s < 0.5:
+        needed = plan.site.c_m_s / (2.0 * high)
+        yield (
+            f"array {array.spec.name!r}: with {aperture:.3f} m it is less than half a wavelength wide all over its "
+            f"band up to {high:g} Hz; give it {needed:.3f} m or more, or raise band_hz"
+        )
+
+
+def _sampling(plan: Plan, array: ArrayPlan) -> Iterator[str]:
+    high, spacing = array.spec.band_hz[1], plan.site.grid.spacing_m
+    if high > OF_RATE * array.sample_rate_hz:
+        yield (
+            f"array {array.spec.name!r}: a band up to {high:g} Hz needs a sample rate of {high / OF_RATE:.0f} Hz or "
+            f"more, got {array.sample_rate_hz:g} Hz; raise sample_rate_hz or lower band_hz"
+        )
+    if array.beyond_grid > MOSTLY:
+        fits = spacing * array.alias_free_hz[2] / high
+        yield (
+            f"array {array.spec.name!r}: a grid of {spacing:g} m is too coarse for {high:g} Hz: "
+            f"{array.beyond_grid:.0%} of points and pairs keep less, half of all {array.alias_free_hz[2]:.0f} Hz or "
+            f"less; use grid.spacing_m {fits:.2g} m"
+        )

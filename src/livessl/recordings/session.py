@@ -1,0 +1,124 @@
+"""A recorded session on disk: what was recorded, from when on, and the site it was recorded in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from livessl.clock import utc_ns, utc_text
+from livessl.site.load import load_site, read_yaml
+from livessl.site.models import ConfigError, Fault, Site
+
+SESSION_FILE: Final = "session.yaml"
+SITE_FILE: Final = "site.yaml"
+VERSION: Final = 1
+
+
+class Piece(BaseModel):
+    """One file without gaps: one array's channels, in order."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    array: str
+    file: str
+    start_utc: str
+
+    @field_validator("start_utc")
+    @classmethod
+    def _instant(cls, text: str) -> str:
+        utc_ns(text)
+        return text
+
+    @property
+    def start_ns(self) -> int:
+        """Site time of its first sample."""
+        return utc_ns(self.start_utc)
+
+
+class _SessionFile(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: int
+    pieces: list[Piece] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A folder of recordings and the site."""
+
+    directory: Path
+    pieces: tuple[Piece, ...]
+
+    def path(self, piece: Piece) -> Path:
+        """Where a piece's file lies."""
+        return self.directory / piece.file
+
+    def site(self, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+        """The site that it was recorded in; `joint` adds to its own."""
+        return load_site(self.directory / SITE_FILE, joint)
+
+
+def piece(array: str, file: str, start_ns: int) -> Piece:
+    """A piece that begins at a site time."""
+    return Piece(array=array, file=file, start_utc=utc_text(start_ns))
+
+
+def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
+    """Write the session's two descriptions beside its recordings."""
+    (directory / SITE_FILE).write_text(site_text(site), encoding="utf-8")
+    described = _SessionFile(version=VERSION, pieces=pieces).model_dump()
+    (directory / SESSION_FILE).write_text(yaml.safe_dump(described, sort_keys=False), encoding="utf-8")
+
+
+def read_session(directory: Path) -> Session:
+    """Read a session.
+
+    Raises
+    ------
+    ConfigError
+        Where the folder holds no session, or one that cannot be understood.
+    """
+    path = directory / SESSION_FILE
+    try:
+        described = _SessionFile.model_validate(read_yaml(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ConfigError(
+            [
+                Fault(
+                    str(path),
+                    f"expected a recorded session, cannot read it: {error.strerror}; make one with "
+                    "`livessl record` or `livessl simulate`",
+                )
+            ]
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError([Fault(str(path), f"not valid YAML: {error}")]) from error
+    except ValidationError as error:
+        raise ConfigError(
+            [Fault(f"{path}: {'.'.join(map(str, item['loc']))}", item["msg"]) for item in error.errors()]
+        ) from error
+    if described.version != VERSION:
+        raise ConfigError([Fault(str(path), f"expected version {VERSION}, got {described.version}")])
+    return Session(directory, tuple(described.pieces))
+
+
+def site_text(site: Site) -> str:
+    """The site as YAML that stands alone: array positions absolute, no geometry files, no word on secrets."""
+    http = {"tokens", "certificate", "private_key"}
+    data: dict[str, Any] = site.model_dump(
+        mode="json", exclude_defaults=True, exclude={"keys": True, "server": {"http": http}}
+    )
+    for spec in site.specs:
+        array = {"microphones_m": spec.microphones_m.round(6).tolist()}
+        given = site.arrays[spec.name]
+        if given.band_hz is not None:
+            array["band_hz"] = list(given.band_hz)
+        data["arrays"][spec.name] = array
+    for name, node in site.nodes.items():
+        data["nodes"][name]["device"]["type"] = node.device.type
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None)

@@ -1,0 +1,230 @@
+"""What subscribers read: estimates, events, tracks and array states as JSON-ready dictionaries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import orjson
+
+from livessl.clock import utc_text
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
+from livessl.site.models import Site
+
+API_VERSION: Final = 1
+
+JsonObject = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Where an answer's time went, from the end of its sound on; seconds, which add up.
+
+    Parameters
+    ----------
+    waited : float
+        For the quiet that ends an event; 0 for an update.
+    sent : float
+        Until the node had sent the last message that the answer needs: by the node's clock.
+    received : float
+        Until the server had it: between two clocks, unless node and server share a machine.
+    located : float
+        Until the answer was there: by the server's clock.
+    """
+
+    waited: float
+    sent: float
+    received: float
+    located: float
+
+    @property
+    def ours(self) -> float:
+        """From when all had happened that the answer needs until it was there."""
+        return self.sent + self.received + self.located
+
+    @property
+    def total(self) -> float:
+        """From the end of the sound to the answer."""
+        return self.waited + self.ours
+
+
+class Messages:
+    """Turns the core's values into the API's objects.
+
+    Parameters
+    ----------
+    site : Site
+        For the zones.
+    origin_ns : int
+        Site time that `start_s` counts from: the beginning of the recording, or of the live run.
+    utc : bool
+        Whether site time is UTC; where a recording does not say when it was made, `time_utc` is null.
+    """
+
+    def __init__(self, site: Site, origin_ns: int, *, utc: bool) -> None:
+        self._site = site
+        self._origin_ns = origin_ns
+        self._utc = utc
+
+    def event(self, event: Event, stages: Stages | None = None, replaces: Sequence[str] = ()) -> JsonObject:
+        """An event, and the ids of the early ones that it replaces: the contract's fields first."""
+        position, covariance, confidence, arrays = where(event.estimate)
+        return {
+            "kind": "event",
+            "id": event.id,
+            **self._when(event.start_ns),
+            "duration_s": round(event.duration_s, 6),
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "arrays": arrays,
+            "method": event.method,
+            "status": str(event.status),
+            "reason": event.reason,
+            "heard_by": list(event.heard_by),
+            "level_dbfs": dbfs(event.power),
+            "contributions": [_contribution(c) for c in event.contributions],
+            "zones": self._site.zones_of(position),
+            "late_frames": event.late_frames,
+            "latency_s": round(event.latency_s if stages is None else stages.total, 4),
+            "latency_stages_s": _stages(stages),
+            "late": event.late,
+            "replaces": list(replaces),
+            "source": event.source,
+        }
+
+    def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
+        """Where a sound that still lasts seems to be."""
+        position, covariance, confidence, arrays = where(update.estimate)
+        return {
+            "kind": "update",
+            "event_id": update.event_id,
+            **self._when(update.estimate.time_ns),
+            "end_utc": utc_text(update.complete_ns) if self._utc else None,
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "arrays": arrays,
+            "status": str(update.status),
+            "contributions": [_contribution(c) for c in update.contributions],
+            "others": [self._other(other) for other in update.others],
+            "zones": self._site.zones_of(position),
+            "level_dbfs": dbfs(update.power),
+            "latency_s": None if stages is None else round(stages.total, 4),
+            "latency_stages_s": _stages(stages),
+        }
+
+    def _other(self, estimate: Estimate) -> JsonObject:
+        position, covariance, confidence, _ = where(estimate)
+        return {
+            "position_m": position,
+            "covariance_m2": covariance,
+            "confidence": confidence,
+            "zones": self._site.zones_of(position),
+        }
+
+    def track(self, track: Track) -> JsonObject:
+        """A followed source."""
+        position = _metres(track.position_m)
+        return {
+            "kind": "track",
+            "id": track.id,
+            "state": str(track.state),
+            **self._when(track.time_ns),
+            "position_m": position,
+            "velocity_m_s": _metres(track.velocity_m_s),
+            "covariance_m2": [_square_metres(row) for row in track.covariance_m2],
+            "zones": self._site.zones_of(position),
+        }
+
+    def _when(self, time_ns: int) -> JsonObject:
+        return {
+            "time_utc": utc_text(time_ns) if self._utc else None,
+            "start_s": round((time_ns - self._origin_ns) / 1e9, 6),
+        }
+
+
+def where(
+    estimate: Estimate | None,
+) -> tuple[list[float] | None, list[list[float]] | None, float, list[str]]:
+    """Position, covariance, confidence and arrays of an estimate, rounded as they are published."""
+    if estimate is None:
+        return None, None, 0.0, []
+    covariance = [_square_metres(row) for row in estimate.covariance_m2]
+    return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
+
+
+def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:
+    """Return an array's state, with the threshold that its node's activity detection applies."""
+    noise = status.noise_power
+    return {
+        "name": status.name,
+        "state": str(status.state),
+        "reason": status.reason,
+        "node": node,
+        "active": status.active,
+        "age_s": None if status.age_s is None else round(status.age_s, 3),
+        "level_dbfs": dbfs(status.power),
+        "noise_floor_dbfs": dbfs(noise),
+        "activity_threshold_dbfs": None if noise is None else dbfs(activity.least_power(noise)),
+        "channel_levels_dbfs": [dbfs(power) for power in status.channel_power],
+        "sample_rate_hz": status.sample_rate_hz,
+        "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),
+        "clock": None if status.clock is None else str(status.clock),
+        "agreement": {"agreed": status.agreed, "disagreed": status.disagreed},
+        "clock_offset": _clock_offset(status),
+        "counters": dict(status.counters),
+    }
+
+
+def _clock_offset(status: ArrayStatus) -> JsonObject | None:
+    offset = status.clock_offset
+    if offset is None:
+        return None
+    return {
+        "offset_s": round(offset.offset_s, 4),
+        "std_s": round(offset.std_s, 4),
+        "sounds": offset.sounds,
+        "reference": offset.reference,
+        "corrected_s": round(status.corrected_frames * FRAME_S, 2),
+    }
+
+
+def json_text(message: JsonObject) -> str:
+    """The message as JSON, without blanks."""
+    return orjson.dumps(message).decode()
+
+
+def dbfs(power: float | None) -> float | None:
+    """Level of a power in full scale squared; null for none, and for digital silence, which has no level."""
+    return round(10.0 * math.log10(power), 1) if power else None
+
+
+def _contribution(contribution: Contribution) -> JsonObject:
+    return {
+        "array": contribution.array,
+        "active_s": round(contribution.active_s, 3),
+        "level_dbfs": dbfs(contribution.power),
+        "azimuth_deg": round(contribution.azimuth_deg, 2),
+        "elevation_deg": round(contribution.elevation_deg, 2),
+        "distance_m": round(contribution.distance_m, 3),
+        "agrees": contribution.agrees,
+        "off_deg": None if contribution.off_deg is None else round(contribution.off_deg, 1),
+        "asked": contribution.asked,
+    }
+
+
+def _stages(stages: Stages | None) -> JsonObject | None:
+    return None if stages is None else {name: round(value, 4) for name, value in asdict(stages).items()}
+
+
+def _metres(values: Any) -> list[float]:
+    return [round(float(value), 4) for value in values]
+
+
+def _square_metres(values: Any) -> list[float]:
+    return [float(f"{float(value):.6g}") for value in values]

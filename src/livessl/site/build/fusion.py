@@ -1,0 +1,56 @@
+"""The fusion of a site: estimator, parameters and clock offsets. It loads everything that locates."""
+
+from __future__ import annotations
+
+from livessl.core.locate.estimators import ESTIMATORS
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.correlation_cache import Each
+from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
+from livessl.core.stream.segmenter import RECENT_S
+from livessl.site.build.grid import search_grid
+from livessl.site.models import Site
+
+
+def make_clock_offsets(site: Site) -> ClockOffsets:
+    """What nobody knows yet of this site's clocks: one each node, or each array that is on none."""
+    return ClockOffsets({spec.name: site.node_of(spec.name) or spec.name for spec in site.processed}, site.c_m_s)
+
+
+def make_fusion(
+    site: Site,
+    method: str | None = None,
+    *,
+    updates: bool = True,
+    live: bool = False,
+    clock_offsets: ClockOffsets | None = None,
+    each: Each | None = None,
+) -> Fusion:
+    """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
+
+    `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
+    """
+    f, a = site.fusion, site.activity
+    estimator = ESTIMATORS[method or f.method](site.processed, search_grid(site), site.c_m_s)
+    parameters = FusionParameters(
+        deadline_s=f.deadline_s,
+        answer_s=ANSWER_S if live else RECENT_S,
+        window_s=f.window_s,
+        update_s=f.update_s,
+        max_event_s=f.max_event_s,
+        min_arrays=f.min_arrays,
+        sources=f.sources,
+        live_sources=f.live_sources,
+        threshold=a.threshold,
+        pre_roll_s=a.pre_roll_s,
+        hang_over_s=a.hang_over_s,
+    )
+    return Fusion(
+        site.site,
+        site.processed,
+        estimator,
+        parameters,
+        updates=updates,
+        newest_only=live,
+        clock_offsets=make_clock_offsets(site) if clock_offsets is None else clock_offsets,
+        each=each,
+    )

@@ -1,0 +1,43 @@
+"""The pipeline of a device, or of a recording in its place. It loads nothing that locates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.pipeline import Pipeline, Wiring
+from livessl.site.models import Site
+
+
+def activity_parameters(site: Site) -> ActivityParameters:
+    """The activity rule's numbers, for the core."""
+    a = site.activity
+    return ActivityParameters(
+        threshold=a.threshold,
+        release_s=a.release_s,
+        floor_window_s=a.floor_window_s,
+        floor_factor=a.floor_factor,
+        min_power=10.0 ** (a.min_level_dbfs / 10.0),
+        pre_roll_s=a.pre_roll_s,
+        hang_over_s=a.hang_over_s,
+    )
+
+
+def make_pipeline(site: Site, channels: Mapping[str, Sequence[int]], sample_rate_hz: float) -> Pipeline:
+    """Return the pipeline of the arrays that share one device's clock.
+
+    Parameters
+    ----------
+    site : Site
+    channels : mapping of array name to channels
+        Device channels counted from 1, in the order of the array's microphones. Arrays that the site joins are
+        processed as one.
+    sample_rate_hz : float
+        Nominal rate of the device.
+    """
+    wirings = [
+        Wiring(site.array(name), np.array(numbers) - 1) for name, numbers in site.joined_channels(channels).items()
+    ]
+    return Pipeline(wirings, sample_rate_hz, activity_parameters(site))

@@ -1,0 +1,102 @@
+"""The listening kernels: compiled and on NumPy they say the same, and what their definitions say."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from livessl.core.correlate.gcc_phat import microphone_pairs
+from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.types import ComplexArray, Float32Array
+
+KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="NumPy")]
+LOW, BINS = 3, 40
+LEAST, DECAY = np.float32(1e-9), np.float32(0.95)
+LOUD, STRONGEST = np.float32(3.0), np.float32(10.0)
+
+
+def spectra_of(frames: int, microphones: int = 3, seed: int = 0) -> ComplexArray:
+    rng = np.random.default_rng(seed)
+    shape = (frames, microphones, LOW + BINS + 5)
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize("noise", [0.0, 3.0, np.inf])
+def test_cross_spectra_are_weighed_sums_of_what_is_whitened(kernels: ModuleType, noise: float) -> None:
+    spectra = spectra_of(4)
+    spectra[:, 0] *= 3.0  # a louder microphone
+    spectra[:, 1, LOW + 7] = 0.0  # where a channel is silent nothing is known
+    weights = np.random.default_rng(1).random((4, BINS)).astype(np.float32)
+    weights[2] = 0.0
+    pairs, whitened, levels = microphone_pairs(3), np.empty((3, BINS), np.complex64), np.empty(3)
+    noises = np.full((4, BINS), noise, np.float32)
+    kernels.cross_spectra(spectra, LOW, pairs, weights, noises, whitened, levels)
+    inside = spectra[:, :, LOW : LOW + BINS].astype(np.complex128)
+    power = np.square(np.abs(inside))
+    padded = np.pad(power.mean(axis=1), ((0, 0), (1, 1)), mode="edge")
+    mean = ((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / 3.0)[:, None]
+    share = np.minimum(1.0, noise / mean)
+    assert noise != 3.0 or 0.05 < (share == 1.0).mean() < 0.95  # of that, some is all noise and some is not
+    power = (1.0 - share) * power + share * mean
+    unit = np.divide(inside, np.sqrt(power), out=np.zeros_like(inside), where=inside != 0)
+    for row, (i, k) in enumerate(pairs):
+        np.testing.assert_allclose(whitened[row], (weights * np.conj(unit[:, i]) * unit[:, k]).sum(axis=0), atol=2e-5)
+    np.testing.assert_allclose(levels, (weights[:, None] * np.square(np.abs(unit))).sum(axis=(0, 2)), rtol=1e-5)
+    assert np.abs(whitened.imag).max() > 0.5  # a sign that is turned is seen
+    assert whitened[0, 7] == whitened[2, 7] == 0.0
+    if noise == 0.0:
+        assert levels[0] == pytest.approx(weights.sum(), rel=1e-5)
+    elif noise == np.inf:
+        assert levels[0] > 5.0 * levels[2]
+
+
+def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array, ...]:
+    """Weights of some windows, six to a frame, and what is known after them."""
+    heard, noise, past = np.zeros(2, np.int64), np.zeros(BINS, np.float32), np.zeros(BINS, np.float32)
+    all_weights, all_noises = [], []
+    for number, (still, loud) in enumerate(zip(quiet, level, strict=True)):
+        weights, noises = np.full((2, 6, BINS), np.nan, np.float32)
+        spectra = np.float32(loud) * spectra_of(6, seed=number)
+        kernels.onset_weights(
+            spectra, LOW, still, heard, LEAST, DECAY, 8, 20, LOUD, STRONGEST, noise, past, weights, noises
+        )
+        all_weights.append(weights)
+        all_noises.append(noises)
+    return np.concatenate(all_weights), np.concatenate(all_noises), noise, past, heard.astype(np.float32)
+
+
+def test_weights_are_the_same_by_both() -> None:
+    quiet, level = [True, True, False, False, True, True], [0.01, 0.02, 1.0, 0.1, 0.5, 0.01]
+    said = [weighed(kernels, quiet, level) for kernels in (with_numba, with_numpy)]
+    for one, other in zip(*said, strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-4, atol=1e-6)
+    weights, noises, last = said[0][:3]
+    assert (noises[2] != noises[1]).any()  # of each window what was known before it
+    np.testing.assert_allclose(noises[-1], last, rtol=0.2)
+    assert not weights[:8].any()  # before the noise is known
+    assert weights[12:18].mean() > 10.0 * weights[18:24].mean()  # what comes first, and what comes after it
+    assert weights.max() == STRONGEST
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_windows_are_cut_a_hop_apart_and_filled_up(kernels: ModuleType) -> None:
+    samples = np.random.default_rng(0).standard_normal((2, 100)).astype(np.float32)
+    window, windows = np.hanning(30).astype(np.float32), np.full((4, 2, 64), np.nan, np.float32)
+    kernels.cut_windows(samples, 20, window, windows)
+    for t in range(4):
+        np.testing.assert_array_equal(windows[t, :, :30], samples[:, 20 * t : 20 * t + 30] * window)
+    assert not windows[:, :, 30:].any()
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
+def test_mean_square_leaves_out_what_is_near(kernels: ModuleType) -> None:
+    lags_s = np.arange(-20, 21) / 1000.0
+    values = np.ones((2, 41), np.float32)
+    values[0, 18:23] = 5.0  # within 2.5 ms of zero
+    at_s = np.array([0.0, 1.0])
+    assert kernels.mean_square(values, lags_s, at_s, 2.5e-3) == pytest.approx(1.0)
+    assert kernels.mean_square(values, lags_s, at_s, -1.0) == pytest.approx((5 * 25 + 77) / 82)
+    assert kernels.mean_square(values, lags_s, at_s, 3.0) == 0.0

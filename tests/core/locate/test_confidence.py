@@ -1,0 +1,119 @@
+"""How sure a place is: probability, refusal and covariance, on evidence made for the purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from free_field import C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
+from livessl.core.geometry import Grid
+from livessl.core.locate import refine
+from livessl.core.locate.confidence import LEAST_CONFIDENCE, ConfidenceFeatures, Judgement, crossing_deg, judge
+from livessl.core.locate.srp import SRPFunctional
+from livessl.core.types import ArraySpec, Evidence
+
+NORTH = tetra("north", [2.7, 4.2, 1.3])
+SOUTH = tetra("south", [2.3, 1.1, 1.5], yaw_deg=71.0)
+GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
+SOURCE_M = np.array([1.13, 3.31, 1.47])
+
+
+def heard_at(spec: ArraySpec, height: float, noise: float = 0.1) -> Evidence:
+    gcc = ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M), RATE_HZ)
+    scatter = np.random.default_rng(len(spec.name)).standard_normal(gcc.values.shape)
+    values = (height * gcc.values + noise * scatter).astype(np.float32)
+    return Evidence(spec, replace(gcc, values=values))
+
+
+def judged(*evidence: Evidence, rival_share: float = 0.3) -> Judgement:
+    functional = SRPFunctional(evidence, C_M_S)
+    power = float(functional.value(SOURCE_M[None])[0])
+    return judge(functional, evidence, SOURCE_M, power, rival_share * power, GRID)
+
+
+@given(margin=st.floats(0.0, 0.3), standing=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
+def test_more_evidence_is_more_confidence(margin: float, standing: float, more: float) -> None:
+    confidence = ConfidenceFeatures(margin, standing).confidence
+    assert 0.0 < confidence < 1.0
+    assert ConfidenceFeatures(margin + more, standing).confidence > confidence
+    assert ConfidenceFeatures(margin, standing + more).confidence > confidence
+
+
+def test_clear_evidence_is_located_and_noise_is_refused() -> None:
+    clear = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0))
+    assert clear.refused is None
+    assert clear.features.confidence > 0.95
+    drowned = judged(heard_at(NORTH, 0.02), heard_at(SOUTH, 0.02), rival_share=0.95)
+    assert drowned.features.confidence < LEAST_CONFIDENCE
+    assert drowned.refused is not None
+    assert f"{drowned.features.confidence:.2f}" in drowned.refused
+
+
+def test_an_array_that_hears_only_noise_hardly_takes_away() -> None:
+    alone = judged(heard_at(NORTH, 1.0)).features
+    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
+    assert both.standing == pytest.approx(alone.standing, abs=1.0)  # noise stands no higher than once its own rms
+    assert judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features.standing > alone.standing + 2.0
+
+
+def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
+    assert (
+        ConfidenceFeatures(0.01, 5.0, crossing_deg=45.0).confidence
+        > ConfidenceFeatures(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
+    )
+    east = tetra("east", [2.0, 0.0, 1.0])
+    west = tetra("west", [0.0, 2.0, 1.0])
+    assert crossing_deg([east], np.array([2.0, 3.0, 1.0])) == 0.0
+    assert crossing_deg([east, west], np.array([2.0, 2.0, 1.0])) == pytest.approx(90.0, abs=3.0)
+    beyond = east.centre_m + 3.0 * (west.centre_m - east.centre_m)
+    assert crossing_deg([east, west], beyond) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_arrays_that_hear_only_noise_leave_it_unsure() -> None:
+    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features
+    one = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
+    assert both.is_sure
+    assert one.shared < 2.0 < both.shared
+    assert not one.is_sure
+    assert not judged(heard_at(NORTH, 1.0)).features.is_sure
+
+
+def test_pairs_that_disagree_widen_the_ellipsoid() -> None:
+    """Delays off by 10 us, 3 mm of sound: far below a lobe, so that the heights hardly fall."""
+    evidence = [heard_at(NORTH, 1.0, 0.0), heard_at(SOUTH, 1.0, 0.0)]
+    off_s = 1e-5 * np.random.default_rng(0).standard_normal((2, 6))
+    torn = [
+        Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
+        for spec, off in zip((NORTH, SOUTH), off_s, strict=True)
+    ]
+    agreed, disagreed = (judged(*each).covariance_m2 for each in (evidence, torn))
+    np.testing.assert_allclose(agreed, 0.005**2 * np.eye(3), atol=1e-6)  # what is left however clear
+    assert np.trace(disagreed) > 1.5 * np.trace(agreed)  # half of it and more is what the pairs tell
+
+
+def test_one_array_has_no_delays_to_spare() -> None:
+    """Three delays, three coordinates: pairs that agree are no wonder, and the ellipsoid is as wide as without it."""
+    alone = judged(heard_at(NORTH, 1.0, 0.0)).covariance_m2
+    assert np.linalg.eigvalsh(alone)[-1] > 0.05**2
+
+
+def test_nothing_heard_is_refused_without_a_warning() -> None:
+    silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (heard_at(NORTH, 1.0),)]
+    nothing = judged(*silent)
+    assert nothing.refused is not None
+    assert nothing.features == ConfidenceFeatures(0.0, 0.0)
+    assert np.isfinite(nothing.covariance_m2).all()
+
+
+def test_neighbourhood_is_a_metre_around_and_inside_the_grid() -> None:
+    box = refine.neighbourhood(SOURCE_M, GRID)
+    for axis, (first, last) in enumerate(box):
+        nodes = GRID.axis_m(axis)
+        assert abs(nodes[first] - SOURCE_M[axis]) <= 1.0
+        assert abs(nodes[last] - SOURCE_M[axis]) <= 1.0
+        assert first == 0 or abs(nodes[first - 1] - SOURCE_M[axis]) > 1.0
+        assert last == len(nodes) - 1 or abs(nodes[last + 1] - SOURCE_M[axis]) > 1.0

@@ -1,0 +1,183 @@
+"""Live and settled: what is told at once, what stays, and for how long an array is waited for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import pytest
+from test_fusion import HANG_OVER, START, Arrivals, frame, fusion_of, mark, node, now_ns
+
+from livessl.core.stream import final_pass
+from livessl.core.stream.array_health import LOST_NS
+from livessl.core.stream.final_pass import HOLD_NS, FinalResults, TwoPassFusion
+from livessl.core.types import FRAME_NS, Event, Frame, Message
+
+NAMES = ("north", "south")
+SECOND = 20
+
+
+def settling_of(settled: int | None = None) -> TwoPassFusion:
+    return TwoPassFusion(fusion_of(), NAMES, settled)
+
+
+def play(into: TwoPassFusion, arrivals: Arrivals, until: int, since: int = 0) -> list[tuple[int, Event | FinalResults]]:
+    """Step through time, in frame indices; the events that came out, and when."""
+    said: list[tuple[int, Event | FinalResults]] = []
+    for now in range(since, until + 1):
+        here = [message for when, message in arrivals if since <= now and (when <= now < when + 1 or when == now)]
+        outputs = into.step(here, now_ns(now))
+        said += [(now, output) for output in outputs if isinstance(output, Event | FinalResults)]
+    return said
+
+
+def settled_events(said: Iterable[tuple[int, Event | FinalResults]]) -> list[Event]:
+    return [event for _, output in said if isinstance(output, FinalResults) for event in output.events]
+
+
+def provisional(said: Iterable[tuple[int, Event | FinalResults]]) -> list[Event]:
+    return [output for _, output in said if isinstance(output, Event)]
+
+
+def both(active: range, frame_indices: range) -> Arrivals:
+    return node("north", active, frame_indices) + node("south", active, frame_indices)
+
+
+def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() -> None:
+    said = play(settling_of(), both(range(10, 16), range(40)), 40)
+    assert provisional(said) == []
+    ((when, output),) = said
+    assert when == 16 + HANG_OVER
+    assert isinstance(output, FinalResults)
+    (event,) = output.events
+    assert (event.heard_by, event.late) == (NAMES, False)
+    assert event.latency_s == pytest.approx(HANG_OVER * 0.05)
+    assert output.until == START + 16  # the sound's end: what follows may be the run-up of the next
+
+
+def test_what_is_settled_grows_with_silence_but_for_a_run_up() -> None:
+    into = settling_of()
+    assert into.settled is None
+    play(into, both(range(0), range(100)), 100)
+    assert into.settled == START + 100 - 8
+
+
+def test_sound_that_lasts_holds_what_it_needs() -> None:
+    into = settling_of()
+    play(into, both(range(30, 90), range(60)), 60)
+    assert into.settled == START + 30 - 8
+
+
+def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
+    into = settling_of()
+    north, south = node("north", range(40, 46), range(200)), node("south", range(40, 46), range(30))
+    said = play(into, north + south, 100)
+    assert settled_events(said) == []
+    (event,) = provisional(said)
+    assert event.heard_by == ("north",)
+    # it comes back, and has kept what it heard
+    into.greet("south", (START + 38, START + 50), now_ns(100))
+    kept: Arrivals = [(101.0, m) for _, m in node("south", range(40, 46), range(35, 50)) if isinstance(m, Frame)]
+    said = play(into, north + kept + [(101.0, mark("south", 100))], 110, 101)
+    assert settled_events(said) == []  # there may be more
+    into.greet("south", None, now_ns(110))
+    said = play(into, [*north, (111.0, mark("south", 110))], 111, 111)
+    (late,) = settled_events(said)
+    assert (late.heard_by, late.late) == (NAMES, True)
+    assert late.latency_s == pytest.approx((111 - 46) * 0.05)
+    assert into.backfilled == {"north": 0, "south": len(kept)}
+
+
+def test_nobody_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(final_pass, "HOLD_NS", 5 * 1_000_000_000)
+    into = settling_of()
+    said = play(into, node("north", range(40, 46), range(300)) + node("south", (), range(30)), 300)
+    (event,) = settled_events(said)
+    assert (event.heard_by, event.late) == (("north",), False)
+    (told,) = provisional(said)
+    assert (event.id, event.start_ns, event.end_ns) == (told.id, told.start_ns, told.end_ns)
+    # the last frame of its hang-over came at 52
+    assert next(when for when, output in said if isinstance(output, FinalResults)) == 52 + 5 * SECOND + 1
+    # what the other kept of that time comes too late, and is counted
+    into.greet("south", (START + 38, START + 52), now_ns(300))
+    play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
+    assert into.too_late == {"north": 0, "south": 6}
+
+
+def test_hold_is_longer_than_a_restart_takes() -> None:
+    assert HOLD_NS > 60 * 1_000_000_000 > LOST_NS
+
+
+def test_memory_that_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = frame("north", 0).samples.nbytes
+    monkeypatch.setattr(final_pass, "HOLD_BYTES", 50 * size)
+    into = settling_of()
+    play(into, node("south", (), range(5)), 5)
+    said = play(into, node("north", range(10, 400), range(5, 420)), 420, 5)
+    assert into._bytes <= 50 * size
+    assert len(settled_events(said)) >= 1
+
+
+def test_good_bye_is_waited_for_by_nobody() -> None:
+    into = settling_of()
+    play(into, both(range(10, 16), range(14)), 14)
+    into.leave("south")
+    said = play(into, node("north", range(10, 16), range(14, 40)), 40, 15)
+    (event,) = settled_events(said)
+    assert event.heard_by == NAMES
+
+
+def test_when_all_have_left_everything_is_settled() -> None:
+    into = settling_of()
+    play(into, both(range(10, 16), range(14)), 14)
+    into.leave("south")
+    into.leave("north")
+    (event,) = settled_events(play(into, [], 15, 15))
+    assert event.heard_by == NAMES
+
+
+def test_what_was_settled_before_is_not_told_again() -> None:
+    """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
+    into = settling_of()
+    first = play(into, both(range(10, 16), range(30)), 30)
+    (output,) = [output for _, output in first if isinstance(output, FinalResults)]
+    again = settling_of(output.until)
+    for name in NAMES:
+        again.greet(name, (START + 8, START + 31), now_ns(31))
+    kept: Arrivals = [(31.0, m) for _, m in both(range(10, 16), range(30)) if isinstance(m, Frame)]
+    said = play(again, kept, 31, 31)
+    for name in NAMES:
+        again.greet(name, None, now_ns(32))
+    said += play(again, [(w, m) for w, m in both(range(40, 46), range(32, 60)) if w >= 32], 60, 32)
+    (event,) = settled_events(said)
+    assert event.start_ns == (START + 40) * FRAME_NS
+    assert sum(again.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
+
+
+def test_clock_of_the_server_set_back_begins_anew() -> None:
+    into = settling_of()
+    play(into, both(range(10, 16), range(100)), 100)
+    hour = 3600 * SECOND
+    said: list[tuple[int, Event | FinalResults]] = []
+    for now in range(-hour, -hour + 40):
+        messages: list[Message] = [
+            m for w, m in both(range(-hour + 10, -hour + 16), range(-hour, -hour + 40)) if w == now
+        ]
+        said += [(now, o) for o in into.step(messages, now_ns(now)) if isinstance(o, Event | FinalResults)]
+    (event,) = settled_events(said)
+    assert event.start_ns == now_ns(-hour + 10)
+
+
+def test_no_event_lies_in_the_future() -> None:
+    """A node an hour ahead is refused and told so; the other goes on."""
+    into = settling_of()
+    ahead = [
+        (w, replace(m, frame_index=m.frame_index + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))
+    ]
+    said = play(into, node("north", range(10, 16), range(40)) + ahead, 40)
+    (event,) = provisional(said)
+    assert event.heard_by == ("north",)
+    south = into.status(now_ns(40))[1]
+    assert south.counters["rejected"] == len(ahead)
+    assert south.reason is not None
+    assert "ahead of the server's; set both by NTP" in south.reason

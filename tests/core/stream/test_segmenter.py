@@ -1,0 +1,230 @@
+"""From sample to message: one for every frame index, in order, and no sound lost at its beginning or its end."""
+
+from __future__ import annotations
+
+from itertools import accumulate, pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.segmenter import RECENT_S, WARM_UP_FRAMES, Segmenter
+from livessl.core.stream.timeline import Framer
+from livessl.core.types import (
+    FRAME_NS,
+    FRAME_S,
+    ArraySpec,
+    Block,
+    ClockState,
+    Float32Array,
+    FloatArray,
+    Frame,
+    Mark,
+    Message,
+)
+
+RATE_HZ = 16000.0
+N = 800
+START = 20 * 1_700_000_000
+SPEC = ArraySpec("north", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), (100.0, 6000.0))
+CHANNELS = np.array([2, 0, 1])
+PRE_ROLL, HANG_OVER = 4, 3
+"""Frames of 50 ms."""
+PARAMETERS = ActivityParameters(pre_roll_s=0.05 * PRE_ROLL, hang_over_s=0.05 * HANG_OVER)
+QUIET, LOUD = 1e-3, 0.2
+
+
+def sound(levels: list[float], seed: int = 1) -> Float32Array:
+    """Four channels of white noise, of a standard deviation for each 50 ms."""
+    samples = np.random.default_rng(seed).standard_normal((4, N * len(levels)))
+    return np.asarray(samples * np.repeat(levels, N), dtype=np.float32)
+
+
+def segmenter() -> Segmenter:
+    return Segmenter(SPEC, CHANNELS, RATE_HZ, PARAMETERS)
+
+
+def run(samples: Float32Array, sizes: list[int] | None = None) -> list[Message]:
+    """Every message of samples that begin on the grid of frames, cut into blocks of the given sizes, then of 480."""
+    framer, made = Framer(RATE_HZ), segmenter()
+    messages: list[Message] = []
+    index, total, left = 0, samples.shape[1], list(sizes or [])
+    while index < total:
+        count = min(left.pop(0) if left else 480, total - index)
+        block = Block(index, samples[:, index : index + count].copy(), START * FRAME_NS + index * 62_500)
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        index += count
+    return messages + made.flush(framer)
+
+
+def frame_indices(messages: list[Message], kind: type[Frame] | type[Mark]) -> list[int]:
+    return [message.frame_index - START for message in messages if isinstance(message, kind)]
+
+
+def frames_of(messages: list[Message]) -> list[Frame]:
+    return [message for message in messages if isinstance(message, Frame)]
+
+
+def test_quiet_is_a_mark_for_every_interval() -> None:
+    messages = run(sound([QUIET] * 40))
+    assert frame_indices(messages, Mark) == list(range(40))
+    assert {message.sequence for message in messages} == {0}
+    assert {message.array for message in messages} == {"north"}
+
+
+def test_sound_is_frames_with_pre_roll_and_hang_over() -> None:
+    messages = run(sound([QUIET] * 20 + [LOUD] * 5 + [QUIET] * 20))
+    assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 25 + HANG_OVER))
+    assert frame_indices(messages, Mark) == [*range(20), *range(25 + HANG_OVER, 45)]  # the pre-roll was marked as quiet
+    assert [f.frame_index - START for f in frames_of(messages) if f.active] == list(range(20, 25))
+    assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
+    # every interval's first mention is in order
+    first = list(dict.fromkeys(message.frame_index - START for message in messages))
+    assert first == list(range(45))
+
+
+def test_pre_roll_is_sent_once() -> None:
+    pause = HANG_OVER + 2  # 2 quiet intervals beyond the hang-over: the next pre-roll has no more
+    messages = run(sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * pause + [LOUD] * 3 + [QUIET] * 10))
+    sent = frame_indices(messages, Frame)
+    assert sent == list(range(20 - PRE_ROLL, 23 + pause + 3 + HANG_OVER))
+    assert frame_indices(messages, Mark) == [*range(20), 26, 27, *range(34, 41)]
+
+
+def test_pause_within_the_hang_over_does_not_part() -> None:
+    messages = run(sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * HANG_OVER + [LOUD] * 3 + [QUIET] * 10))
+    assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 29 + HANG_OVER))
+
+
+def test_sound_in_the_very_first_frames_is_not_lost() -> None:
+    messages = run(sound([LOUD] * 4 + [QUIET] * 26))
+    assert frame_indices(messages, Frame) == list(range(4 + HANG_OVER))
+    assert frame_indices(messages, Mark) == list(range(4 + HANG_OVER, 30))
+
+
+def test_steady_noise_from_the_start_is_quiet() -> None:
+    assert frame_indices(run(sound([LOUD] * 60)), Frame) == []
+    # and it is the warm-up that sees to it: without one, the first frame would be a sound
+    assert WARM_UP_FRAMES == 10
+    framer, made = Framer(RATE_HZ), segmenter()
+    cuts = framer.push(Block(0, sound([LOUD] * 2), START * FRAME_NS))
+    made.flush(framer)
+    assert [isinstance(message, Frame) for cut in cuts for message in made.push(cut, framer)] == [True, True]
+
+
+def test_short_stream_is_told_at_its_end() -> None:
+    assert frame_indices(run(sound([QUIET, QUIET, LOUD, QUIET])), Frame) == [0, 1, 2, 3]
+    assert run(sound([QUIET])[:, :400]) == []
+
+
+def test_samples_are_the_devices_in_order_of_the_microphones() -> None:
+    samples = sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * 10)
+    for frame in frames_of(run(samples)):
+        first = (frame.frame_index - START) * N
+        np.testing.assert_array_equal(frame.samples, samples[CHANNELS, first : first + N])
+        assert frame.time_ns == pytest.approx(frame.frame_index * FRAME_NS, abs=1)
+        assert frame.sample_rate_hz == RATE_HZ
+        assert frame.power == pytest.approx(in_band(samples[CHANNELS, first : first + N]).mean(), rel=1e-4)
+
+
+def in_band(samples: Float32Array) -> FloatArray:
+    spectrum = np.fft.rfft(samples.astype(np.float64), axis=1)
+    frequency_hz = np.fft.rfftfreq(samples.shape[1], 1 / RATE_HZ)
+    spectrum[:, (frequency_hz < 100) | (frequency_hz > 6000)] = 0.0
+    return np.asarray((np.fft.irfft(spectrum, samples.shape[1], axis=1) ** 2).mean(axis=1))
+
+
+def test_mark_tells_powers_noise_and_the_device() -> None:
+    samples = sound([QUIET] * 30)
+    samples[0] *= 2.0
+    samples[1] = 0.0
+    messages = run(samples)
+    mark = messages[-1]
+    assert isinstance(mark, Mark)
+    expected = in_band(samples[CHANNELS, -N:])
+    assert mark.channel_power == pytest.approx(expected, rel=1e-4, abs=1e-15)
+    assert mark.channel_power[2] == 0.0  # device channel 1 is the third microphone
+    assert mark.power == pytest.approx(expected.mean(), rel=1e-4)
+    # White noise of 0.75 QUIET^2 in the band, 4, 0 and 1 times that over three microphones. The least of the means of 5
+    # intervals: at most 2 % low by 3 sd of 1/sqrt(5 * 590).
+    assert mark.noise_power == pytest.approx(0.7375 * QUIET**2 * 5 / 3, rel=0.15)
+    assert (mark.overflows, mark.lost_frames, mark.clock) == (0, 0, ClockState.SETTLING)
+
+
+def test_mark_counts_what_the_device_lost() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    samples = sound([QUIET] * 100)
+    messages: list[Message] = []
+    for index in range(0, samples.shape[1], 400):
+        block = Block(
+            index, samples[:, index : index + 400].copy(), START * FRAME_NS + index * 62_500, index == 400 * 5
+        )
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+    mark = messages[-1]
+    assert isinstance(mark, Mark)
+    assert (mark.overflows, mark.lost_frames, mark.clock) == (1, 1, ClockState.LOCKED)
+
+
+def test_wrong_number_of_channels_is_refused() -> None:
+    with pytest.raises(ValueError, match="array 'north': has 3 microphones, given 2 channels"):
+        Segmenter(SPEC, CHANNELS[:2], RATE_HZ, PARAMETERS)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    loud=st.lists(st.booleans(), min_size=WARM_UP_FRAMES, max_size=50),
+    sizes=st.lists(st.integers(1, 3000), max_size=20),
+)
+def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes: list[int]) -> None:
+    samples = sound([LOUD if one else QUIET for one in loud])
+    whole, parted = run(samples, [samples.shape[1]]), run(samples, sizes)
+    assert [(type(m), m.frame_index, m.sequence, m.power) for m in parted] == [
+        (type(m), m.frame_index, m.sequence, m.power) for m in whole
+    ]
+    for one, other in zip(frames_of(whole), frames_of(parted), strict=True):
+        assert (one.active, abs(one.time_ns - other.time_ns) <= 1) == (other.active, True)
+        np.testing.assert_array_equal(one.samples, other.samples)
+    # and what holds for every stream
+    assert [m.sequence for m in whole] == list(accumulate(isinstance(m, Frame) for m in whole))
+    assert list(dict.fromkeys(m.frame_index - START for m in whole)) == list(range(len(loud)))
+    sent = frame_indices(whole, Frame)
+    assert all(earlier < later for earlier, later in pairwise(sent))  # no frame twice
+    assert len(frame_indices(whole, Mark)) + len(set(sent) - set(frame_indices(whole, Mark))) == len(loud)
+
+
+def test_what_was_not_sent_is_remembered_for_a_while() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    samples = sound([QUIET] * 20 + [LOUD] * 2 + [QUIET] * (round(RECENT_S / FRAME_S) + 30))
+    messages: list[Message] = []
+    for k in range(samples.shape[1] // N):
+        block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        if k == 30:
+            asked = frames_of(made.ask(START + 12, START + 21))
+            assert [frame.frame_index - START for frame in asked] == list(range(12, 22))
+            assert {(frame.sequence, frame.active) for frame in asked} == {(0, False)}
+            sent = {frame.frame_index: frame for frame in frames_of(messages)}
+            for frame in asked:
+                np.testing.assert_array_equal(
+                    frame.samples, samples[CHANNELS, (frame.frame_index - START) * N :][:, :N]
+                )
+                assert frame.frame_index not in sent or sent[frame.frame_index].power == frame.power
+    last = messages[-1].frame_index
+    assert made.ask(START, START + 40) == []
+    remembered = frames_of(made.ask(START, last))
+    assert len(remembered) == round(RECENT_S / FRAME_S)
+    assert remembered[-1].frame_index == last
+    # asking takes nothing from what is sent by itself
+    assert [frame.sequence for frame in frames_of(messages)] == list(range(1, len(frames_of(messages)) + 1))
+
+
+def test_nothing_is_remembered_over_a_gap() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    samples = sound([QUIET] * 40)
+    for k in (*range(15), *range(18, 40)):
+        block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
+        for cut in framer.push(block):
+            made.push(cut, framer)
+    assert [frame.frame_index - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))

@@ -1,0 +1,198 @@
+"""Whoever computes a campaign, and however often it is cut: the same bytes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from evaluate.small_campaign import CLASSES, small_job, write_sounds
+from livessl.cli.main import main
+from livessl.lab.evaluate import campaign
+from livessl.lab.evaluate.campaign import read_clips, run_campaign
+
+POSITIONS = 16
+
+
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute here, for tests of what is kept: a worker takes seconds to begin."""
+    monkeypatch.setattr(
+        campaign, "_by_processes", lambda job, wanted, jobs: (campaign.compute(job, number) for number in wanted)
+    )
+
+
+def arguments(sounds: Path, out: Path, jobs: int = 1) -> list[str]:
+    given = {"events": sounds, "positions": POSITIONS, "rt": "0,0.2", "grid": 1.0, "seed": 5, "jobs": jobs, "out": out}
+    options = [text for name, value in given.items() for text in (f"--{name}", str(value))]
+    return ["evaluate", "one-array", "--classes", ",".join(CLASSES), *options]
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+def test_killed_and_resumed_it_gives_the_same_bytes(tmp_path: Path) -> None:
+    sounds = write_sounds(tmp_path / "sounds")
+    cut, whole = tmp_path / "cut", tmp_path / "whole"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "livessl", *arguments(sounds, cut)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 60.0
+    while len(list((cut / "parts").glob("*.parquet"))) < 3:
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < deadline, "no position was finished in a minute"
+        time.sleep(0.01)
+    workers = children(process.pid)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = {path: path.read_bytes() for path in (cut / "parts").glob("*.parquet")}
+    assert 3 <= len(kept) < POSITIONS
+    assert not (cut / "results.parquet").exists()
+    while any(alive(worker) for worker in workers):
+        assert time.monotonic() < deadline, f"workers {workers} outlive the command that was killed"
+        time.sleep(0.05)
+
+    stamps = {path: path.stat().st_mtime_ns for path in kept}
+    assert main(arguments(sounds, cut)) == 0
+    assert {path: path.stat().st_mtime_ns for path in kept} == stamps  # nothing was computed twice
+    assert main(arguments(sounds, whole, jobs=2)) == 0
+    for name in ("results.parquet", "summary.csv", "claims.csv"):
+        assert (cut / name).read_bytes() == (whole / name).read_bytes()
+    assert (
+        pq.read_metadata(whole / "results.parquet").num_rows == POSITIONS * 2 * 2 * 2 * 3
+    )  # RTs, sounds, sizes, methods
+
+
+@pytest.mark.processes
+def test_interrupted_it_ends_soon(tmp_path: Path) -> None:
+    sounds, out = write_sounds(tmp_path / "sounds"), tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "livessl", *arguments(sounds, out), "--positions", "5000"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.monotonic() + 60.0
+    while not list((out / "parts").glob("*.parquet")):
+        assert process.poll() is None, "it ended before it could be interrupted"
+        assert time.monotonic() < deadline, "no position was finished in a minute"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30.0) == 130  # thousands of positions are minutes
+    assert len(list((out / "parts").glob("*.parquet"))) < 1000
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed", "ignore::ResourceWarning")
+def test_a_dask_cluster_gives_the_same_rows(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    job = small_job(tmp_path / "sounds")
+    here = run_campaign(job, tmp_path / "here", jobs=1)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        there = run_campaign(job, tmp_path / "there", jobs=1, scheduler=cluster.scheduler_address)
+    assert there.read_bytes() == here.read_bytes()
+
+
+def test_more_positions_go_on_where_fewer_ended(one_process: None, tmp_path: Path) -> None:
+    few = run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "out", jobs=1)
+    first = pq.read_table(few)
+    seen: list[tuple[int, int]] = []
+    more = run_campaign(
+        small_job(tmp_path / "sounds", 2), tmp_path / "out", jobs=1, progress=lambda *done: seen.append(done)
+    )
+    table = pq.read_table(more)
+    assert seen == [(1, 2), (2, 2)]
+    assert table.slice(0, first.num_rows).to_pylist() == first.to_pylist()
+    assert table.num_rows == 2 * first.num_rows
+    one, other = (set(table.column("x_m").to_pylist()[part]) for part in (slice(0, 24), slice(24, 48)))
+    assert one.isdisjoint(other)  # two places
+
+
+def test_joined_results_alone_are_enough_to_go_on(one_process: None, tmp_path: Path) -> None:
+    run_campaign(small_job(tmp_path / "sounds", 2), tmp_path / "moved", jobs=1)
+    shutil.rmtree(tmp_path / "moved" / "parts")
+    seen: list[tuple[int, int]] = []
+    moved = run_campaign(
+        small_job(tmp_path / "sounds", 3), tmp_path / "moved", jobs=1, progress=lambda *done: seen.append(done)
+    )
+    assert seen[0] == (2, 3)
+    whole = run_campaign(small_job(tmp_path / "sounds", 3), tmp_path / "whole", jobs=1)
+    assert moved.read_bytes() == whole.read_bytes()
+
+
+def test_report_alone_joins_what_was_run(one_process: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "one", jobs=1)
+    assert main(["evaluate", "report", "--with", str(tmp_path / "one"), "--out", str(tmp_path / "docs")]) == 0
+    written = [Path(line) for line in capsys.readouterr().out.split()]
+    assert {path.name for path in written} == {"summary.csv", "claims.csv", "claims.md", "report.md", "report.html"}
+    figures = {path.name for path in (tmp_path / "docs" / "figures").iterdir()}
+    assert {"one-array.png", "one-array.svg", "gcc.png", "topology.svg", "maps-pair.png"} <= figures
+    assert "office.png" not in figures
+    assert main(["evaluate", "report", "--out", str(tmp_path / "docs")]) == 2
+    assert main(["evaluate", "one-array", "--out", str(tmp_path / "docs")]) == 2
+    assert capsys.readouterr().err.count("livessl: error") == 2
+
+
+def test_another_campaign_is_not_mixed_in(one_process: None, tmp_path: Path) -> None:
+    run_campaign(small_job(tmp_path / "sounds", 1), tmp_path / "out", jobs=1)
+    with pytest.raises(ValueError, match="expected an empty folder or the same campaign"):
+        run_campaign(small_job(tmp_path / "sounds", 1, seed=6), tmp_path / "out", jobs=1)
+
+
+def test_classes_are_the_files_names_without_their_numbers(tmp_path: Path) -> None:
+    clips = read_clips(write_sounds(tmp_path), ("phone", "door_slam"), 16000.0)
+    assert {name: [clip for clip, _ in each] for name, each in clips.items()} == {
+        "phone": ["phone001", "phone002"],
+        "door_slam": ["door_slam001", "door_slam002"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"--events": "nowhere"}, "expected a folder of sounds, got no such folder"),
+        ({"--events": "empty"}, "expected WAV or FLAC files, got none"),
+        ({"--classes": "door_slam,cat"}, "expected clips of cat .* door_slam, dropped_keys, phone, voice; .*--classes"),
+        ({"--rt": "fast"}, "--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got 'fast'"),
+        ({"--rt": "0:2:0"}, "--rt: expected seconds"),
+        ({"--rt": "0.05"}, "at least 0.17 s by Sabine"),
+        ({"--grid": "0"}, "--grid: expected 0.02 to 2 metres"),
+        ({"--sample-rate": "8000"}, "--sample-rate: the band ends at 6000 Hz"),
+        ({"--with": "empty"}, "expected a finished campaign"),
+    ],
+)
+def test_wrong_use_is_one_clear_error(
+    changes: dict[str, str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sounds = write_sounds(tmp_path / "sounds")
+    (tmp_path / "empty").mkdir()
+    given = {"--events": "sounds", "--positions": "1", "--rt": "0", "--grid": "1", "--jobs": "1"} | changes
+    options = []
+    for name, value in given.items():
+        options += [name, str(tmp_path / value) if name in {"--events", "--with"} else value]
+    if "--classes" not in given:
+        options += ["--classes", ",".join(CLASSES)]
+    assert sounds.exists()
+    assert main(["evaluate", "one-array", *options, "--out", str(tmp_path / "out")]) == 2
+    complaint = capsys.readouterr().err.strip().splitlines()
+    assert len(complaint) == 1
+    assert complaint[0].startswith("livessl: error: ")
+    assert re.search(message, complaint[0])

@@ -1,0 +1,207 @@
+"""From blocks to messages: the right channels, and the same messages however the blocks are cut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate, pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from livessl import wire
+from livessl.clock import UnpacedClock
+from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array, Frame, Mark, Message
+from livessl.errors import DeviceError
+from livessl.recordings.assign import recording_channels
+from livessl.recordings.play import played_messages
+from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.site.build.pipeline import make_pipeline
+from livessl.site.models import Site
+from small_site import RATE_HZ, Changes, hiss, site_of
+
+START_NS = 1_767_225_600_000_000_000
+SITE = site_of()
+
+
+def scene(channels: int = 8) -> Float32Array:
+    """Two seconds of quiet with a burst after 1.2 s."""
+    samples = hiss(2.0, channels, level=1e-3)
+    first, last = round(1.2 * RATE_HZ), round(1.4 * RATE_HZ)
+    samples[:, first:last] += hiss(0.2, channels, seed=1, level=0.2)
+    return samples
+
+
+SCENE = scene()
+
+
+def messages(cuts: Sequence[int], channels: dict[str, list[int]], site: Site = SITE) -> list[Message]:
+    """What a line makes of the scene, cut at these samples."""
+    line = make_pipeline(site, channels, float(RATE_HZ))
+    made: list[Message] = []
+    edges = [0, *sorted(cuts), SCENE.shape[1]]
+    for first, stop in pairwise(edges):
+        stamp_ns = START_NS + round(first / RATE_HZ * 1e9)
+        made += line.push(Block(first, np.ascontiguousarray(SCENE[:, first:stop]), stamp_ns))
+    return made + line.flush()
+
+
+BOTH = {"north": [1, 2, 3, 4], "south": [5, 6, 7, 8]}
+WHOLE = messages([], BOTH)
+
+
+def by_array(made: Sequence[Message], array: str) -> list[bytes]:
+    """An array's messages, to the bit, but for what marks say of the device's clock: that comes of each stamp."""
+    mine = [message for message in made if message.array == array]
+    for message in mine:
+        if isinstance(message, Mark):
+            assert abs(message.drift_ppm) < 1e-3  # stamps are rounded to a nanosecond
+    plain = [replace(m, drift_ppm=0.0, clock=ClockState.LOCKED) if isinstance(m, Mark) else m for m in mine]
+    return [wire.encode(message) for message in plain]
+
+
+def frames_of(made: Sequence[Message], array: str) -> list[Frame]:
+    return [message for message in made if isinstance(message, Frame) and message.array == array]
+
+
+def test_burst_becomes_frames_and_quiet_marks() -> None:
+    for array in BOTH:
+        frames = frames_of(WHOLE, array)
+        active = [frame.frame_index - START_NS // FRAME_NS for frame in frames if frame.active]
+        assert active == [24, 25, 26, 27]  # 1.2 s to 1.4 s
+        frame_indices = [frame.frame_index - START_NS // FRAME_NS for frame in frames]
+        assert frame_indices == list(range(24 - 8, 28 + 6))  # 0.4 s before, 0.3 s after
+        marks = [message for message in WHOLE if isinstance(message, Mark) and message.array == array]
+        assert len(marks) > 20
+        messages = [message for message in WHOLE if message.array == array]
+        assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
+
+
+def test_frames_hold_the_sound_of_their_channels() -> None:
+    shuffled = {"north": [3, 1, 8, 2], "south": [5, 6, 7, 4]}
+    for channels in (BOTH, shuffled):
+        made = messages([], channels)
+        for array, numbers in channels.items():
+            for frame in frames_of(made, array):
+                first = round((frame.time_ns - START_NS) / 1e9 * RATE_HZ)
+                expected = SCENE[np.array(numbers) - 1, first : first + frame.samples.shape[1]]
+                assert np.array_equal(frame.samples, expected)
+    assert by_array(messages([], shuffled), "north") != by_array(WHOLE, "north")
+
+
+@given(st.lists(st.integers(1, SCENE.shape[1] - 1), unique=True, max_size=60))
+@settings(max_examples=40, deadline=None)
+def test_however_blocks_are_cut_the_frames_are_the_same(cuts: list[int]) -> None:
+    made = messages(cuts, BOTH)
+    for array in BOTH:
+        assert by_array(made, array) == by_array(WHOLE, array)
+
+
+def test_other_sound_gives_other_messages() -> None:
+    assert by_array(WHOLE, "north") != by_array(WHOLE, "south")
+
+
+def test_played_messages_are_those_of_the_lines() -> None:
+    lines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
+    placed = [Placed(ArrayRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
+    clock = UnpacedClock(START_NS)
+    made: list[Message] = []
+    for known_ns, batch in played_messages(lines, placed, clock):
+        assert known_ns == clock.now_ns()
+        for message in batch:
+            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
+        made += batch
+    assert known_ns == START_NS + 2_000_000_000
+    for array in BOTH:
+        assert by_array(made, array) == by_array(WHOLE, array)
+
+
+def test_played_messages_of_a_short_recording_are_flushed() -> None:
+    """Shorter than the warm-up: everything comes at the end."""
+    line = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
+    short = Placed(ArrayRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
+    batches = [batch for _, batch in played_messages([line], [short], UnpacedClock())]
+    assert [len(batch) for batch in batches[:-1]] == [0] * (len(batches) - 1)
+    assert len(batches[-1]) == 5
+
+
+def test_line_names_its_arrays() -> None:
+    assert make_pipeline(SITE, BOTH, float(RATE_HZ)).arrays == ["north", "south"]
+
+
+def recording(channels: int, rate_hz: float = RATE_HZ) -> ArrayRecording:
+    return ArrayRecording("take1.wav", float(rate_hz), hiss(0.1, channels))
+
+
+NODELESS: Changes = {"nodes": {}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "array", "channels", "wanted", "expected"),
+    [
+        ({}, "south", 4, None, [1, 2, 3, 4]),  # as many as microphones: they are the array's
+        ({}, "south", 8, None, [5, 6, 7, 8]),  # the whole device: the node's channels
+        ({}, "south", 6, None, [1, 2, 3, 4]),  # not the whole device
+        ({}, "north", 8, None, [1, 2, 3, 4]),
+        (NODELESS, "south", 8, None, [1, 2, 3, 4]),
+        ({}, "south", 8, [8, 7, 2, 1], [8, 7, 2, 1]),  # as wanted
+        (NODELESS, "south", 4, [4, 3, 2, 1], [4, 3, 2, 1]),
+    ],
+)
+def test_which_channels_are_an_arrays(
+    changes: Changes, array: str, channels: int, wanted: list[int] | None, expected: list[int]
+) -> None:
+    assert recording_channels(site_of(changes), array, recording(channels), wanted) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "one", "wanted", "said"),
+    [
+        ({}, recording(3), None, "expected 4 channels, one for each microphone of array 'north', got 3"),
+        (
+            {},
+            recording(4),
+            [1, 2, 3],
+            "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3]",
+        ),
+        (
+            {},
+            recording(4),
+            [0, 1, 2, 3],
+            "expected 4 different channel numbers from 1 to 4 for array 'north', got [0, 1, 2, 3]",
+        ),
+        (
+            {},
+            recording(4),
+            [1, 2, 3, 5],
+            "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3, 5]",
+        ),
+        (
+            {},
+            recording(4, 44100),
+            None,
+            "expected 16000 Hz for array 'north', got 44100 Hz; resample the file or correct "
+            "nodes.lab-pc.device.sample_rate_hz",
+        ),
+        (
+            NODELESS,
+            recording(4, 8000),
+            None,
+            "array 'north' uses up to 6000 Hz and needs more than 12000 Hz, got 8000 Hz; lower band_hz",
+        ),
+    ],
+)
+def test_recording_that_does_not_fit(
+    changes: Changes, one: ArrayRecording, wanted: list[int] | None, said: str
+) -> None:
+    with pytest.raises(DeviceError) as caught:
+        recording_channels(site_of(changes), "north", one, wanted)
+    assert str(caught.value).startswith("take1.wav: ")
+    assert said in str(caught.value)
+
+
+def test_channel_wanted_twice_is_refused() -> None:
+    with pytest.raises(DeviceError, match="expected 4 different channel numbers"):
+        recording_channels(SITE, "north", recording(4), [1, 2, 2, 4])

@@ -1,0 +1,232 @@
+"""Recordings that stand in for devices: what is read, when it is said to have been heard, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from numpy.testing import assert_allclose, assert_array_equal
+
+from livessl.clock import UnpacedClock
+from livessl.core.types import Block, Float32Array
+from livessl.errors import DeviceError
+from livessl.recordings.recording import (
+    ArrayRecording,
+    Looped,
+    Placed,
+    Recording,
+    Spliced,
+    WavRecording,
+    merged,
+    played,
+)
+from small_site import RATE_HZ, hiss, write_wav
+
+START_NS = 1_767_225_600_000_000_000
+NS = 1_000_000_000
+
+
+def joined(blocks: Iterable[Block]) -> Float32Array:
+    return np.concatenate([block.samples for block in blocks], axis=1)
+
+
+def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4, seed: int = 0) -> ArrayRecording:
+    samples = hiss(seconds * rate_hz / RATE_HZ, channels, seed)
+    return ArrayRecording("hiss", float(rate_hz), samples)
+
+
+@pytest.mark.parametrize(
+    ("ending", "subtype", "rounding"),
+    [
+        ("wav", "PCM_U8", 2**-7),
+        ("wav", "PCM_16", 2**-15),
+        ("wav", "PCM_24", 2**-23),
+        ("wav", "PCM_32", 2**-23),  # float32 has 24 bits
+        ("wav", "FLOAT", 0.0),
+        ("wav", "DOUBLE", 0.0),
+        ("flac", "PCM_16", 2**-15),
+        ("flac", "PCM_24", 2**-23),
+    ],
+)
+def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
+    samples = hiss(0.33, channels=5)
+    path = write_wav(tmp_path / f"sound.{ending}", samples, subtype=subtype)
+    read = WavRecording(path)
+    assert (read.name, read.sample_rate_hz, read.channels) == (str(path), RATE_HZ, 5)
+    assert read.duration_s == pytest.approx(0.33)
+    got = joined(read.blocks(0))
+    assert got.dtype == np.float32
+    assert_allclose(got, samples, rtol=0, atol=rounding)
+    assert not np.array_equal(got[0], got[1])
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(DeviceError) as caught:
+        WavRecording(path)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: expected ")
+    assert "\n" not in said
+    return said
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    assert refusal(tmp_path / "missing.wav").endswith("expected a WAV or FLAC file, cannot read it: no such file")
+
+
+def test_what_is_no_sound_file(tmp_path: Path) -> None:
+    path = tmp_path / "notes.wav"
+    for content in (b"", b"dear diary", b"RIFF", bytes(1000)):
+        path.write_bytes(content)
+        assert "expected a WAV or FLAC file, cannot read it" in refusal(path)
+    assert "expected a WAV or FLAC file, cannot read it" in refusal(tmp_path)
+
+
+def test_zero_length(tmp_path: Path) -> None:
+    path = write_wav(tmp_path / "empty.wav", np.zeros((4, 0), dtype=np.float32))
+    assert "got a file of zero length; record it again" in refusal(path)
+
+
+@pytest.mark.parametrize("subtype", ["FLOAT", "DOUBLE"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_samples_that_are_not_finite(tmp_path: Path, subtype: str, bad: float) -> None:
+    samples = hiss(20.0)
+    samples[2, 300_000] = bad  # beyond the first part that is scanned
+    said = refusal(write_wav(tmp_path / "broken.wav", samples, subtype=subtype))
+    assert "got NaN or infinity at sample 300000 of channel 3; export it again" in said
+
+
+def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
+    samples = hiss(20.0)
+    samples[2, 300_000] = -1e6  # the largest that is taken
+    WavRecording(write_wav(tmp_path / "loud.wav", samples))
+    samples[2, 300_000] = -1.001e6
+    said = refusal(write_wav(tmp_path / "broken.wav", samples))
+    assert "samples around 1 at full scale, got -1.001e+06 at sample 300000 of channel 3; export it again" in said
+
+
+@pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT"])
+def test_silence(tmp_path: Path, subtype: str) -> None:
+    samples = np.zeros((4, 300_001), dtype=np.float32)
+    assert "got all-zero samples; was the right input recorded?" in refusal(
+        write_wav(tmp_path / "silence.wav", samples, subtype=subtype)
+    )
+    samples[3, -1] = 0.5  # one click, at the very end, is sound
+    WavRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
+
+
+def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
+    path = write_wav(tmp_path / "sound.wav", hiss())
+    read = WavRecording(path)
+    path.unlink()
+    with pytest.raises(DeviceError, match="no such file"):
+        next(read.blocks(0))
+
+
+@pytest.mark.parametrize("rate_hz", [16000, 22050, 44100, 48000, 96000])
+def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -> None:
+    source = recording(1.01, rate_hz)
+    read: list[Recording] = [source, WavRecording(write_wav(tmp_path / "s.wav", source.samples, rate_hz))]
+    for one in read:
+        blocks = list(one.blocks(START_NS))
+        index = 0
+        for block in blocks:
+            assert block.first_index == index
+            # an ideal stamp is exact to the rounding of a nanosecond, however long the recording
+            assert abs(block.stamp_ns - START_NS - index / rate_hz * 1e9) <= 1
+            assert not block.overflow
+            index += block.samples.shape[1]
+        assert {block.samples.shape[1] for block in blocks[:-1]} == {round(0.02 * rate_hz)}
+        assert_array_equal(joined(blocks), source.samples)
+
+
+def test_merged_comes_in_the_order_of_completion() -> None:
+    early, late, short = recording(0.5), recording(0.3, 22050, seed=1), recording(0.05, seed=2)
+    placed = [Placed(late, START_NS + 133_000_000), Placed(early, START_NS), Placed(short, START_NS + 900_000_000)]
+    entries = list(merged(placed))
+    ends = [end_ns for end_ns, _, _ in entries]
+    assert ends == sorted(ends)
+    for line, item in enumerate(placed):
+        mine = [(end_ns, block) for end_ns, of, block in entries if of == line]
+        assert_array_equal(joined(block for _, block in mine), joined_of(item))
+        assert mine[0][1].stamp_ns == item.start_ns
+        for end_ns, block in mine:
+            assert abs(end_ns - block.stamp_ns - block.samples.shape[1] / item.recording.sample_rate_hz * 1e9) <= 1
+    assert [line for _, line, _ in entries] != sorted(line for _, line, _ in entries)  # they do interleave
+
+
+def joined_of(item: Placed) -> Float32Array:
+    return joined(item.recording.blocks(item.start_ns))
+
+
+def test_no_block_is_played_before_it_is_complete() -> None:
+    clock = UnpacedClock(START_NS)
+    placed = [Placed(recording(0.2), START_NS), Placed(recording(0.2, 44100), START_NS + 7)]
+    seen = [(clock.now_ns(), end_ns) for end_ns, _, _ in played(placed, clock)]
+    assert seen == [(end_ns, end_ns) for _, end_ns in seen]
+    assert len(seen) == 20
+
+
+class Sleeper(UnpacedClock):
+    """It never sleeps longer than 70 ms at a time."""
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        return super().sleep_until_ns(min(time_ns, self.now_ns() + 70_000_000)) and self.now_ns() >= time_ns
+
+
+def test_whoever_waits_for_sound_hears_of_it() -> None:
+    """Before the beginning and in a gap come empty blocks, so that a listener can look up."""
+    spliced = Spliced((Placed(recording(0.04), START_NS), Placed(recording(0.04), START_NS + NS)))
+    clock = Sleeper(START_NS - NS)
+    last_ns, heard = START_NS - NS, []
+    for now_ns, _, block in played([Placed(spliced, START_NS)], clock):
+        assert now_ns - last_ns <= 70_000_000
+        last_ns = now_ns
+        heard.append(block.samples.shape[1])
+    assert [n for n in heard if n] == [320] * 4
+    assert heard.count(0) == 14 + 13  # a second and 20 ms; then a second less 20 ms
+
+
+def test_looped_goes_on_without_a_gap() -> None:
+    once = recording(0.05)  # not a whole number of blocks
+    looped = Looped(once)
+    assert (looped.name, looped.channels, looped.sample_rate_hz) == ("hiss", 4, RATE_HZ)
+    assert looped.duration_s == float("inf")
+    blocks = list(islice(looped.blocks(START_NS), 12))
+    assert_array_equal(joined(blocks), np.tile(once.samples, 4))
+    index = 0
+    for block in blocks:
+        assert block.first_index == index
+        assert abs(block.stamp_ns - START_NS - index / RATE_HZ * 1e9) <= 1
+        index += block.samples.shape[1]
+
+
+def test_spliced_keeps_the_gap() -> None:
+    first, second = recording(0.1, seed=1), recording(0.1, seed=2)
+    gap_ns = 2 * NS + 31_250  # 2 s and half a sample
+    spliced = Spliced((Placed(first, START_NS), Placed(second, START_NS + gap_ns)))
+    assert spliced.duration_s == pytest.approx(2.1, abs=1e-4)
+    assert (spliced.name, spliced.channels, spliced.sample_rate_hz) == ("hiss", 4, RATE_HZ)
+    for shift_ns in (0, 500 * NS):  # played when it was recorded, or at any other time
+        blocks = list(spliced.blocks(START_NS + shift_ns))
+        before, after = blocks[:5], blocks[5:]
+        assert_array_equal(joined(before), first.samples)
+        assert_array_equal(joined(after), second.samples)
+        assert before[0].stamp_ns == START_NS + shift_ns
+        assert after[0].stamp_ns == START_NS + shift_ns + gap_ns
+        assert after[0].first_index == round(gap_ns * RATE_HZ / 1e9) > before[-1].first_index + 320
+
+
+def test_block_of_another_shape_cannot_be_made() -> None:
+    for samples in (np.zeros(4, dtype=np.float32), np.zeros((4, 5))):
+        with pytest.raises(ValueError, match=re.escape("(channels, n) float32")):
+            Block(0, samples, 0)  # type: ignore[arg-type]
+
+
+def test_soundfile_writes_what_these_tests_believe(tmp_path: Path) -> None:
+    path = write_wav(tmp_path / "s.wav", hiss(0.1), subtype="PCM_24")
+    assert soundfile.info(path).subtype == "PCM_24"

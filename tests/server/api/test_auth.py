@@ -1,0 +1,340 @@
+"""The gate before the HTTP face: every route with every role, the WebSocket included, and what is too much."""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from livessl.clock import SystemClock
+from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
+from livessl.server.app import MAX_HEAD_BYTES, REFRESH_S, Server
+from livessl.site.keys import Role, add_token, revoke_token
+from livessl.site.models import ConfigError
+from small_site import running_server, site_of, wait_until, write_site
+
+TOKENED = {"server.http.tokens": "tokens.yaml"}
+ROLES: list[Role | None] = [None, *Role]
+
+
+class Secured:
+    """A server with tokens, and one token of each role."""
+
+    def __init__(self, server: Server, tokens: dict[Role, str]) -> None:
+        self.server = server
+        self.tokens = tokens
+
+    def ask(self, path: str, role: Role | None, method: str = "GET", **more: Any) -> httpx.Response:
+        return httpx.request(method, f"{self.server.url}{path}", headers=self.headers(role), **more)
+
+    def headers(self, role: Role | None) -> dict[str, str]:
+        return {} if role is None else {"Authorization": f"Bearer {self.tokens[role]}"}
+
+    def live(self, path: str = "live", **more: Any) -> Any:
+        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=5, **more)
+
+    def routes(self) -> set[str]:
+        """All that there is, from the server's own description, with examples for what is in braces."""
+        described = self.ask("/api/v1/openapi.json", Role.VIEWER).json()
+        return {path.format(event_id="small-0", name="north") for path in described["paths"]}
+
+
+def listen(live: ClientConnection) -> None:
+    """Until the server closes it."""
+    while True:
+        live.recv(timeout=5)
+
+
+def raw(url: str, data: bytes, until: bytes | None = None) -> bytes:
+    """What the server answers to bytes, until it hangs up or has said something."""
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=5) as connection:
+        answer = b""
+        try:
+            connection.sendall(data)
+            while not (until and until in answer) and (part := connection.recv(65536)):
+                answer += part
+        except ConnectionError:  # it hung up before we had said everything
+            pass
+        return answer
+
+
+@pytest.fixture(scope="module")
+def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Secured]:
+    directory = tmp_path_factory.mktemp("site")
+    tokens = {role: add_token(directory / "tokens.yaml", str(role), str(role)) for role in Role}  # type: ignore[arg-type]
+    with running_server(site_of(TOKENED, directory)) as server:
+        yield Secured(server, tokens)
+
+
+PUBLIC = {"/", "/static/app.js", "/static/index.html", "/api/v1/health"}
+FOR_ADMINS = {"/api/v1/access"}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_route_is_for_its_roles(secured: Secured, role: Role | None) -> None:
+    for path in secured.routes() | PUBLIC | {"/api/v1/openapi.json", "/api/v1/nothing", "/static"}:
+        status = secured.ask(path, role).status_code
+        if path in PUBLIC:
+            assert status == 200, path
+        elif role is None:
+            assert status == 401, path
+        elif path in FOR_ADMINS and role < Role.ADMIN:
+            assert status == 403, path
+        else:
+            assert status in (200, 204, 307, 404, 405), path
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "TRACE", "INVENTED"])
+def test_whoever_changes_must_be_an_operator(secured: Secured, role: Role | None, method: str) -> None:
+    """Who may ask is told that nothing can be changed there, who may not is told so before."""
+    expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 405, Role.ADMIN: 405}[role]
+    assert secured.ask("/api/v1/site", role, method).status_code == expected
+    assert secured.ask("/api/v1/health", role, method).status_code == expected
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_whoever_switches_an_array_must_be_an_operator(secured: Secured, role: Role | None) -> None:
+    expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 200, Role.ADMIN: 200}[role]
+    for enabled in (False, True):
+        answer = secured.ask("/api/v1/arrays/north/enabled", role, "PUT", json={"enabled": enabled})
+        assert answer.status_code == expected
+        arrays = secured.ask("/api/v1/arrays", Role.VIEWER).json()["arrays"]
+        assert arrays[0]["enabled"] is (enabled or expected != 200)
+
+
+def test_tokens_are_made_and_revoked_while_the_server_runs(tmp_path: Path) -> None:
+    """And a WebSocket that a revoked token has opened is closed, with the reason; the others stay."""
+    path = tmp_path / "tokens.yaml"
+    tokens = {Role.VIEWER: add_token(path, "wall", "viewer"), Role.ADMIN: add_token(path, "boss", "admin")}
+    with running_server(site_of(TOKENED, tmp_path)) as server:
+        secured = Secured(server, tokens)
+        with (
+            secured.live(additional_headers=secured.headers(Role.VIEWER)) as wall,
+            secured.live(additional_headers=secured.headers(Role.ADMIN)) as boss,
+        ):
+            tokens[Role.OPERATOR] = add_token(path, "desk", "operator")
+            wait_until(lambda: secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200, "the new token")
+            revoke_token(path, "wall")
+            with pytest.raises(ConnectionClosed) as caught:
+                listen(wall)
+            assert caught.value.rcvd is not None
+            assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, "the token is not valid any more")
+            assert secured.ask("/api/v1/site", Role.VIEWER).status_code == 401
+            path.chmod(0o644)  # then it is not read: who was let in stays in
+            path.touch()
+            time.sleep(2 * REFRESH_S)
+            assert secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200
+            path.unlink()
+            wait_until(lambda: secured.ask("/api/v1/site", Role.ADMIN).status_code == 401, "the end of all tokens")
+            with pytest.raises(ConnectionClosed):
+                listen(boss)
+
+
+def test_routes_that_nobody_has_thought_of_are_guarded() -> None:
+    assert needed_role("GET", "/api/v9/anything") is Role.VIEWER
+    assert needed_role("DELETE", "/api/v9/anything") is Role.OPERATOR
+    assert needed_role("GET", "/staticky") is Role.VIEWER
+    assert needed_role("POST", "/static/app.js") is Role.OPERATOR
+    assert needed_role("POST", "/api/v1/access") is Role.ADMIN
+
+
+@pytest.mark.parametrize("role", list(Role))
+def test_live_with_a_token(secured: Secured, role: Role) -> None:
+    """In a header, as programs send it; or among the protocols, as browsers can."""
+    with secured.live(additional_headers=secured.headers(role)) as live:
+        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert live.subprotocol is None
+    offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{secured.tokens[role]}")]
+    with secured.live(subprotocols=offered) as live:
+        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert live.subprotocol == "livessl"  # and never the one with the token
+
+
+@pytest.mark.parametrize("role", list(Role))
+def test_map_with_a_token(secured: Secured, role: Role) -> None:
+    with secured.live("map", additional_headers=secured.headers(role)) as watching:
+        assert watching.ping().wait(timeout=5)  # it is open, and stays so
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"additional_headers": {"Authorization": "Bearer livessl_wrong"}},
+        {"additional_headers": {"Authorization": "Basic bGl2ZXNzbA=="}},
+        {"subprotocols": [Subprotocol("livessl")]},
+        {"subprotocols": [Subprotocol("livessl"), Subprotocol("livessl.token.wrong")]},
+    ],
+)
+@pytest.mark.parametrize("path", ["live", "map", "nothing"])
+def test_socket_without_a_token_is_not_opened(secured: Secured, path: str, more: dict[str, Any]) -> None:
+    with pytest.raises(InvalidStatus) as caught:
+        secured.live(path, **more)
+    assert caught.value.response.status_code == 403
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "Bearer",
+        "bearer livessl_wrong",
+        "Basic TOKEN",
+        "TOKEN",
+        "Bearer TOKENx",
+        "Bearer \xff",
+        "Bearer a b",
+    ],
+)
+def test_wrong_credentials_are_no_credentials(secured: Secured, header: str) -> None:
+    value = header.replace("TOKEN", secured.tokens[Role.VIEWER]).encode("latin-1")
+    response = httpx.get(f"{secured.server.url}/api/v1/site", headers={b"Authorization": value})
+    assert response.status_code == 401
+    assert response.headers["WWW-Authenticate"] == 'Bearer realm="livessl"'
+    assert response.json() == {"detail": "expected a valid token; send it as Authorization: Bearer TOKEN"}
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_token_in_the_address_is_not_taken(secured: Secured) -> None:
+    """Addresses end up in histories and logs."""
+    assert secured.ask(f"/api/v1/site?token={secured.tokens[Role.ADMIN]}", None).status_code == 401
+
+
+def test_scheme_is_bearer_however_it_is_written(secured: Secured) -> None:
+    for scheme in ("Bearer", "bearer", "BEARER"):
+        headers = {"Authorization": f"{scheme} {secured.tokens[Role.VIEWER]}"}
+        assert httpx.get(f"{secured.server.url}/api/v1/site", headers=headers).status_code == 200
+
+
+def test_health_without_a_token_tells_the_status_only(secured: Secured) -> None:
+    assert secured.ask("/api/v1/health", None).json() == {"v": 1, "status": "starting"}
+    assert secured.ask("/api/v1/health", Role.VIEWER).json()["arrays"] == {"north": "starting", "south": "starting"}
+
+
+def test_health_tells_what_is_secured(secured: Secured) -> None:
+    assert secured.ask("/api/v1/health", Role.VIEWER).json()["secured"] == {
+        "nodes": False,
+        "tokens": True,
+        "tls": False,
+    }
+
+
+def test_description_tells_of_the_token(secured: Secured) -> None:
+    described = secured.ask("/api/v1/openapi.json", Role.VIEWER).json()
+    assert described["security"] == [{"token": []}]
+    assert described["components"]["securitySchemes"] == {"token": {"type": "http", "scheme": "bearer"}}
+    for path, methods in described["paths"].items():
+        for described in methods.values():
+            assert {"401", "403"} <= set(described["responses"]), path
+
+
+def test_admins_see_who_may_and_who_was_refused(secured: Secured) -> None:
+    secured.ask("/api/v1/site", None)
+    seen = secured.ask("/api/v1/access", Role.ADMIN).json()
+    assert seen["clients"] == [{"name": str(role), "role": str(role)} for role in Role]
+    assert seen["nodes"] == []
+    [refused] = [r for r in seen["refused"] if r["reason"].startswith("expected a valid token")]
+    assert (refused["door"], refused["who"]) == ("http", "127.0.0.1")
+    assert refused["count"] >= 1
+
+
+def refused_count(secured: Secured, reason: str) -> float:
+    text = secured.ask("/metrics", Role.VIEWER).text
+    found = [line for line in text.splitlines() if line.startswith("livessl_refused_total{") and reason in line]
+    return sum(float(line.rpartition(" ")[2]) for line in found)
+
+
+def test_refusals_are_counted_and_logged_once(secured: Secured, caplog: pytest.LogCaptureFixture) -> None:
+    before = refused_count(secured, "role admin, this one is of a operator")
+    with caplog.at_level(logging.WARNING):
+        for _ in range(5):
+            secured.ask("/api/v1/access", Role.OPERATOR)
+    assert refused_count(secured, "role admin, this one is of a operator") == before + 5
+    assert secured.ask("/api/v1/health", Role.VIEWER).json()["refused"]["http"] >= 5
+    assert len([r for r in caplog.records if "this one is of a operator" in r.getMessage()]) <= 1
+
+
+@pytest.mark.parametrize("length", [MAX_BODY_BYTES + 1, 10**12, 10**19])
+def test_body_that_is_too_long_is_not_read(secured: Secured, length: int) -> None:
+    token = secured.tokens[Role.OPERATOR]
+    head = f"POST /api/v1/site HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {token}\r\nContent-Length: {length}\r\n\r\n"
+    assert raw(secured.server.url, head.encode() + b"x", until=b"\r\n").startswith(b"HTTP/1.1 413")
+
+
+def test_body_of_unknown_length_is_not_read(secured: Secured) -> None:
+    assert secured.ask("/api/v1/site", Role.OPERATOR, "POST", content=iter([b"x", b"y"])).status_code == 411
+
+
+def test_body_within_the_limit_reaches_the_routes(secured: Secured) -> None:
+    assert secured.ask("/api/v1/site", Role.OPERATOR, "POST", content=bytes(MAX_BODY_BYTES)).status_code == 405
+
+
+def test_head_that_is_too_long_is_not_read(secured: Secured) -> None:
+    for head in (b"GET /" + b"x" * 8 * MAX_HEAD_BYTES, b"GET / HTTP/1.1\r\nX-A: " + b"x" * 8 * MAX_HEAD_BYTES):
+        answer = raw(secured.server.url, head)
+        assert not answer or answer.startswith(b"HTTP/1.1 400")
+    assert secured.ask("/api/v1/health", None).status_code == 200
+
+
+@pytest.mark.processes
+def test_token_is_in_no_log(tmp_path: Path) -> None:
+    """Not even where the most is said, with right and wrong tokens, where one may stand and where none may."""
+    tokens = {role: add_token(tmp_path / "tokens.yaml", str(role), str(role)) for role in Role}  # type: ignore[arg-type]
+    site = write_site(tmp_path, TOKENED)
+    command = [sys.executable, "-m", "livessl", "--verbose", "serve", "--site", str(site)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        said = [process.stderr.readline()]
+        while "dashboard on" not in said[-1]:
+            assert said[-1], said
+            said.append(process.stderr.readline())
+        url = said[-1].rpartition(" ")[2].strip()
+        try:
+            for token in tokens.values():
+                for header in (f"Bearer {token}", f"Basic {token}", f"Bearer {token}x"):
+                    httpx.get(f"{url}/api/v1/access", headers={"Authorization": header})
+                httpx.get(f"{url}/api/v1/site?token={token}")
+                offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{token}")]
+                with connect(f"ws{url.removeprefix('http')}/api/v1/live", subprotocols=offered) as live:
+                    live.recv(timeout=5)
+                raw(url, f"GET / HTTP/1.1\r\nAuthorization: Bearer {token}\r\nbroken\r\n\r\n".encode())
+        finally:
+            process.terminate()
+            said.append(process.stderr.read())
+    log = "".join(said)
+    assert "was refused" in log
+    for role, token in tokens.items():
+        assert token.removeprefix("livessl_") not in log, role
+
+
+def test_tokens_that_cannot_be_read_stop_the_start(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tokens\.yaml: cannot be read: No such file"):
+        Server(site_of(TOKENED, tmp_path), SystemClock())
+
+
+def test_behind_a_proxy_on_this_machine_any_name_will_do(secured: Secured) -> None:
+    """Tokens are sent by no page that does not know them, so there is nothing to rebind a name for."""
+    headers = {**secured.headers(Role.VIEWER), "Host": "livessl.example.org"}
+    assert httpx.get(f"{secured.server.url}/api/v1/site", headers=headers).status_code == 200
+
+
+def test_without_tokens_this_machine_may_do_everything() -> None:
+    with running_server(site_of()) as server:
+        assert httpx.get(f"{server.url}/api/v1/access").json()["clients"] == []
+        assert httpx.post(f"{server.url}/api/v1/site").status_code == 405
+        health = httpx.get(f"{server.url}/api/v1/health").json()
+        assert health["secured"] == {"nodes": False, "tokens": False, "tls": False}
+        assert health["refused"] == {"nodes": 0, "http": 0}

@@ -1,0 +1,92 @@
+"""TLS from certificate files: requests and WebSockets are encrypted, and files that do not fit stop the start."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import ssl
+import subprocess
+from pathlib import Path
+
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from conftest import require
+from livessl.clock import SystemClock
+from livessl.server.app import Server
+from livessl.site.models import ConfigError
+from small_site import running_server, site_of
+
+FILES = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A certificate for this machine, its key, another key, and the key behind a passphrase."""
+    require(shutil.which("openssl") is not None, "openssl is not installed (Debian: apt install openssl)")
+    directory = tmp_path_factory.mktemp("tls")
+    new = ["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=livessl"]
+    names = ["-addext", "subjectAltName=IP:127.0.0.1", "-keyout", "site.key", "-out", "site.crt"]
+    locked = ["rsa", "-aes256", "-passout", "pass:secret", "-in", "site.key", "-out", "locked.key"]
+    for arguments in ([*new, *names], ["genrsa", "-out", "other.key", "2048"], locked):
+        subprocess.run(["openssl", *arguments], cwd=directory, check=True, capture_output=True)
+    return directory
+
+
+def test_everything_is_encrypted(folder: Path) -> None:
+    trusted = ssl.create_default_context(cafile=folder / "site.crt")
+    with running_server(site_of(FILES, folder)) as server:
+        assert server.url.startswith("https://127.0.0.1:")
+        health = httpx.get(f"{server.url}/api/v1/health", verify=trusted)
+        assert health.json()["secured"]["tls"] is True
+        with connect(f"wss{server.url.removeprefix('https')}/api/v1/live", ssl=trusted, open_timeout=5) as live:
+            assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        with pytest.raises(httpx.HTTPError):
+            httpx.get(server.url.replace("https", "http") + "/api/v1/health")
+        with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
+            httpx.get(f"{server.url}/api/v1/health", verify=ssl.create_default_context())
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl.TLSVersion) -> None:
+    trusted = ssl.create_default_context(cafile=folder / "site.crt")
+    trusted.minimum_version = trusted.maximum_version = version
+    with running_server(site_of(FILES, folder)) as server:
+        port = int(server.url.rpartition(":")[2])
+        for offered in ("DEFAULT", "AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA256"):
+            trusted.set_ciphers(offered)
+            with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
+                if (
+                    version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT"
+                ):  # no key exchange anew, or none authentic
+                    with pytest.raises(ssl.SSLError):
+                        trusted.wrap_socket(plain, server_hostname="127.0.0.1")
+                    continue
+                with trusted.wrap_socket(plain, server_hostname="127.0.0.1") as secured:
+                    chosen = secured.cipher()
+                    assert chosen is not None
+                    assert "GCM" in chosen[0] or "CHACHA20" in chosen[0]
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "said"),
+    [
+        ("site.crt", "other.key", "KEY_VALUES_MISMATCH"),
+        ("site.crt", "locked.key", "name a PEM certificate and its key without a passphrase"),
+        ("missing.crt", "site.key", "No such file or directory"),
+        ("site.key", "site.key", "name a PEM certificate"),
+    ],
+)
+def test_files_that_do_not_fit_stop_the_start(folder: Path, certificate: str, key: str, said: str) -> None:
+    changes = {"server.http.certificate": certificate, "server.http.private_key": key}
+    with pytest.raises(ConfigError, match=said) as caught:
+        Server(site_of(changes, folder), SystemClock())
+    assert str(caught.value).startswith("server.http.certificate: cannot use ")
+
+
+@pytest.mark.parametrize("given", ["certificate", "private_key"])
+def test_one_file_without_the_other_is_a_fault(given: str) -> None:
+    with pytest.raises(ConfigError, match=f"expected certificate and private_key, got {given} alone; add the other"):
+        site_of({f"server.http.{given}": "site.pem"})
