@@ -18,8 +18,8 @@ from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import Block, Event, Float32Array, Frame, Mark
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.recording import ArrayRecording, Placed, Spliced
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.recording import MemoryRecording, SplicedRecording, TimedRecording
 from livessl.recordings.session import read_session
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
@@ -30,7 +30,7 @@ from small_site import (
     hiss,
     running_server,
     scene,
-    scene_parts,
+    scene_recordings,
     site_of,
     wait_until,
     write_site,
@@ -45,7 +45,7 @@ NEAR_M = 0.5 * 343.0 / RATE_HZ
 """Way of half a sample: what delays rounded to samples would err by. Ours are finer, and there is no reverberation."""
 
 
-def events_of(site: Site, parts: Sequence[Part]) -> list[Event]:
+def events_of(site: Site, parts: Sequence[AssignedRecording]) -> list[Event]:
     return [o for o in offline.run(site, parts, UnpacedClock(START_NS)) if isinstance(o, Event)]
 
 
@@ -53,9 +53,9 @@ def eight() -> Float32Array:
     return np.concatenate([heard("north"), heard("south")])
 
 
-def whole(array: str = "both") -> Part:
+def whole(array: str = "both") -> AssignedRecording:
     """The scene as one recording of eight channels."""
-    return Part(array, Placed(ArrayRecording("eight", float(RATE_HZ), eight()), START_NS), tuple(range(1, 9)))
+    return AssignedRecording(array, MemoryRecording("eight", float(RATE_HZ), eight()), START_NS, tuple(range(1, 9)))
 
 
 def site_of_eight() -> Site:
@@ -85,20 +85,20 @@ def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
 
 
 def test_joint_arrays_are_one_array_of_all_their_microphones_to_the_last_bit() -> None:
-    joint = events_of(site_of(JOINT), scene_parts(START_NS))
+    joint = events_of(site_of(JOINT), scene_recordings(START_NS))
     assert [event.heard_by for event in joint] == [("both",), ("both",)]
     assert max(distances_m(joint)) < NEAR_M
     assert facts(joint) == facts(events_of(site_of_eight(), [whole()]))
-    summed = events_of(site_of(), scene_parts(START_NS))
+    summed = events_of(site_of(), scene_recordings(START_NS))
     assert [event.heard_by for event in summed] == [("north", "south")] * 2
     assert [fact[0] for fact in facts(summed)] != [fact[0] for fact in facts(joint)]
 
 
 def test_a_millisecond_between_the_arrays_is_another_place_for_joint_ones_only() -> None:
     """What one clock is needed for: a summed pair of arrays does not notice."""
-    north, south = scene_parts(START_NS)
+    north, south = scene_recordings(START_NS)
     shifted = np.roll(heard("south"), RATE_HZ // 1000, axis=1)
-    late = replace(south, placed=Placed(ArrayRecording("south", float(RATE_HZ), shifted), START_NS))
+    late = replace(south, recording=MemoryRecording("south", float(RATE_HZ), shifted), start_ns=START_NS)
     assert max(distances_m(events_of(site_of(), [north, late]))) < NEAR_M
     assert min(distances_m(events_of(site_of(JOINT), [north, late]))) > 10 * NEAR_M
 
@@ -128,44 +128,44 @@ def test_a_line_hears_them_as_one() -> None:
     assert levels == 8
 
 
-def refusal(site: Site, parts: Sequence[Part]) -> str:
+def refusal(site: Site, parts: Sequence[AssignedRecording]) -> str:
     with pytest.raises(DeviceError) as caught:
-        pipelines_of(site, parts)
+        make_pipelines(site, parts)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
 def test_recordings_that_did_not_begin_together() -> None:
-    north, south = scene_parts(START_NS)
-    later = replace(south, placed=replace(south.placed, start_ns=START_NS + 62_500))  # a sample
+    north, south = scene_recordings(START_NS)
+    later = replace(south, start_ns=START_NS + 62_500)  # a sample
     assert refusal(site_of(JOINT), [north, later]) == (
-        "array 'both': joint processing expects recordings of one beginning, length and sampling rate, got north (0 s, "
-        "5.3 s, 16000 Hz), south (6.25e-05 s, 5.3 s, 16000 Hz); record them through one device, or take joint.both away"
-    ).replace("5.3", f"{north.placed.recording.duration_s:g}")
+        "array 'both': joint processing expects recordings of one start, length and sampling rate, got north (0 s, "
+        "5.3 s, 16000 Hz), south (6.25e-05 s, 5.3 s, 16000 Hz); record them through one device, or remove joint.both"
+    ).replace("5.3", f"{north.recording.duration_s:g}")
 
 
 def test_recordings_of_different_length() -> None:
-    north, south = scene_parts(START_NS)
-    short = ArrayRecording("south", float(RATE_HZ), heard("south")[:, :-1])
-    said = refusal(site_of(JOINT), [north, replace(south, placed=Placed(short, START_NS))])
-    assert "expects recordings of one beginning, length and sampling rate" in said
+    north, south = scene_recordings(START_NS)
+    short = MemoryRecording("south", float(RATE_HZ), heard("south")[:, :-1])
+    said = refusal(site_of(JOINT), [north, replace(south, recording=short, start_ns=START_NS)])
+    assert "expects recordings of one start, length and sampling rate" in said
 
 
 def test_array_without_a_recording() -> None:
-    said = refusal(site_of(JOINT), scene_parts(START_NS)[:1])
+    said = refusal(site_of(JOINT), scene_recordings(START_NS)[:1])
     assert said == (
         "array 'both': joint processing expects a recording of each of north, south, got none of 'south'; add it, or "
-        "take joint.both away"
+        "remove joint.both"
     )
 
 
 def test_recording_of_all_and_of_one_besides() -> None:
-    said = refusal(site_of(JOINT), [whole(), scene_parts(START_NS)[0]])
-    assert said == "array 'both': expected its recording or 'north''s, got both; take one away"
+    said = refusal(site_of(JOINT), [whole(), scene_recordings(START_NS)[0]])
+    assert said == "array 'both': expected a recording of it or of 'north', got both; leave one out"
 
 
 def test_files_of_nobody_knows_which_device() -> None:
-    said = refusal(site_of(NODELESS), scene_parts(START_NS))
+    said = refusal(site_of(NODELESS), scene_recordings(START_NS))
     assert said == (
         "array 'both': joint processing expects arrays sampled by one clock, got 'north' by north, 'south' by south; "
         "record them through one device, or let their maps be summed instead"
@@ -173,7 +173,7 @@ def test_files_of_nobody_knows_which_device() -> None:
 
 
 def test_one_recording_of_all_needs_no_node() -> None:
-    joint = facts(events_of(site_of(JOINT), scene_parts(START_NS)))
+    joint = facts(events_of(site_of(JOINT), scene_recordings(START_NS)))
     assert facts(events_of(site_of(NODELESS), [whole()])) == joint
     parts = [
         replace(whole(name), channels=numbers) for name, numbers in (("north", (1, 2, 3, 4)), ("south", (5, 6, 7, 8)))
@@ -184,21 +184,21 @@ def test_one_recording_of_all_needs_no_node() -> None:
 
 
 def test_a_gap_in_one_recording_only() -> None:
-    def spliced(array: str, *cuts: tuple[float, float]) -> Part:
+    def spliced(array: str, *cuts: tuple[float, float]) -> AssignedRecording:
         samples = heard(array)
         stretches = [
-            Placed(
-                ArrayRecording(array, float(RATE_HZ), samples[:, round(first * RATE_HZ) : round(stop * RATE_HZ)]),
+            TimedRecording(
+                MemoryRecording(array, float(RATE_HZ), samples[:, round(first * RATE_HZ) : round(stop * RATE_HZ)]),
                 START_NS + round(first * 1e9),
             )
             for first, stop in cuts
         ]
-        return Part(array, Placed(Spliced(tuple(stretches)), START_NS), (1, 2, 3, 4))
+        return AssignedRecording(array, SplicedRecording(tuple(stretches)), START_NS, (1, 2, 3, 4))
 
     site, end_s = site_of(JOINT), heard("north").shape[1] / RATE_HZ
     torn = ((0.0, 0.3), (0.5, end_s))
     assert len(events_of(site, [spliced("north", *torn), spliced("south", *torn)])) == 2
-    with pytest.raises(DeviceError, match=r"north \+ south: expected recordings that run together .* 0\.300 s after"):
+    with pytest.raises(DeviceError, match=r"north \+ south: expected recordings whose samples match .* 0\.300 s after"):
         events_of(site, [spliced("north", *torn), spliced("south", (0.0, end_s))])
 
 
@@ -300,7 +300,7 @@ def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> N
     clock = SystemClock()
     with running_server(site_of(JOINT)) as server:
         endpoint = server.engine.endpoint
-        arguments = (endpoint, scene_parts(START_NS), UnpacedClock(START_NS), clock)
+        arguments = (endpoint, scene_recordings(START_NS), UnpacedClock(START_NS), clock)
         with pytest.raises(UndeliveredError, match="array 'north' is joined in 'both' at the server; give node and"):
             send_session(site_of(), *arguments, "run-1", lambda: False)
         send_session(site_of(JOINT), *arguments, "run-2", lambda: False)
@@ -310,7 +310,7 @@ def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> N
         image = httpx.get(f"{server.url}/api/v1/map", params={"array": "both"})
         unknown = httpx.get(f"{server.url}/api/v1/map", params={"array": "north"})
     for event, expected in zip(
-        read["events"]["events"][::-1], events_of(site_of(JOINT), scene_parts(START_NS)), strict=True
+        read["events"]["events"][::-1], events_of(site_of(JOINT), scene_recordings(START_NS)), strict=True
     ):
         assert expected.estimate is not None
         assert event["position_m"] == [round(float(x), 4) for x in expected.estimate.position_m]

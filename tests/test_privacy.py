@@ -16,7 +16,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.server import app
 from livessl.server.store import Query, Store
 from livessl.site.models import ConfigError
-from small_site import running_server, scene_parts, site_of, wait_until, write_site
+from small_site import running_server, scene_recordings, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
 DAY_NS = 86_400_000_000_000
@@ -41,7 +41,7 @@ def test_running_it_all_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     site = site_of({**PRIVATE, "server.events_db": str(tmp_path / "events.db")}, tmp_path)
     with running_server(site) as server:
-        send_session(site, server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run", lambda: False)
+        send_session(site, server.engine.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events")
         written = {path.name for path in tmp_path.rglob("*")}
         assert {name.partition("-")[0] for name in written} == {"events.db"}

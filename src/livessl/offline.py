@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import BackfillRequest, Frame, Mark, Message, Output
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
 from livessl.site.build.fusion import make_fusion
 from livessl.site.models import Site
 
 
 def run(
     site: Site,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     clock: Clock,
     *,
     method: str | None = None,
@@ -32,11 +32,11 @@ def run(
         Where recordings of arrays that the site joins do not belong together.
     """
     fusion = make_fusion(site, method, updates=False)
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     if ask:
         fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
     now_ns = 0
-    for now_ns, batch in played_messages(pipelines, placed, clock):
+    for now_ns, batch in paced_messages(pipelines, inputs, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
         while asks := [output for output in outputs if isinstance(output, BackfillRequest)]:
             yield from (output for output in outputs if not isinstance(output, BackfillRequest))

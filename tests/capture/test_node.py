@@ -26,8 +26,8 @@ from livessl.capture.node import (
 )
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.receiver import Item, Joined, Left, Receiver
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, mark, site_of, wait_until
@@ -87,17 +87,17 @@ def sound() -> Float32Array:
     return samples
 
 
-def parts(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[Part]:
+def parts(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[AssignedRecording]:
     heard = sound() if samples is None else samples
-    placed = Placed(ArrayRecording("burst", float(RATE_HZ), heard), start_ns)
-    return [Part(array, placed, (1, 2, 3, 4)) for array in ARRAYS]
+    burst = MemoryRecording("burst", float(RATE_HZ), heard)
+    return [AssignedRecording(array, burst, start_ns, (1, 2, 3, 4)) for array in ARRAYS]
 
 
 def never() -> bool:
     return False
 
 
-def replay(there: There, played: list[Part], progress: Callable[[int], None] | None = None) -> None:
+def replay(there: There, played: list[AssignedRecording], progress: Callable[[int], None] | None = None) -> None:
     pace = UnpacedClock(START_NS)
     send_session(there.site, there.receiver.endpoint, played, pace, PatientClock(), "run-1", never, progress)
 

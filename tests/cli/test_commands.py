@@ -349,7 +349,7 @@ def test_all_files_that_do_not_fit_are_told(run: Run, recorded: Recorded, tmp_pa
         ("north=1,2,3", "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3]"),
         ("north=1,2,3,5", "expected 4 different channel numbers from 1 to 4"),
         ("north=1,2,3,3", "expected 4 different channel numbers from 1 to 4"),
-        ("west=1,2,3,4", "channels of array 'west': no recording of it is given; there are north, south"),
+        ("west=1,2,3,4", "channels of array 'west': expected an array with a recording (north, south)"),
     ],
 )
 def test_channels_that_do_not_fit(run: Run, recorded: Recorded, channels: str, said: str) -> None:

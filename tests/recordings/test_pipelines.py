@@ -16,8 +16,8 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array, Frame, Mark, Message
 from livessl.errors import DeviceError
 from livessl.recordings.assign import recording_channels
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording, TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
 from small_site import RATE_HZ, Changes, hiss, site_of
@@ -105,10 +105,10 @@ def test_other_sound_gives_other_messages() -> None:
 
 def test_played_messages_are_those_of_the_lines() -> None:
     lines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
-    placed = [Placed(ArrayRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
+    recordings = [TimedRecording(MemoryRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
     clock = UnpacedClock(START_NS)
     made: list[Message] = []
-    for known_ns, batch in played_messages(lines, placed, clock):
+    for known_ns, batch in paced_messages(lines, recordings, clock):
         assert known_ns == clock.now_ns()
         for message in batch:
             assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
@@ -121,8 +121,8 @@ def test_played_messages_are_those_of_the_lines() -> None:
 def test_played_messages_of_a_short_recording_are_flushed() -> None:
     """Shorter than the warm-up: everything comes at the end."""
     line = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
-    short = Placed(ArrayRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
-    batches = [batch for _, batch in played_messages([line], [short], UnpacedClock())]
+    short = TimedRecording(MemoryRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
+    batches = [batch for _, batch in paced_messages([line], [short], UnpacedClock())]
     assert [len(batch) for batch in batches[:-1]] == [0] * (len(batches) - 1)
     assert len(batches[-1]) == 5
 
@@ -131,8 +131,8 @@ def test_line_names_its_arrays() -> None:
     assert make_pipeline(SITE, BOTH, float(RATE_HZ)).arrays == ["north", "south"]
 
 
-def recording(channels: int, rate_hz: float = RATE_HZ) -> ArrayRecording:
-    return ArrayRecording("take1.wav", float(rate_hz), hiss(0.1, channels))
+def recording(channels: int, rate_hz: float = RATE_HZ) -> MemoryRecording:
+    return MemoryRecording("take1.wav", float(rate_hz), hiss(0.1, channels))
 
 
 NODELESS: Changes = {"nodes": {}}
@@ -194,7 +194,7 @@ def test_which_channels_are_an_arrays(
     ],
 )
 def test_recording_that_does_not_fit(
-    changes: Changes, one: ArrayRecording, wanted: list[int] | None, said: str
+    changes: Changes, one: MemoryRecording, wanted: list[int] | None, said: str
 ) -> None:
     with pytest.raises(DeviceError) as caught:
         recording_channels(site_of(changes), "north", one, wanted)

@@ -16,9 +16,9 @@ from livessl.capture.record import record_device
 from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, parts_from_sessions, parts_from_wavs
-from livessl.recordings.recorder import Recorder, record_parts
-from livessl.recordings.recording import ArrayRecording, Placed, WavRecording
+from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions
+from livessl.recordings.recorder import Recorder, record_playback
+from livessl.recordings.recording import FileRecording, MemoryRecording
 from livessl.recordings.session import read_session
 from small_site import RATE_HZ, Changes, hiss, site_of, write_wav
 
@@ -51,23 +51,23 @@ def test_wav_part_becomes_a_session_without_loss(tmp_path: Path, kind: Literal["
     heard = {name: sixteen_bits(hiss(1.01, seed=k)) for k, name in enumerate(BOTH)}
     wavs = {name: write_wav(tmp_path / f"{name}.wav", heard[name], subtype="PCM_16") for name in BOTH}
     out = tmp_path / "out"
-    parts = parts_from_wavs(SITE, wavs, start_ns=START_NS)
-    assert record_parts(out, SITE, parts, UnpacedClock(START_NS), never, kind)
+    parts = assign_files(SITE, wavs, start_ns=START_NS)
+    assert record_playback(out, SITE, parts, UnpacedClock(START_NS), never, kind)
     session = read_session(out)
     assert {piece.array: piece.start_ns for piece in session.pieces} == dict.fromkeys(BOTH, START_NS)
     for piece in session.pieces:
         assert soundfile.info(session.path(piece)).subtype == subtype
         assert_array_equal(read(session.path(piece)), heard[piece.array])
-    replayed = parts_from_sessions(session.site(), [session])
-    assert {part.array: (part.placed.start_ns, part.channels) for part in replayed} == dict.fromkeys(
+    replayed = assign_sessions(session.site(), [session])
+    assert {part.array: (part.start_ns, part.channels) for part in replayed} == dict.fromkeys(
         BOTH, (START_NS, (1, 2, 3, 4))
     )
 
 
 def test_recording_stops_when_told(tmp_path: Path) -> None:
-    part = Part("north", Placed(ArrayRecording("hiss", float(RATE_HZ), hiss(5.0)), START_NS), (1, 2, 3, 4))
+    part = AssignedRecording("north", MemoryRecording("hiss", float(RATE_HZ), hiss(5.0)), START_NS, (1, 2, 3, 4))
     clock = UnpacedClock(START_NS)
-    assert record_parts(tmp_path, SITE, [part], clock, lambda: clock.now_ns() >= START_NS + 500_000_000)
+    assert record_playback(tmp_path, SITE, [part], clock, lambda: clock.now_ns() >= START_NS + 500_000_000)
     [piece] = read_session(tmp_path).pieces
     assert read(tmp_path / piece.file).shape == (4, RATE_HZ // 2)
 
@@ -109,8 +109,8 @@ def test_gap_begins_a_new_file(tmp_path: Path) -> None:
     for piece, first, stop in zip(north, (0, 24000, 32000), (16000, 32000, 40000), strict=True):
         assert piece.start_ns == START_NS + round(first / RATE_HZ * 1e9)
         assert_array_equal(read(session.path(piece)), samples[:4, first:stop])
-    [part] = [part for part in parts_from_sessions(SITE, [session]) if part.array == "north"]
-    blocks = list(part.placed.recording.blocks(part.placed.start_ns))
+    [part] = [part for part in assign_sessions(SITE, [session]) if part.array == "north"]
+    blocks = list(part.recording.blocks(part.start_ns))
     starts = [b.first_index for b, before in zip(blocks[1:], blocks, strict=False) if follows_a_gap(b, before)]
     assert starts == [24000]
 
@@ -133,9 +133,9 @@ def test_what_is_complete_survives_a_crash(tmp_path: Path) -> None:
     assert list(told) == names
     assert told[names[0]] == told[names[1]] > 0  # all stamps of a stretch tell its start, once it is whole
     assert told[names[2]] == told[names[3]] == second
-    assert WavRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
+    assert FileRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
     recorder.__exit__(None, None, None)
-    assert len(parts_from_sessions(SITE, [read_session(tmp_path)])) == 2
+    assert len(assign_sessions(SITE, [read_session(tmp_path)])) == 2
 
 
 def starts(directory: Path) -> dict[str, int]:
@@ -199,7 +199,7 @@ def test_24_bits_keep_what_a_converter_gives(tmp_path: Path) -> None:
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, 8000))
     assert_allclose(read(tmp_path / "north-000.flac"), samples[:4], rtol=0, atol=2**-23)
-    assert WavRecording(tmp_path / "north-000.flac").channels == 4
+    assert FileRecording(tmp_path / "north-000.flac").channels == 4
 
 
 def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
         "west": write_wav(tmp_path / "good.wav", hiss(0.1)),
     }
     with pytest.raises(DeviceError) as caught:
-        parts_from_wavs(SITE, wavs)
+        assign_files(SITE, wavs)
     few, missing, west = str(caught.value).splitlines()
     assert "few.wav: expected 4 channels" in few
     assert "missing.wav: expected a WAV or FLAC file, cannot read it: no such file" in missing
@@ -220,5 +220,5 @@ def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
 def test_wavs_begin_together_but_for_their_offset(tmp_path: Path) -> None:
     site = site_of({"arrays.south.wav_offset_s": -0.25})
     path = write_wav(tmp_path / "hiss.wav", hiss(0.1))
-    parts = parts_from_wavs(site, {"north": path, "south": path}, start_ns=START_NS)
-    assert [part.placed.start_ns - START_NS for part in parts] == [0, -250_000_000]
+    parts = assign_files(site, {"north": path, "south": path}, start_ns=START_NS)
+    assert [part.start_ns - START_NS for part in parts] == [0, -250_000_000]

@@ -16,14 +16,14 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
 from livessl.recordings.recording import (
-    ArrayRecording,
-    Looped,
-    Placed,
+    FileRecording,
+    LoopedRecording,
+    MemoryRecording,
     Recording,
-    Spliced,
-    WavRecording,
-    merged,
-    played,
+    SplicedRecording,
+    TimedRecording,
+    merged_blocks,
+    paced_blocks,
 )
 from small_site import RATE_HZ, hiss, write_wav
 
@@ -35,9 +35,9 @@ def joined(blocks: Iterable[Block]) -> Float32Array:
     return np.concatenate([block.samples for block in blocks], axis=1)
 
 
-def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4, seed: int = 0) -> ArrayRecording:
+def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4, seed: int = 0) -> MemoryRecording:
     samples = hiss(seconds * rate_hz / RATE_HZ, channels, seed)
-    return ArrayRecording("hiss", float(rate_hz), samples)
+    return MemoryRecording("hiss", float(rate_hz), samples)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4,
 def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
     samples = hiss(0.33, channels=5)
     path = write_wav(tmp_path / f"sound.{ending}", samples, subtype=subtype)
-    read = WavRecording(path)
+    read = FileRecording(path)
     assert (read.name, read.sample_rate_hz, read.channels) == (str(path), RATE_HZ, 5)
     assert read.duration_s == pytest.approx(0.33)
     got = joined(read.blocks(0))
@@ -67,7 +67,7 @@ def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding
 
 def refusal(path: Path) -> str:
     with pytest.raises(DeviceError) as caught:
-        WavRecording(path)
+        FileRecording(path)
     said = str(caught.value)
     assert said.startswith(f"{path}: expected ")
     assert "\n" not in said
@@ -103,7 +103,7 @@ def test_samples_that_are_not_finite(tmp_path: Path, subtype: str, bad: float) -
 def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
     samples = hiss(20.0)
     samples[2, 300_000] = -1e6  # the largest that is taken
-    WavRecording(write_wav(tmp_path / "loud.wav", samples))
+    FileRecording(write_wav(tmp_path / "loud.wav", samples))
     samples[2, 300_000] = -1.001e6
     said = refusal(write_wav(tmp_path / "broken.wav", samples))
     assert "samples around 1 at full scale, got -1.001e+06 at sample 300000 of channel 3; export it again" in said
@@ -116,12 +116,12 @@ def test_silence(tmp_path: Path, subtype: str) -> None:
         write_wav(tmp_path / "silence.wav", samples, subtype=subtype)
     )
     samples[3, -1] = 0.5  # one click, at the very end, is sound
-    WavRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
+    FileRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
 
 
 def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "sound.wav", hiss())
-    read = WavRecording(path)
+    read = FileRecording(path)
     path.unlink()
     with pytest.raises(DeviceError, match="no such file"):
         next(read.blocks(0))
@@ -130,7 +130,7 @@ def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate_hz", [16000, 22050, 44100, 48000, 96000])
 def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -> None:
     source = recording(1.01, rate_hz)
-    read: list[Recording] = [source, WavRecording(write_wav(tmp_path / "s.wav", source.samples, rate_hz))]
+    read: list[Recording] = [source, FileRecording(write_wav(tmp_path / "s.wav", source.samples, rate_hz))]
     for one in read:
         blocks = list(one.blocks(START_NS))
         index = 0
@@ -146,11 +146,15 @@ def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -
 
 def test_merged_comes_in_the_order_of_completion() -> None:
     early, late, short = recording(0.5), recording(0.3, 22050, seed=1), recording(0.05, seed=2)
-    placed = [Placed(late, START_NS + 133_000_000), Placed(early, START_NS), Placed(short, START_NS + 900_000_000)]
-    entries = list(merged(placed))
+    recordings = [
+        TimedRecording(late, START_NS + 133_000_000),
+        TimedRecording(early, START_NS),
+        TimedRecording(short, START_NS + 900_000_000),
+    ]
+    entries = list(merged_blocks(recordings))
     ends = [end_ns for end_ns, _, _ in entries]
     assert ends == sorted(ends)
-    for line, item in enumerate(placed):
+    for line, item in enumerate(recordings):
         mine = [(end_ns, block) for end_ns, of, block in entries if of == line]
         assert_array_equal(joined(block for _, block in mine), joined_of(item))
         assert mine[0][1].stamp_ns == item.start_ns
@@ -159,14 +163,14 @@ def test_merged_comes_in_the_order_of_completion() -> None:
     assert [line for _, line, _ in entries] != sorted(line for _, line, _ in entries)  # they do interleave
 
 
-def joined_of(item: Placed) -> Float32Array:
+def joined_of(item: TimedRecording) -> Float32Array:
     return joined(item.recording.blocks(item.start_ns))
 
 
 def test_no_block_is_played_before_it_is_complete() -> None:
     clock = UnpacedClock(START_NS)
-    placed = [Placed(recording(0.2), START_NS), Placed(recording(0.2, 44100), START_NS + 7)]
-    seen = [(clock.now_ns(), end_ns) for end_ns, _, _ in played(placed, clock)]
+    recordings = [TimedRecording(recording(0.2), START_NS), TimedRecording(recording(0.2, 44100), START_NS + 7)]
+    seen = [(clock.now_ns(), end_ns) for end_ns, _, _ in paced_blocks(recordings, clock)]
     assert seen == [(end_ns, end_ns) for _, end_ns in seen]
     assert len(seen) == 20
 
@@ -180,10 +184,12 @@ class Sleeper(UnpacedClock):
 
 def test_whoever_waits_for_sound_hears_of_it() -> None:
     """Before the beginning and in a gap come empty blocks, so that a listener can look up."""
-    spliced = Spliced((Placed(recording(0.04), START_NS), Placed(recording(0.04), START_NS + NS)))
+    spliced = SplicedRecording(
+        (TimedRecording(recording(0.04), START_NS), TimedRecording(recording(0.04), START_NS + NS))
+    )
     clock = Sleeper(START_NS - NS)
     last_ns, heard = START_NS - NS, []
-    for now_ns, _, block in played([Placed(spliced, START_NS)], clock):
+    for now_ns, _, block in paced_blocks([TimedRecording(spliced, START_NS)], clock):
         assert now_ns - last_ns <= 70_000_000
         last_ns = now_ns
         heard.append(block.samples.shape[1])
@@ -193,7 +199,7 @@ def test_whoever_waits_for_sound_hears_of_it() -> None:
 
 def test_looped_goes_on_without_a_gap() -> None:
     once = recording(0.05)  # not a whole number of blocks
-    looped = Looped(once)
+    looped = LoopedRecording(once)
     assert (looped.name, looped.channels, looped.sample_rate_hz) == ("hiss", 4, RATE_HZ)
     assert looped.duration_s == float("inf")
     blocks = list(islice(looped.blocks(START_NS), 12))
@@ -208,7 +214,7 @@ def test_looped_goes_on_without_a_gap() -> None:
 def test_spliced_keeps_the_gap() -> None:
     first, second = recording(0.1, seed=1), recording(0.1, seed=2)
     gap_ns = 2 * NS + 31_250  # 2 s and half a sample
-    spliced = Spliced((Placed(first, START_NS), Placed(second, START_NS + gap_ns)))
+    spliced = SplicedRecording((TimedRecording(first, START_NS), TimedRecording(second, START_NS + gap_ns)))
     assert spliced.duration_s == pytest.approx(2.1, abs=1e-4)
     assert (spliced.name, spliced.channels, spliced.sample_rate_hz) == ("hiss", 4, RATE_HZ)
     for shift_ns in (0, 500 * NS):  # played when it was recorded, or at any other time

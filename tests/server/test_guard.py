@@ -25,7 +25,7 @@ from livessl.server.receiver import Joined, Receiver
 from livessl.site import keys
 from livessl.site.keys import KeyPair, NodeKeys
 from livessl.site.models import ConfigError, Site
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
@@ -332,9 +332,9 @@ def test_scene_is_heard_by_key_live_and_replayed(folder: Path) -> None:
     with running_server(keyed(folder)) as server:
         site = keyed(folder, {"nodes.lab-pc.server": server.engine.endpoint})
         start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
-        capture_recordings(site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.engine.events == 2, "both events, live")
-        send_session(site, server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
+        send_session(site, server.engine.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
         wait_until(lambda: server.engine.events == 4, "both events, replayed")
         with linked(server.engine.endpoint, keys_of(folder, "stranger")) as link:
             until(link, lambda: server.engine.refusals.count("nodes"), "the refusal")

@@ -23,14 +23,14 @@ from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
-from livessl.recordings.recording import Placed, Spliced
+from livessl.recordings.recording import SplicedRecording
 from livessl.server import engine
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
 from livessl.site.keys import add_token
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 START_NS = 1_767_225_600_000_000_000
@@ -71,7 +71,7 @@ def play(server: Server, speed: float | None = None) -> None:
     """Send the scene as a replay, as fast as it goes or at a speed."""
     pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
     send_session(
-        site_of(), server.engine.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
+        site_of(), server.engine.endpoint, scene_recordings(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
     )
     server.engine.wait_idle()
 
@@ -80,7 +80,7 @@ def offline_events() -> list[dict[str, Any]]:
     """The events of the scene without any server."""
     site = site_of()
     told = Messages(site, START_NS, utc=True)
-    outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
+    outputs = offline.run(site, scene_recordings(START_NS), UnpacedClock(START_NS))
     return [told.event(output) for output in outputs if isinstance(output, Event)]
 
 
@@ -157,8 +157,8 @@ def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
     gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
     twice = [
-        replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
-        for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
+        replace(first, recording=SplicedRecording((first.timed, second.timed)), start_ns=START_NS)
+        for first, second in zip(scene_recordings(START_NS), scene_recordings(START_NS + gap_ns), strict=True)
     ]
     with running_server(site_of()) as server:
         send_session(site_of(), server.engine.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)

@@ -15,9 +15,9 @@ from livessl.core.stream.pipeline import Pipeline
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, BackfillRequest, Message
 from livessl.errors import RunError
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import Placed
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.keys import node_keys
 from livessl.site.models import NodeConfig, Site
@@ -73,7 +73,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
 def capture_recordings(
     site: Site,
     name: str,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     clock: Clock,
     run_id: str,
     stop: Stop,
@@ -88,9 +88,9 @@ def capture_recordings(
     UndeliveredError
         Where the server has not acknowledged everything.
     """
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
-    for end_ns in _sent(link, pipelines, placed, clock, stop):
+    for end_ns in _sent(link, pipelines, inputs, clock, stop):
         if progress is not None:
             progress(end_ns)
     _finish(link, clock, stop)
@@ -99,7 +99,7 @@ def capture_recordings(
 def send_session(
     site: Site,
     endpoint: str,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     pace: Clock,
     clock: Clock,
     run_id: str,
@@ -115,7 +115,7 @@ def send_session(
     UndeliveredError
         Where the server refuses it, or has not acknowledged everything.
     """
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
@@ -123,7 +123,7 @@ def send_session(
         raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
     lead = _Lead(link, clock)
     end_ns = 0
-    for end_ns in _sent(link, pipelines, placed, pace, lambda: stop() or link.refused is not None):
+    for end_ns in _sent(link, pipelines, inputs, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while (link.pending > MAX_PENDING or lead.exceeds(AHEAD_NS, end_ns)) and not (stop() or link.refused):
@@ -181,10 +181,10 @@ def _link(
 
 
 def _sent(
-    link: Link, pipelines: Sequence[Pipeline], placed: Sequence[Placed], pace: Clock, stop: Stop
+    link: Link, pipelines: Sequence[Pipeline], inputs: Sequence[TimedRecording], pace: Clock, stop: Stop
 ) -> Iterator[int]:
     """Send what the pipelines make of their recordings, block by block; yields the site time reached."""
-    for end_ns, batch in played_messages(pipelines, placed, pace):
+    for end_ns, batch in paced_messages(pipelines, inputs, pace):
         if stop():
             return
         link.send(batch)

@@ -40,7 +40,7 @@ from livessl.site.models import (
 
 if TYPE_CHECKING:
     from livessl.lab.demo import Outcome
-    from livessl.recordings.assign import Part
+    from livessl.recordings.assign import AssignedRecording
     from livessl.server.api.encode import JsonObject
     from livessl.server.app import Server
 
@@ -469,9 +469,9 @@ def _capture(arguments: argparse.Namespace) -> int:
         with _polite_stop() as stop:
             capture_device(site, arguments.node, device, clock, run_id, stop.is_set)
         return OK
-    parts = _played_parts(arguments, site, clock.now_ns())
-    with _polite_stop() as stop, progress.timed("playing", *span_ns(parts)) as bar:
-        capture_recordings(site, arguments.node, parts, clock, run_id, stop.is_set, bar)
+    recordings = _playback(arguments, site, clock.now_ns())
+    with _polite_stop() as stop, progress.timed("playing", *span_ns(recordings)) as bar:
+        capture_recordings(site, arguments.node, recordings, clock, run_id, stop.is_set, bar)
     return OK
 
 
@@ -510,32 +510,32 @@ def _run_id(node: str, clock: Clock) -> str:
     return f"{clock.now_ns()}-{os.getpid()}-{node}"[:64]
 
 
-def _played_parts(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[Part]:
-    """What a node plays instead of a device."""
-    from livessl.capture.stand_in import parts_from_node
-    from livessl.recordings.assign import common_start_ns, parts_from_wavs, repeated
+def _playback(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[AssignedRecording]:
+    """Return the recordings that a node plays in place of a device."""
+    from livessl.capture.playback import node_recordings
+    from livessl.recordings.assign import assign_files, common_start_ns, looped
 
     start_ns = getattr(arguments, "start_at", None) or common_start_ns(now_ns, len(site.nodes))
     if not arguments.wav:
         with progress.counted("simulating the room", "source") as bar:
-            parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
+            recordings = node_recordings(site, arguments.node, start_ns, bar)
     else:
-        parts = parts_from_wavs(site, *_wavs(arguments), start_ns)
-    return repeated(parts) if getattr(arguments, "loop", False) else parts
+        recordings = assign_files(site, *_wavs(arguments), start_ns)
+    return looped(recordings) if getattr(arguments, "loop", False) else recordings
 
 
 def _locate(arguments: argparse.Namespace) -> int:
     from livessl import offline
-    from livessl.recordings.assign import parts_from_wavs, span_ns
+    from livessl.recordings.assign import assign_files, span_ns
     from livessl.server.api.encode import Messages
 
     site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
-    parts = parts_from_wavs(site, *_wavs(arguments))
+    recordings = assign_files(site, *_wavs(arguments))
     messages = Messages(site, 0, utc=False)
     found = 0
-    with progress.timed("listening", *span_ns(parts)) as bar:
-        for output in offline.run(site, parts, UnpacedClock(), method=arguments.method, progress=bar):
+    with progress.timed("listening", *span_ns(recordings)) as bar:
+        for output in offline.run(site, recordings, UnpacedClock(), method=arguments.method, progress=bar):
             if isinstance(output, Event):
                 found += 1
                 _print_event(messages.event(output), as_json=arguments.json)
@@ -563,16 +563,16 @@ def _print_event(event: JsonObject, *, as_json: bool) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from livessl.recordings.assign import parts_from_sessions
+    from livessl.recordings.assign import assign_sessions
     from livessl.recordings.session import read_session
 
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = _once_each(arguments.joint, "--joint")
     site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
-    parts = parts_from_sessions(site, sessions)
+    recordings = assign_sessions(site, sessions)
     if arguments.server is not None:
         with _polite_stop() as stop:
-            _send(site, arguments.server, parts, arguments.speed, stop)
+            _send(site, arguments.server, recordings, arguments.speed, stop)
         return OK
     from livessl.server.app import Server
 
@@ -588,7 +588,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     def send() -> None:
         try:
-            _send(site, server.engine.endpoint, parts, arguments.speed, stop)
+            _send(site, server.engine.endpoint, recordings, arguments.speed, stop)
             server.engine.wait_idle()
         except Exception as error:  # noqa: BLE001 - raised again below
             failures.append(error)
@@ -607,20 +607,22 @@ def _replay(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: threading.Event) -> None:
+def _send(
+    site: Site, endpoint: str, recordings: Sequence[AssignedRecording], speed: float, stop: threading.Event
+) -> None:
     from livessl.capture.node import send_session
     from livessl.recordings.assign import span_ns
 
     clock = SystemClock()
-    begin_ns, end_ns = span_ns(parts)
+    begin_ns, end_ns = span_ns(recordings)
     pace = UnpacedClock(begin_ns) if speed == float("inf") else PacedClock(begin_ns, speed)
     with progress.timed("playing", begin_ns, end_ns) as bar:
-        send_session(site, endpoint, parts, pace, clock, _run_id("replay", clock), stop.is_set, bar)
+        send_session(site, endpoint, recordings, pace, clock, _run_id("replay", clock), stop.is_set, bar)
 
 
 def _record(arguments: argparse.Namespace) -> int:
     from livessl.capture.record import record_device
-    from livessl.recordings.recorder import Recorder, record_parts
+    from livessl.recordings.recorder import Recorder, record_playback
 
     site = load_site(arguments.site)
     if site.privacy == "positions-only":
@@ -646,8 +648,8 @@ def _record(arguments: argparse.Namespace) -> int:
             record_device(recorder, device, over)
             recorded = recorder.recorded
         else:
-            parts = _played_parts(arguments, site, begun_ns)
-            recorded = record_parts(arguments.out, site, parts, clock, over, arguments.format)
+            recordings = _playback(arguments, site, begun_ns)
+            recorded = record_playback(arguments.out, site, recordings, clock, over, arguments.format)
     if not recorded:
         _complain("nothing was recorded: the device delivered no sound")
         return FAILED

@@ -1,24 +1,31 @@
-"""What a node plays when its device is no audio interface: recorded files, or a simulated scene."""
+"""Recordings that a node plays in place of an audio interface: files, or a simulated scene."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, parts_from_wavs, repeated
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording, assign_files, looped
+from livessl.recordings.recording import MemoryRecording
 from livessl.site.models import SceneDeviceConfig, Site, WavDeviceConfig
 
 
-def parts_from_scene(
+def scene_recordings(
     site: Site,
     arrays: Iterable[str],
     config: SceneDeviceConfig,
     start_ns: int,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Part]:
-    """A simulated scene as the arrays of one node would record it; every node with the same numbers hears the same."""
+) -> list[AssignedRecording]:
+    """Simulate a scene as the arrays of one node would record it.
+
+    Nodes with the same `config` simulate the same scene.
+
+    Raises
+    ------
+    ValueError
+        If there is no such scene.
+    """
     from livessl.simulate.scene import make_scene, render, synthesised_sounds  # heavy, and no other device needs it
 
     scene = make_scene(
@@ -32,34 +39,30 @@ def parts_from_scene(
         seed=config.seed,
     )
     order = list(site.arrays)
-    parts = []
+    recordings = []
     for array in arrays:
         microphones = site.array(array).microphones_m
         samples = render(scene, microphones, seed=config.seed + 1 + order.index(array), progress=progress)
-        recording = ArrayRecording(f"scene {config.seed}", config.sample_rate_hz, samples)
-        parts.append(Part(array, Placed(recording, start_ns), tuple(range(1, len(microphones) + 1))))
-    return parts
+        recording = MemoryRecording(f"scene {config.seed}", config.sample_rate_hz, samples)
+        recordings.append(AssignedRecording(array, recording, start_ns, tuple(range(1, len(microphones) + 1))))
+    return recordings
 
 
-def parts_from_node(
-    site: Site,
-    node: str,
-    start_ns: int,
-    base: Path,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Part]:
-    """What a node whose device is no audio interface plays: its WAV files (relative to `base`), or its scene.
+def node_recordings(
+    site: Site, node: str, start_ns: int, progress: Callable[[int, int], None] | None = None
+) -> list[AssignedRecording]:
+    """Return what a node of device type `wav` or `scene` plays from `start_ns` on.
 
     Raises
     ------
     DeviceError
-        With every file that does not fit, one a line; or why there is no such scene.
+        One line for each file that does not fit; or why the scene cannot be simulated.
     """
     config = site.nodes[node].device
     arrays = site.nodes[node].arrays
     if isinstance(config, SceneDeviceConfig):
         try:
-            parts = parts_from_scene(site, arrays, config, start_ns, progress)
+            recordings = scene_recordings(site, arrays, config, start_ns, progress)
         except ValueError as error:
             raise DeviceError(f"nodes.{node}.device: {error}") from error
     else:
@@ -67,6 +70,6 @@ def parts_from_node(
         missing = [array for array in arrays if array not in config.files]
         if missing:
             raise DeviceError(f"nodes.{node}.device.files: expected a file for array {missing[0]!r}; add it")
-        wavs = {array: base / config.files[array] for array in arrays}
-        parts = parts_from_wavs(site, wavs, start_ns=start_ns)
-    return repeated(parts) if config.loop else parts
+        files = {array: site.file(config.files[array]) for array in arrays}
+        recordings = assign_files(site, files, start_ns=start_ns)
+    return looped(recordings) if config.loop else recordings
