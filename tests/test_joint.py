@@ -285,7 +285,7 @@ def test_check_counts_joint_microphones(files: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("both=north,west", r"site.yaml: joint.both.west: no such array; arrays are north, south"),
+        ("both=north,west", r"site.yaml: joint.both.west: expected one of the arrays north, south, got 'west'"),
         ("north=north,south", r"site.yaml: joint.north: expected another name"),
     ],
 )

@@ -13,9 +13,9 @@ import pytest
 from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
+from livessl.errors import ConfigError
 from livessl.server import app
 from livessl.server.store import Query, Store
-from livessl.site.models import ConfigError
 from small_site import running_server, scene_recordings, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
@@ -139,6 +139,6 @@ def test_no_sound_on_a_disk_where_only_positions_are_kept() -> None:
         site_of(changes)
     (fault,) = caught.value.faults
     assert fault.where.endswith("nodes.lab-pc.spool.directory")
-    assert "no sound is kept on a disk; take it away" in fault.what
+    assert "no sound may be stored on a disk; remove it" in fault.what
     assert site_of({**changes, "nodes.lab-pc.spool": {"directory": None}}).nodes["lab-pc"].spool.directory is None
     assert site_of({**changes, "privacy": "recording"}).nodes["lab-pc"].spool.directory == "spool"

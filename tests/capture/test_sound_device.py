@@ -27,7 +27,7 @@ from livessl.capture.sound_device import SoundDevice, input_devices
 from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -377,7 +377,7 @@ import sys
 import numpy as np
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 with SoundDevice(SoundDeviceConfig(name="virtual", sample_rate_hz=48000), 4, SystemClock()) as device:
     blocks = []
@@ -399,7 +399,7 @@ WATCHER = """
 import json
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 clock, last = SystemClock(), None
 end_ns = clock.now_ns() + 60_000_000_000

@@ -27,10 +27,11 @@ from livessl.capture.link import Link
 from livessl.cli import main as command_line
 from livessl.cli.main import main
 from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.errors import ConfigError, Fault
 from livessl.lab import demo
 from livessl.recordings.session import read_session
 from livessl.server.receiver import Receiver
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.site.models import Site
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 

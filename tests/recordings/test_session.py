@@ -9,9 +9,9 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
+from livessl.errors import ConfigError
 from livessl.recordings.session import SESSION_FILE, piece, read_session, site_text, write_session
 from livessl.site.load import parse_site
-from livessl.site.models import ConfigError
 from small_site import Changes, site_of
 
 START_NS = 1_767_225_600_123_456_000

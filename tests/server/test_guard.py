@@ -21,10 +21,11 @@ from livessl.capture.link import Link
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Frame
+from livessl.errors import ConfigError
 from livessl.server.receiver import Joined, Receiver
 from livessl.site import keys
 from livessl.site.keys import KeyPair, NodeKeys
-from livessl.site.models import ConfigError, Site
+from livessl.site.models import Site
 from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()

@@ -29,7 +29,7 @@ from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()

@@ -13,10 +13,11 @@ import pytest
 import yaml
 
 from livessl.cli.main import main
-from livessl.site import keys
-from livessl.site.keys import Client, Role
+from livessl.errors import ConfigError
+from livessl.site import keys, tokens
+from livessl.site.checks import unprotected_addresses
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, open_doors
+from livessl.site.tokens import Client, Role
 from small_site import Changes, site_of, write_site
 
 KEYED: Changes = {"keys": "keys", "server.http.tokens": "tokens.yaml"}
@@ -52,13 +53,13 @@ def test_token_is_kept_as_a_hash_in_a_file_of_its_owner(site: Path, capsys: pyte
 
 def test_tokens_are_told_apart_and_strangers_are_nobody(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = {role: keyed(capsys, "token", "--site", site, "--name", f"a-{role}", "--role", str(role)) for role in Role}
-    tokens = keys.read_tokens(site.parent / "tokens.yaml")
+    known = tokens.read_tokens(site.parent / "tokens.yaml")
     for role, token in made.items():
-        assert tokens.client(token) == Client(f"a-{role}", role)
-        assert tokens.client(token[:-1]) is None
-        assert tokens.client(token + "=") is None
+        assert known.client(token) == Client(f"a-{role}", role)
+        assert known.client(token[:-1]) is None
+        assert known.client(token + "=") is None
     for stranger in ("", "livessl_", "\udcff", "x" * 10_000):
-        assert tokens.client(stranger) is None
+        assert known.client(stranger) is None
     assert len(set(made.values())) == 3
 
 
@@ -70,9 +71,9 @@ def test_every_known_hash_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
         compared.append(known)
         return known == presented
 
-    monkeypatch.setattr("livessl.site.keys.hmac.compare_digest", compare)
+    monkeypatch.setattr("hmac.compare_digest", compare)
     held = {hashlib.sha256(name.encode()).digest(): Client(name, Role.VIEWER) for name in "abc"}
-    assert keys.Tokens(held).client("a") == Client("a", Role.VIEWER)
+    assert tokens.Tokens(held).client("a") == Client("a", Role.VIEWER)
     assert compared == list(held)
 
 
@@ -80,18 +81,18 @@ def test_revoked_token_is_nobody(site: Path, capsys: pytest.CaptureFixture[str])
     path = site.parent / "tokens.yaml"
     first, second = (keyed(capsys, "token", "--site", site, "--name", name) for name in ("wall", "desk"))
     keyed(capsys, "revoke", "--site", site, "--token", "wall")
-    assert keys.read_tokens(path).client(first) is None
-    assert keys.read_tokens(path).client(second) is not None
-    assert "no token named 'wall'; there are desk" in refused(capsys, "revoke", "--site", site, "--token", "wall")
+    assert tokens.read_tokens(path).client(first) is None
+    assert tokens.read_tokens(path).client(second) is not None
+    assert "no token named 'wall'; tokens are desk" in refused(capsys, "revoke", "--site", site, "--token", "wall")
     keyed(capsys, "revoke", "--site", site, "--token", "desk")
     with pytest.raises(ConfigError, match="make a token with `livessl keys token`"):  # none left: not open to all
-        keys.read_tokens(path)
+        tokens.read_tokens(path)
 
 
 def test_name_of_a_token_is_taken_once(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "token", "--site", site, "--name", "wall")
     said = refused(capsys, "token", "--site", site, "--name", "wall", "--role", "admin")
-    assert "a token named 'wall' is there already" in said
+    assert "a token named 'wall' exists already" in said
     assert "expected a name of 1 to 64 letters" in refused(capsys, "token", "--site", site, "--name", "a b")
 
 
@@ -101,12 +102,14 @@ def test_secrets_open_to_others_are_not_used(site: Path, mode: int, capsys: pyte
     keyed(capsys, "server", "--site", site)
     loaded = load_site(site)
     for path, read in (
-        (site.parent / "tokens.yaml", lambda: keys.read_tokens(site.parent / "tokens.yaml")),
+        (site.parent / "tokens.yaml", lambda: tokens.read_tokens(site.parent / "tokens.yaml")),
         (site.parent / "keys" / "server.secret", lambda: keys.server_keys(loaded)),
     ):
         read()
         path.chmod(mode)
-        with pytest.raises(ConfigError, match=rf"can be used by others \(mode {mode:o}\); chmod 600 it"):
+        with pytest.raises(
+            ConfigError, match=rf"expected a file that only its owner can use, got mode {mode:o}; chmod 600 it"
+        ):
             read()
 
 
@@ -126,7 +129,7 @@ def test_wrong_tokens_file_says_where_but_not_what(tmp_path: Path, text: str, sa
     path.touch(mode=0o600)
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=said) as caught:
-        keys.read_tokens(path)
+        tokens.read_tokens(path)
     assert "SECRET" not in str(caught.value)
     assert caught.value.__cause__ is None
 
@@ -162,9 +165,9 @@ def test_secrets_are_in_no_repr(site: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_no_pair_is_ever_overwritten(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = keyed(capsys, "server", "--site", site)
-    assert "server.secret: is there already and would be lost" in refused(capsys, "server", "--site", site)
+    assert "server.secret: exists already and would be lost" in refused(capsys, "server", "--site", site)
     keyed(capsys, "node", "lab-pc", "--site", site)
-    assert "lab-pc.secret: is there already" in refused(capsys, "node", "lab-pc", "--site", site, "--server", key)
+    assert "lab-pc.secret: exists already" in refused(capsys, "node", "lab-pc", "--site", site, "--server", key)
 
 
 def test_dismissed_node_is_not_enrolled(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,7 +176,7 @@ def test_dismissed_node_is_not_enrolled(site: Path, capsys: pytest.CaptureFixtur
     assert keys.enrolled(site.parent / "keys") == {"a": b"\x22" * 32, "b": b"\x11" * 32}
     keyed(capsys, "revoke", "--node", "a", "--site", site)
     assert keys.enrolled(site.parent / "keys") == {"b": b"\x11" * 32}
-    assert "no node 'a' is enrolled; there are b" in refused(capsys, "revoke", "--node", "a", "--site", site)
+    assert "no node 'a' is enrolled; nodes are b" in refused(capsys, "revoke", "--node", "a", "--site", site)
 
 
 def test_list_tells_who_may_but_no_secret(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -230,25 +233,25 @@ def test_site_without_keys_needs_none() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "", "lab-pc.local", "127.0.0.1.example"])
 def test_api_open_to_the_network_needs_tokens(host: str) -> None:
-    [fault] = open_doors(site_of({"server.http.host": host}))
+    [fault] = unprotected_addresses(site_of({"server.http.host": host}))
     assert fault.where == "server.http.host"
     assert "make a token with `livessl keys token`" in fault.what
-    assert open_doors(site_of({"server.http.host": host, "server.http.tokens": "tokens.yaml"})) == []
+    assert unprotected_addresses(site_of({"server.http.host": host, "server.http.tokens": "tokens.yaml"})) == []
 
 
 @pytest.mark.parametrize("bind", ["tcp://*:5570", "tcp://0.0.0.0:5570", "tcp://[::]:5570", "tcp://eth0:5570"])
 def test_socket_open_to_the_network_needs_keys(bind: str) -> None:
-    [fault] = open_doors(site_of({"server.bind": bind}))
+    [fault] = unprotected_addresses(site_of({"server.bind": bind}))
     assert fault.where == "server.bind"
     assert "`livessl keys server`" in fault.what
-    assert open_doors(site_of({"server.bind": bind, "keys": "keys"})) == []
+    assert unprotected_addresses(site_of({"server.bind": bind, "keys": "keys"})) == []
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost", "::1"])
 def test_this_machine_alone_needs_nothing(host: str) -> None:
     endpoint = f"tcp://{f'[{host}]' if ':' in host else host}:5570"
-    assert open_doors(site_of({"server.http.host": host, "server.bind": endpoint})) == []
-    assert open_doors(site_of({"server.bind": "ipc:///run/livessl"})) == []
+    assert unprotected_addresses(site_of({"server.http.host": host, "server.bind": endpoint})) == []
+    assert unprotected_addresses(site_of({"server.bind": "ipc:///run/livessl"})) == []
 
 
 @pytest.mark.parametrize("command", ["serve", "check"])

@@ -15,7 +15,8 @@ from pydantic import BaseModel
 from livessl.core.geometry import circle, tetrahedron
 from livessl.core.types import FloatArray
 from livessl.site.load import load_site
-from livessl.site.models import GeometryFile, Site, SoundDeviceConfig
+from livessl.site.models import GeometryFile, Site
+from livessl.site.node_models import SoundDeviceConfig
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted((ROOT / "config").glob("*.yaml"))

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from livessl.core.types import FloatArray
+from livessl.errors import ConfigError
 from livessl.site.build.grid import search_grid
 from livessl.site.build.pipeline import activity_parameters
 from livessl.site.load import load_site, parse_site
-from livessl.site.models import ConfigError, Site
+from livessl.site.models import Site
 from small_site import SMALL, Changes, site_of, small, text_of, write_site
 
 SQUARE_M = [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]
@@ -53,8 +54,18 @@ JOINT = "joint.both"
 WEST: Changes = {"microphones_m": [[1.0, 1.0, 1.0], [1.0, 1.2, 1.0]]}
 PI: Changes = {"device": {"name": "pi", "sample_rate_hz": 16000}, "arrays": {"south": [1, 2, 3, 4]}}
 ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
-    "unknown key": ({"colour": "red"}, "colour", "unknown key; correct its spelling or take it away"),
-    "unknown key inside": ({f"{ARRAY}.positon_m": [1, 1, 1]}, f"{ARRAY}.positon_m", "unknown key"),
+    "unknown key": ({"colour": "red"}, "colour", "unknown key 'colour'; remove it"),
+    "unknown key inside": (
+        {f"{ARRAY}.positon_m": [1, 1, 1]},
+        f"{ARRAY}.positon_m",
+        "unknown key 'positon_m'; did you mean 'position_m'",
+    ),
+    "misspelt key": ({"temprature_c": 20}, "temprature_c", "unknown key 'temprature_c'; did you mean 'temperature_c'"),
+    "misspelt key of a device": (
+        {f"{NODE}.device.sample_rate": 16000},
+        f"{NODE}.device.sample_rate",
+        "unknown key 'sample_rate'; did you mean 'sample_rate_hz'",
+    ),
     "our own key": ({"specs": []}, "specs", "unknown key"),
     "another key of our own": ({"processed": []}, "processed", "unknown key"),
     "missing key": ({"room": ...}, "room", "missing; add it"),
@@ -86,7 +97,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "absolute, and posed": (
         {ARRAY: {"microphones_m": [[1, 1, 1], [1, 2, 1], [2, 1, 1], [1, 1, 2]], "orientation_deg": {"yaw": 3}}},
         ARRAY,
-        "microphones_m are absolute; take position_m and orientation_deg away",
+        "microphones_m are absolute; remove position_m and orientation_deg, or use geometry",
     ),
     "no such shape": ({f"{ARRAY}.geometry": {"cube": {}}}, f"{ARRAY}.geometry.cube", "unknown key"),
     "two shapes": (
@@ -126,11 +137,16 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         ARRAY,
         r"microphone 2 at \(4.1632, 1.3, 1.3388\) is outside the room \(4, 5, 3\) m; correct the array's position",
     ),
+    "array in millimetres": (
+        {f"{ARRAY}.position_m": [1900, 1300, 1400]},
+        ARRAY,
+        r"outside the room \(4, 5, 3\) m; give metres, not millimetres",
+    ),
     "array under the floor": ({f"{ARRAY}.position_m": [1.0, 1.3, -0.5]}, ARRAY, "microphone 1 .* outside the room"),
     "grid too fine": (
         {"grid.spacing_m": 0.01},
         "grid.spacing_m",
-        r"a grid of 60,000,000 nodes .* allowed are 50,000,000; use a spacing of 0.011 m or more",
+        r"expected at most 50,000,000 grid points, got 60,000,000; use a spacing of 0.011 m or more",
     ),
     "grid inside out": (
         {"grid.bounds_m": [[0, 4], [5, 0], [0, 3]]},
@@ -153,12 +169,12 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "array of two nodes": (
         {"nodes.other": {"device": {"name": "other"}, "arrays": {"north": [1, 2, 3, 4]}}},
         "nodes.other.arrays.north",
-        "already captured by node 'lab-pc'; an array belongs to one node",
+        "already captured by node 'lab-pc'; remove it from one of the nodes",
     ),
     "node's unknown array": (
         {f"{NODE}.arrays.west": [9, 10, 11, 12]},
         f"{NODE}.arrays.west",
-        "no such array; arrays are north, south",
+        "expected one of the arrays north, south, got 'west'; correct the name or add the array",
     ),
     "node without arrays": ({f"{NODE}.arrays": {}}, f"{NODE}.arrays", "at least 1 item"),
     "band above Nyquist": (
@@ -189,7 +205,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "arrays.fused",
         "'fused' is the map of all arrays together; rename it",
     ),
-    "warnings of one's own": ({"warnings": ["beware"]}, "warnings", "unknown key; take it away"),
+    "warnings of one's own": ({"warnings": ["beware"]}, "warnings", "unknown key 'warnings'; remove it"),
     "port of a node that is any": (
         {f"{NODE}.server": "tcp://127.0.0.1:*"},
         f"{NODE}.server",
@@ -205,7 +221,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "speed and temperature": (
         {"speed_of_sound_m_s": 343.0, "temperature_c": 20.0},
         "temperature_c",
-        "expected either speed_of_sound_m_s or temperature_c, got both; take one away",
+        "expected either speed_of_sound_m_s or temperature_c, got both; remove one",
     ),
     "temperature of an oven": ({"temperature_c": 200}, "temperature_c", "less than 80, got 200"),
     "min_arrays": ({"fusion.min_arrays": 3}, "fusion.min_arrays", "at most the number of arrays, 2, got 3"),
@@ -219,8 +235,12 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "device that is a name": ({f"{NODE}.device": "UMC"}, f"{NODE}.device", "expected a mapping such as .* got 'UMC'"),
     "joint array of one": ({JOINT: ["north"]}, JOINT, "at least 2 items"),
     "joint array of no list": ({JOINT: "north"}, JOINT, "valid tuple.*got 'north'"),
-    "joint array of nobody": ({JOINT: ["north", "west"]}, f"{JOINT}.west", "no such array; arrays are north, south"),
-    "joint array of one twice": ({JOINT: ["north", "north"]}, f"{JOINT}.north", "already joined in 'both'; take it"),
+    "joint array of nobody": (
+        {JOINT: ["north", "west"]},
+        f"{JOINT}.west",
+        "expected one of the arrays north, south, got 'west'; correct the name or add the array",
+    ),
+    "joint array of one twice": ({JOINT: ["north", "north"]}, f"{JOINT}.north", "already joined in 'both'; remove it"),
     "array in two joint ones": (
         {
             JOINT: ["north", "south"],
@@ -229,9 +249,13 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
             "joint.two": ["west", "north"],
         },
         "joint.two.north",
-        "already joined in 'both'; take it away here or there",
+        "already joined in 'both'; remove it from one of them",
     ),
-    "joint array that is called as one": ({"joint.south": ["north", "south"]}, "joint.south", "is called so already"),
+    "joint array that is called as one": (
+        {"joint.south": ["north", "south"]},
+        "joint.south",
+        "expected a name that no array has; rename it",
+    ),
     "joint array that is called as the map of all": ({"joint.fused": ["north", "south"]}, "joint.fused", "rename it"),
     "joint array of a bad name": ({"joint.the two": ["north", "south"]}, "joint.the two", "rename it"),
     "joint array of two nodes": (
@@ -297,7 +321,7 @@ def test_duplicate_key_names_the_second() -> None:
     text = text_of() + "room: {size_m: [1.0, 1.0, 1.0]}\n"
     last = len(text.splitlines())
     faults = dict(faults_of(text))
-    assert faults[f"site.yaml:{last}: room"] == "stands here twice and only the last would count; take one away"
+    assert faults[f"site.yaml:{last}: room"] == "expected each key once, got it twice; remove one"
 
 
 def test_spacing_that_is_suggested_does_pass() -> None:

@@ -20,7 +20,8 @@ from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.keys import node_keys
-from livessl.site.models import NodeConfig, Site
+from livessl.site.models import Site
+from livessl.site.node_models import NodeConfig
 
 DRAIN_NS: Final = 3_000_000_000
 """How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable
 from livessl.errors import DeviceError
 from livessl.recordings.assign import AssignedRecording, assign_files, looped
 from livessl.recordings.recording import MemoryRecording
-from livessl.site.models import SceneDeviceConfig, Site, WavDeviceConfig
+from livessl.site.models import Site
+from livessl.site.node_models import SceneDeviceConfig, WavDeviceConfig
 
 
 def scene_recordings(

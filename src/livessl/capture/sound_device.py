@@ -23,7 +23,7 @@ import numpy as np
 from livessl.clock import Clock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 WAIT_S: Final = 0.25
 """Longest silence of the iterator: the caller serves its network link at least so often."""

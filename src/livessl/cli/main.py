@@ -22,21 +22,15 @@ from livessl import __version__
 from livessl.cli import argument, progress
 from livessl.clock import Clock, PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import Event
-from livessl.errors import RunError, UseError
+from livessl.errors import ConfigError, Fault, RunError, UseError
 from livessl.site import keys as keyring
+from livessl.site import tokens
 from livessl.site.build.grid import search_grid
+from livessl.site.checks import unprotected_addresses
 from livessl.site.load import load_site
-from livessl.site.models import (
-    METHODS,
-    ConfigError,
-    Fault,
-    HttpConfig,
-    NodeConfig,
-    Site,
-    SoundDeviceConfig,
-    StoreConfig,
-    open_doors,
-)
+from livessl.site.models import METHODS, Site
+from livessl.site.node_models import NodeConfig, SoundDeviceConfig
+from livessl.site.server_models import HttpConfig, StoreConfig
 
 if TYPE_CHECKING:
     from livessl.lab.demo import Outcome
@@ -304,7 +298,7 @@ def _add_keys(command: Callable[..., Any]) -> None:
     sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` told it")
     sub = deed("token", _keys_token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
     sub.add_argument("--name", required=True, help="of the client, to revoke it by")
-    sub.add_argument("--role", choices=[str(role) for role in keyring.Role], default="viewer", help="default viewer")
+    sub.add_argument("--role", choices=[str(role) for role in tokens.Role], default="viewer", help="default viewer")
     sub = deed("revoke", _keys_revoke, "let a node or a client in no longer", "revoke --site site.yaml --token wall")
     which = sub.add_mutually_exclusive_group(required=True)
     which.add_argument("--node", metavar="NAME")
@@ -737,7 +731,7 @@ def _plan(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     try:
         site = load_site(arguments.site)
-        doors = open_doors(site)
+        doors = unprotected_addresses(site)
         if doors:
             raise ConfigError([Fault(f"{arguments.site}: {door.where}", door.what) for door in doors])
     except ConfigError as error:
@@ -796,7 +790,7 @@ def _keys_enrol(arguments: argparse.Namespace) -> int:
 
 
 def _keys_token(arguments: argparse.Namespace) -> int:
-    print(keyring.add_token(_tokens_file(arguments), arguments.name, arguments.role))
+    print(tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role))
     logging.info("this is the only time that the token is shown; a running server knows it once it is restarted")
     return OK
 
@@ -805,7 +799,7 @@ def _keys_revoke(arguments: argparse.Namespace) -> int:
     if arguments.node is not None:
         keyring.dismiss(_keys_folder(arguments), arguments.node)
     else:
-        keyring.revoke_token(_tokens_file(arguments), arguments.token)
+        tokens.revoke_token(_tokens_file(arguments), arguments.token)
     logging.info("a running server forgets it once it is restarted")
     return OK
 
@@ -813,8 +807,8 @@ def _keys_revoke(arguments: argparse.Namespace) -> int:
 def _keys_list(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     nodes = {} if site.keys is None else keyring.enrolled(site.file(site.keys))
-    tokens = site.server.http.tokens
-    clients = () if tokens is None else keyring.read_tokens(site.file(tokens)).clients
+    file = site.server.http.tokens
+    clients = () if file is None else tokens.read_tokens(site.file(file)).clients
     if arguments.json:
         told = [{"name": client.name, "role": str(client.role)} for client in clients]
         print(json.dumps({"nodes": {name: key.hex() for name, key in nodes.items()}, "clients": told}))

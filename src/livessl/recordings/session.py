@@ -11,8 +11,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from livessl.clock import utc_ns, utc_text
-from livessl.site.load import load_site, read_yaml
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.errors import ConfigError, Fault
+from livessl.site.findings import read_yaml
+from livessl.site.load import load_site
+from livessl.site.models import Site
 
 SESSION_FILE: Final = "session.yaml"
 SITE_FILE: Final = "site.yaml"

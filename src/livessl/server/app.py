@@ -19,6 +19,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import InvalidState
 
 from livessl.clock import Clock
+from livessl.errors import ConfigError, Fault
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -27,8 +28,10 @@ from livessl.server.fanout import Hub
 from livessl.server.receiver import BindError
 from livessl.server.sinks import Sinks
 from livessl.server.store import Store, StoreError
-from livessl.site.keys import file_stamp, read_tokens
-from livessl.site.models import ConfigError, Fault, HttpConfig, Site, open_doors
+from livessl.site.checks import unprotected_addresses
+from livessl.site.models import Site
+from livessl.site.server_models import HttpConfig
+from livessl.site.tokens import file_stamp, read_tokens
 
 SWITCH_S: Final = 0.0005
 """How long a thread may keep the interpreter from another one. What listens and searches leaves it for moments,
@@ -103,7 +106,7 @@ class Server:
         method: str | None = None,
         on_event: Callable[[JsonObject], None] | None = None,
     ) -> None:
-        faults = open_doors(site)
+        faults = unprotected_addresses(site)
         if faults:
             raise ConfigError(faults)
         if method is not None:
@@ -121,9 +124,10 @@ class Server:
         with ExitStack() as undo:  # what is open when a later step fails
             self._http = _listen(http.host, http.port)
             undo.callback(self._http.close)
-            self._sinks = Sinks(site.server.sinks)
+            sinks = (sink.model_copy(update={"path": str(site.file(sink.path))}) for sink in site.server.sinks)
+            self._sinks = Sinks(list(sinks))
             undo.callback(self._sinks.close)
-            self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
+            self._store = Store(site.file(site.server.events_db) if site.server.events_db else None)
             undo.callback(self._store.close)
             self.engine = Engine(site, clock, self._store, self._publish)
             undo.pop_all()

@@ -17,7 +17,7 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import running_server, scene_recordings, site_of
 
 TOO_STRICT = [positive_data_acceptance]

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from conftest import require
-from livessl.site.keys import RoleName, add_token
+from livessl.site.tokens import RoleName, add_token
 from small_site import Changes, running_server, site_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -28,7 +28,7 @@ from livessl.core.types import FRAME_NS
 from livessl.server import app
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import SMALL, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
