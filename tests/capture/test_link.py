@@ -15,7 +15,9 @@ import pytest
 import zmq
 
 from livessl import wire
-from livessl.capture.link import BACKLOG_FRAMES, BEHIND_NS, SILENT_NS, Dealer, Link
+from livessl.capture.dealer import Dealer
+from livessl.capture.link import SILENT_NS, Link
+from livessl.capture.outbox import BACKLOG_FRAMES, LATE_NS
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
@@ -184,7 +186,7 @@ def test_broken_connection_is_noticed_before_anything_goes_over_the_next() -> No
             link.send([frame(k) for k in range(1, 5)])
             together(link, router, lambda: len(router.frames()) == 4, "the frames")
         with Router(link.endpoint) as router:
-            link.tell("a greeting for another reason")
+            link.report("a greeting for another reason")
             together(link, router, lambda: router.got, "anything")
             first = router.got[0]
             assert isinstance(first, wire.Hello)
@@ -257,7 +259,7 @@ def test_a_mark_that_frames_follow_is_not_sent_after_them() -> None:
     dealer.full = True
     link.send([mark(1), frame(2), mark(2, array="south")])
     for _ in range(6):
-        clock.time_ns += BEHIND_NS // 5
+        clock.time_ns += LATE_NS // 5
         dealer.coming.append(wire.encode(wire.Ack("run-1", {})))
         link.service()
     dealer.full = False
@@ -402,15 +404,15 @@ def test_what_is_no_acknowledgement_is_left_alone(caplog: pytest.LogCaptureFixtu
         router.ack(north=1)
         together(link, router, lambda: link.pending == 0, "the acknowledgement")
         assert link.connected
-    assert "sent something else than an acknowledgement" in caplog.text
+    assert "sent an invalid message" in caplog.text
 
 
 def test_trouble_with_the_device_is_told_once() -> None:
     with Router() as router, linked(router.endpoint) as link:
         connect(link, router)
         for _ in range(3):
-            link.tell("input device 'UMC' is not connected")
-        link.tell(None)
+            link.report("input device 'UMC' is not connected")
+        link.report(None)
 
         def told() -> list[str | None]:
             """What was said, without repetitions."""
@@ -424,7 +426,7 @@ def test_trouble_with_the_device_is_told_once() -> None:
 def test_trouble_is_in_the_greeting_of_a_server_that_comes_later() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link:
-        link.tell("unplugged")
+        link.report("unplugged")
         with Router(endpoint) as router:
             together(link, router, router.hellos, "a greeting")
             assert router.hellos()[0].problem == "unplugged"
@@ -532,7 +534,7 @@ def remembered(ask: BackfillRequest) -> list[Message]:
 
 def test_what_the_server_asks_for_is_sent_and_not_kept() -> None:
     with Router() as router:
-        link = Link(router.endpoint, HELLO, SystemClock(), recent=remembered)
+        link = Link(router.endpoint, HELLO, SystemClock(), backfill=remembered)
         connect(link, router)
         assert not [m for m in router.got if isinstance(m, wire.Hello) and m.answers]  # an older server would refuse it
         router.say(wire.encode(wire.Request("run-1")))
@@ -565,7 +567,7 @@ def sounds(router: Router) -> list[Frame]:
 def test_another_server_is_not_taken_to_ask() -> None:
     clock = HandClock()
     with Router() as router:
-        link = Link(router.endpoint, HELLO, clock, recent=remembered)
+        link = Link(router.endpoint, HELLO, clock, backfill=remembered)
         connect(link, router)
         before = hellos(router)
         router.say(wire.encode(wire.Request("run-1")))

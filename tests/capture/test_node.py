@@ -215,7 +215,7 @@ def test_nobody_there_is_told_at_the_end() -> None:
         endpoint, site = there.receiver.endpoint, there.site
     with pytest.raises(UndeliveredError) as caught:
         capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", never)
-    assert str(caught.value).endswith(f"were never taken by the server at {endpoint}; is one running there?")
+    assert str(caught.value).endswith(f"were never acknowledged by the server at {endpoint}; is one running there?")
     assert int(str(caught.value).split()[0]) >= 36
 
 

@@ -174,7 +174,7 @@ class TestFinding:
 
     def test_ambiguous_name_prints_the_candidates(self, portaudio: FakePortAudio) -> None:
         portaudio.plug(("UMC1820: USB Audio (hw:1,0)", 8), ("UMC404HD (hw:2,0)", 4), ("Webcam", 1))
-        with pytest.raises(DeviceError, match=r"'umc'.*fits one input device, got 2: ALSA: UMC1820.*ALSA: UMC404HD"):
+        with pytest.raises(DeviceError, match=r"'umc'.*matches one input device, got 2: ALSA: UMC1820.*ALSA: UMC404HD"):
             device("umc").__enter__()
 
     def test_host_api_tells_namesakes_apart(self, portaudio: FakePortAudio) -> None:
@@ -195,7 +195,7 @@ class TestFinding:
             assert FakeStream.opened[0].wanted["device"] == 1
 
     def test_too_few_channels(self, portaudio: FakePortAudio) -> None:
-        with pytest.raises(DeviceError, match="'ALC257' has 2 input channels, arrays use channel 5; correct"):
+        with pytest.raises(DeviceError, match="'ALC257': expected at least 5 input channels, got 2; correct"):
             device("ALC257", channels=5).__enter__()
 
     def test_outputs_do_not_count(self, portaudio: FakePortAudio) -> None:

@@ -186,7 +186,7 @@ def test_full_disk_costs_nothing_while_memory_lasts(tmp_path: Path, caplog: pyte
         assert isinstance(wire.decode(data), Frame)
     spool.append(frame(8, frame_index=8))
     assert len(contents(spool)) == 8
-    assert caplog.text.count("kept in memory now: free space") == 1
+    assert caplog.text.count("kept in memory now; free space") == 1
     spool.close()
     again = Spool(tmp_path)
     assert [frame_index for _, frame_index in frame_indices(again)] == [8]

@@ -87,7 +87,7 @@ def test_folder_without_session(tmp_path: Path) -> None:
         ("version: 2026-02-31", "not valid YAML"),
         ("version: 1\npieces: []\n", r"pieces: .*at least 1 item"),
         ("version: 2\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z'}]\n", "version 1, got 2"),
-        ("version: 1\npieces: [{array: n, file: n.wav}]\n", "pieces.0.start_utc: .*required"),
+        ("version: 1\npieces: [{array: n, file: n.wav}]\n", "pieces.0.start_utc: missing; add it"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: yesterday}]\n", "expected RFC 3339 .*'yesterday'"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z', x: 1}]\n", "pieces.0.x"),
     ],

@@ -269,7 +269,7 @@ def test_trouble_of_a_device_is_seen_by_everyone() -> None:
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, "?kinds=arrays")
         link = connected(server, LIVE)
-        link.tell("input device 'UMC1820' is not connected")
+        link.report("input device 'UMC1820' is not connected")
 
         def told() -> bool:
             link.service()

@@ -43,7 +43,7 @@ DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
 class SpoolConfig(Model):
-    """Where a node keeps the frames that the server may still need: in a folder, or by default in memory."""
+    """Store for the frames that the server may still need: a folder, or by default the memory."""
 
     directory: FileName | None = None
     max_mb: Positive = 512.0

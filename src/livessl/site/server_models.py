@@ -51,6 +51,6 @@ class ServerConfig(Model):
 
 
 class StoreConfig(Model):
-    """How long events are kept, in days; None keeps them for ever."""
+    """Retention of events in days; None keeps them for ever."""
 
     retention_days: Positive | None = None
