@@ -1,4 +1,4 @@
-"""Arrays of one device processed as one array of all their microphones, and what may not be."""
+"""Joint arrays: several arrays of one device are processed as one array of all their microphones."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ NODELESS: Changes = {**JOINT, "nodes": {}}
 START_NS = 1_767_225_600_000_000_000
 
 NEAR_M = 0.5 * 343.0 / RATE_HZ
-"""Way of half a sample: what delays rounded to samples would err by. Ours are finer, and there is no reverberation."""
+"""Path of sound, in metres, in half a sample: the error of delays rounded to samples. Ours are finer, without
+reverberation."""
 
 
 def events_of(site: Site, parts: Sequence[AssignedRecording]) -> list[Event]:
@@ -74,7 +75,7 @@ def distances_m(events: Sequence[Event]) -> list[float]:
 
 
 def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
-    """All that an event says, to the last bit."""
+    """Return all fields of an event as exact values."""
     told: list[tuple[Any, ...]] = []
     for event in events:
         assert event.estimate is not None
@@ -84,7 +85,7 @@ def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
     return told
 
 
-def test_joint_arrays_are_one_array_of_all_their_microphones_to_the_last_bit() -> None:
+def test_joint_arrays_give_exactly_the_events_of_one_array() -> None:
     joint = events_of(site_of(JOINT), scene_recordings(START_NS))
     assert [event.heard_by for event in joint] == [("both",), ("both",)]
     assert max(distances_m(joint)) < NEAR_M
@@ -94,8 +95,8 @@ def test_joint_arrays_are_one_array_of_all_their_microphones_to_the_last_bit() -
     assert [fact[0] for fact in facts(summed)] != [fact[0] for fact in facts(joint)]
 
 
-def test_a_millisecond_between_the_arrays_is_another_place_for_joint_ones_only() -> None:
-    """What one clock is needed for: a summed pair of arrays does not notice."""
+def test_an_offset_of_a_millisecond_moves_the_events_of_joint_arrays_only() -> None:
+    """Joint arrays therefore need one clock; arrays whose maps are summed do not."""
     north, south = scene_recordings(START_NS)
     shifted = np.roll(heard("south"), RATE_HZ // 1000, axis=1)
     late = replace(south, recording=MemoryRecording("south", float(RATE_HZ), shifted), start_ns=START_NS)
@@ -103,15 +104,15 @@ def test_a_millisecond_between_the_arrays_is_another_place_for_joint_ones_only()
     assert min(distances_m(events_of(site_of(JOINT), [north, late]))) > 10 * NEAR_M
 
 
-def test_a_third_array_stays_alone() -> None:
+def test_array_outside_the_joint_one_stays_separate() -> None:
     third: Changes = {"arrays.west": {"geometry": {"tetrahedron": {"edge_m": 0.2}}, "position_m": [0.5, 2.6, 1.1]}}
     site = site_of({**JOINT, **third})
     assert [(spec.name, len(spec.microphones_m)) for spec in site.processed] == [("west", 4), ("both", 8)]
     assert [spec.name for spec in site.specs] == ["north", "south", "west"]
 
 
-def test_a_line_hears_them_as_one() -> None:
-    """What is heard by one of them is sound of all eight channels: one mask for all."""
+def test_pipeline_detects_activity_of_joint_arrays_together() -> None:
+    """Activity on one of them activates all eight channels."""
     samples = hiss(2.0, 8, level=1e-4)
     samples[4:, RATE_HZ : RATE_HZ + 3200] += hiss(0.2, 4, seed=1, level=0.2)  # at the southern ones only
     line = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
@@ -135,7 +136,7 @@ def refusal(site: Site, parts: Sequence[AssignedRecording]) -> str:
     return str(caught.value)
 
 
-def test_recordings_that_did_not_begin_together() -> None:
+def test_recordings_with_different_starts_are_refused() -> None:
     north, south = scene_recordings(START_NS)
     later = replace(south, start_ns=START_NS + 62_500)  # a sample
     assert refusal(site_of(JOINT), [north, later]) == (
@@ -144,14 +145,14 @@ def test_recordings_that_did_not_begin_together() -> None:
     ).replace("5.3", f"{north.recording.duration_s:g}")
 
 
-def test_recordings_of_different_length() -> None:
+def test_recordings_of_different_lengths_are_refused() -> None:
     north, south = scene_recordings(START_NS)
     short = MemoryRecording("south", float(RATE_HZ), heard("south")[:, :-1])
     said = refusal(site_of(JOINT), [north, replace(south, recording=short, start_ns=START_NS)])
     assert "expects recordings of one start, length and sampling rate" in said
 
 
-def test_array_without_a_recording() -> None:
+def test_missing_recording_of_a_member_is_refused() -> None:
     said = refusal(site_of(JOINT), scene_recordings(START_NS)[:1])
     assert said == (
         "array 'both': joint processing expects a recording of each of north, south, got none of 'south'; add it, or "
@@ -159,12 +160,12 @@ def test_array_without_a_recording() -> None:
     )
 
 
-def test_recording_of_all_and_of_one_besides() -> None:
+def test_recording_of_the_joint_array_and_of_a_member_is_refused() -> None:
     said = refusal(site_of(JOINT), [whole(), scene_recordings(START_NS)[0]])
     assert said == "array 'both': expected a recording of it or of 'north', got both; leave one out"
 
 
-def test_files_of_nobody_knows_which_device() -> None:
+def test_files_without_a_node_are_not_taken_for_one_device() -> None:
     said = refusal(site_of(NODELESS), scene_recordings(START_NS))
     assert said == (
         "array 'both': joint processing expects arrays sampled by one clock, got 'north' by north, 'south' by south; "
@@ -172,7 +173,7 @@ def test_files_of_nobody_knows_which_device() -> None:
     )
 
 
-def test_one_recording_of_all_needs_no_node() -> None:
+def test_one_recording_of_all_members_needs_no_node() -> None:
     joint = facts(events_of(site_of(JOINT), scene_recordings(START_NS)))
     assert facts(events_of(site_of(NODELESS), [whole()])) == joint
     parts = [
@@ -183,7 +184,7 @@ def test_one_recording_of_all_needs_no_node() -> None:
     assert facts(events_of(site_of(NODELESS), parts)) != joint
 
 
-def test_a_gap_in_one_recording_only() -> None:
+def test_gap_in_one_recording_only_is_refused() -> None:
     def spliced(array: str, *cuts: tuple[float, float]) -> AssignedRecording:
         samples = heard(array)
         stretches = [
@@ -261,7 +262,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [event["position_m"] for event in again] == [event["position_m"] for event in replayed]
 
 
-def test_simulation_is_of_the_arrays_themselves(files: Path) -> None:
+def test_simulation_writes_the_members_not_the_joint_array(files: Path) -> None:
     arguments = [
         "simulate",
         "--site",
@@ -286,17 +287,17 @@ def test_check_counts_joint_microphones(files: Path, capsys: pytest.CaptureFixtu
     ("option", "said"),
     [
         ("both=north,west", r"site.yaml: joint.both.west: expected one of the arrays north, south, got 'west'"),
-        ("north=north,south", r"site.yaml: joint.north: expected another name"),
+        ("north=north,south", r"site.yaml: joint.north: expected a name that no array has"),
     ],
 )
-def test_option_that_is_wrong(files: Path, capsys: pytest.CaptureFixture[str], option: str, said: str) -> None:
+def test_wrong_option_is_refused(files: Path, capsys: pytest.CaptureFixture[str], option: str, said: str) -> None:
     site = write_site(files)
     assert main(["locate", "--site", str(site), *wavs(files), "--joint", option]) == 2
     [complaint] = capsys.readouterr().err.splitlines()
     assert said in complaint
 
 
-def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> None:
+def test_server_accepts_a_joint_node_and_refuses_a_separate_one(files: Path) -> None:
     clock = SystemClock()
     with running_server(site_of(JOINT)) as server:
         endpoint = server.endpoint

@@ -1,4 +1,4 @@
-"""A capture node from sound to server: what it sends, how it ends, and what it says when nobody takes it."""
+"""A capture node from sound to server: its messages, its end, and its errors when the server does not take them."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ CLOCK = SystemClock()
 
 
 class PatientClock(SystemClock):
-    """A node by this clock never takes the server for gone.
+    """A clock by which the server is never silent.
 
-    By another it does where the machine stands still for two seconds, and sends again what the server has: frames come
-    twice then, and rightly.
+    With a real clock, a pause of the machine of two seconds makes the link reconnect and send frames again, as it
+    should, but these tests count frames.
     """
 
     def monotonic_ns(self) -> int:
-        """No interval passes."""
+        """Return a constant time."""
         return 0
 
 
 @dataclass
 class There:
-    """The real receiver, and all that came."""
+    """The real receiver, and all items that it has received."""
 
     receiver: Receiver
     items: list[Item] = field(default_factory=list)
@@ -62,7 +62,7 @@ class There:
         return site_of({"nodes.lab-pc.server": self.receiver.endpoint})
 
     def of(self, kind: type[Item]) -> list[Item]:
-        """What has come of a kind."""
+        """Return the received items of a kind."""
         self.items += self.receiver.take(1000, 0.001)
         return [item for item in self.items if isinstance(item, kind)]
 
@@ -81,7 +81,7 @@ def server() -> Iterator[There]:
 
 
 def sound() -> Float32Array:
-    """A second and a half, with a burst after the first second."""
+    """Return 1.5 s of quiet noise with a burst after the first second."""
     samples = hiss(1.5, level=1e-3)
     samples[:, RATE_HZ : RATE_HZ + RATE_HZ // 5] += hiss(0.2, seed=1, level=0.2)
     return samples
@@ -103,7 +103,7 @@ def replay(there: There, played: list[AssignedRecording], progress: Callable[[in
 
 
 def assert_whole(there: There, first: int = FIRST) -> None:
-    """Every message of both arrays is there, in order, the burst in frames."""
+    """Assert that every message of both arrays has arrived in order, and the burst as frames."""
     for array in ARRAYS:
         messages = there.messages(array)
         assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
@@ -111,7 +111,7 @@ def assert_whole(there: There, first: int = FIRST) -> None:
         assert messages[-1].frame_index == first + 29
 
 
-def test_session_arrives_whole_and_is_said_good_bye_to() -> None:
+def test_session_arrives_whole_and_ends_with_a_good_bye() -> None:
     with server() as there:
         progress: list[int] = []
         replay(there, parts(), progress.append)
@@ -124,7 +124,7 @@ def test_session_arrives_whole_and_is_said_good_bye_to() -> None:
         assert progress[-1] == START_NS + 1_500_000_000
 
 
-def test_session_waits_for_a_server_that_comes_later() -> None:
+def test_session_waits_for_a_server_that_starts_later() -> None:
     with server() as there:
         site = site_of({"server.bind": there.receiver.endpoint})
     played = Thread(
@@ -144,13 +144,13 @@ def test_session_waits_for_a_server_that_comes_later() -> None:
 
 
 def knocking() -> Float32Array:
-    """Forty seconds of noise, every other half second: nearly every frame is kept."""
+    """Return 40 s of noise that is loud every other half second, so that nearly every frame is sent."""
     samples = hiss(40.0, level=0.1)
     loud = np.arange(samples.shape[1]) // (RATE_HZ // 2) % 2 == 1
     return np.where(loud, samples, 1e-3 * samples).astype(np.float32)
 
 
-def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
+def test_session_is_not_played_faster_than_the_server_takes_messages() -> None:
     with server() as there:
         played = Thread(target=replay, args=(there, parts(samples=knocking())))
         played.start()
@@ -166,7 +166,7 @@ def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
 
 
 class Stuck(SystemClock):
-    """Time that passes while nothing is sent: a tenth of a second whenever somebody waits."""
+    """A clock that advances by a tenth of a second at each wait."""
 
     def __init__(self) -> None:
         self.waited_ns = 0
@@ -179,8 +179,8 @@ class Stuck(SystemClock):
         return super().sleep_until_ns(time_ns)
 
 
-def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
-    """Nor ended before: the server may ask for what is remembered. But where it settles nothing it goes on."""
+def test_session_is_not_played_far_ahead_of_the_settled_time() -> None:
+    """The server can thus still request frames; but the replay continues if the server settles nothing."""
     clock, reached = Stuck(), dict[int, int]()
     with server() as there:
         there.receiver.ingest.settled = dict.fromkeys(ARRAYS, FIRST + 20)
@@ -199,7 +199,7 @@ def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
 
 
 def test_recordings_arrive_whole() -> None:
-    """At real speed; they began a little ago, so that there is nothing to wait for."""
+    """Recordings play at real speed; these began a little ago, so that the test need not wait."""
     with server() as there:
         first = CLOCK.now_ns() // FRAME_NS - 30
         capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), PatientClock(), "run-1", never)
@@ -210,7 +210,7 @@ def test_recordings_arrive_whole() -> None:
             assert sorted(frames) == list(range(12, 30))  # live ones overtake what was cut before the connection
 
 
-def test_nobody_there_is_told_at_the_end() -> None:
+def test_absent_server_is_reported_at_the_end() -> None:
     with server() as there:
         endpoint, site = there.receiver.endpoint, there.site
     with pytest.raises(UndeliveredError) as caught:
@@ -219,7 +219,7 @@ def test_nobody_there_is_told_at_the_end() -> None:
     assert int(str(caught.value).split()[0]) >= 36
 
 
-def test_refusal_is_told() -> None:
+def test_refusal_is_reported() -> None:
     with server() as there:
         first = Link(there.receiver.endpoint, wire.Hello("other-pc", "run-0", {"north": 16000.0}), CLOCK)
         first.wait_connected(never)
@@ -237,7 +237,7 @@ def test_refusal_is_told() -> None:
         first.close(bye=True)
 
 
-def test_stopping_is_no_failure() -> None:
+def test_stopping_is_not_an_error() -> None:
     with server() as there:
         site = there.site
     asked = count()
@@ -246,7 +246,7 @@ def test_stopping_is_no_failure() -> None:
 
 
 class Scripted:
-    """A device whose troubles are written down: for each 50 ms None, or what is wrong instead of sound."""
+    """A device that follows a script: for each 50 ms either None, or a problem in place of sound."""
 
     name = "UMC1820"
     sample_rate_hz = float(RATE_HZ)
@@ -279,7 +279,7 @@ class Scripted:
 
 
 def captured(script: list[str | None], stop: Callable[[Scripted], bool]) -> tuple[There, Scripted]:
-    """What a server that knows the node gets of such a device."""
+    """Return what a connected server receives from such a device."""
     with server() as there:
         device = Scripted(script, lambda: there.of(Joined))
         capture_device(there.site, "lab-pc", device, CLOCK, "run-1", lambda: stop(device))
@@ -287,7 +287,7 @@ def captured(script: list[str | None], stop: Callable[[Scripted], bool]) -> tupl
         return there, device
 
 
-def test_device_is_entered_heard_and_left() -> None:
+def test_device_is_entered_captured_and_left() -> None:
     there, device = captured([None] * 30, lambda _: False)
     assert device.entered
     assert device.left
@@ -297,7 +297,7 @@ def test_device_is_entered_heard_and_left() -> None:
         assert there.messages(array)[-1].frame_index == FIRST + 29
 
 
-def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCaptureFixture) -> None:
+def test_device_problem_and_its_end_reach_the_server(caplog: pytest.LogCaptureFixture) -> None:
     unplugged = "input device 'UMC1820' is not connected"
     seen: set[str | None] = set()
     with server() as there:
@@ -320,7 +320,7 @@ def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCap
     assert "device 'UMC1820' delivers sound" in caplog.text
 
 
-def test_device_is_left_when_told_to_stop() -> None:
+def test_device_is_left_on_stop() -> None:
     heard: list[bool] = []
 
     def after_twenty(device: Scripted) -> bool:
@@ -332,7 +332,7 @@ def test_device_is_left_when_told_to_stop() -> None:
     assert all(m.frame_index < FIRST + 20 for m in there.messages("north"))
 
 
-def test_full_scale_and_beyond_arrive_as_they_are() -> None:
+def test_samples_beyond_full_scale_arrive_unchanged() -> None:
     samples = sound()
     samples[:, RATE_HZ] = 1.7
     with server() as there:

@@ -1,4 +1,4 @@
-"""From blocks to messages: the right channels, and the same messages however the blocks are cut."""
+"""Pipelines of recordings: arrays get their channels, and the messages do not depend on block boundaries."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SCENE = scene()
 
 
 def messages(cuts: Sequence[int], channels: dict[str, list[int]], site: Site = SITE) -> list[Message]:
-    """What a line makes of the scene, cut at these samples."""
+    """Return the pipeline's messages for the scene, cut at these samples."""
     line = make_pipeline(site, channels, float(RATE_HZ))
     made: list[Message] = []
     edges = [0, *sorted(cuts), SCENE.shape[1]]
@@ -53,7 +53,7 @@ WHOLE = messages([], BOTH)
 
 
 def by_array(made: Sequence[Message], array: str) -> list[bytes]:
-    """An array's messages, to the bit, but for what marks say of the device's clock: that comes of each stamp."""
+    """Return an array's messages as bytes, without the clock fields of marks, which depend on each stamp."""
     mine = [message for message in made if message.array == array]
     for message in mine:
         if isinstance(message, Mark):
@@ -93,17 +93,17 @@ def test_frames_hold_the_sound_of_their_channels() -> None:
 
 @given(st.lists(st.integers(1, SCENE.shape[1] - 1), unique=True, max_size=60))
 @settings(max_examples=40, deadline=None)
-def test_however_blocks_are_cut_the_frames_are_the_same(cuts: list[int]) -> None:
+def test_frames_do_not_depend_on_block_boundaries(cuts: list[int]) -> None:
     made = messages(cuts, BOTH)
     for array in BOTH:
         assert by_array(made, array) == by_array(WHOLE, array)
 
 
-def test_other_sound_gives_other_messages() -> None:
+def test_different_sound_gives_different_messages() -> None:
     assert by_array(WHOLE, "north") != by_array(WHOLE, "south")
 
 
-def test_played_messages_are_those_of_the_lines() -> None:
+def test_paced_messages_are_those_of_the_pipelines() -> None:
     lines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
     recordings = [TimedRecording(MemoryRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
     clock = UnpacedClock(START_NS)
@@ -118,8 +118,8 @@ def test_played_messages_are_those_of_the_lines() -> None:
         assert by_array(made, array) == by_array(WHOLE, array)
 
 
-def test_played_messages_of_a_short_recording_are_flushed() -> None:
-    """Shorter than the warm-up: everything comes at the end."""
+def test_messages_of_a_short_recording_are_flushed() -> None:
+    """The recording is shorter than the warm-up, so that all messages come at its end."""
     line = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
     short = TimedRecording(MemoryRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
     batches = [batch for _, batch in paced_messages([line], [short], UnpacedClock())]
@@ -127,7 +127,7 @@ def test_played_messages_of_a_short_recording_are_flushed() -> None:
     assert len(batches[-1]) == 5
 
 
-def test_line_names_its_arrays() -> None:
+def test_pipeline_names_its_arrays() -> None:
     assert make_pipeline(SITE, BOTH, float(RATE_HZ)).arrays == ["north", "south"]
 
 
@@ -150,7 +150,7 @@ NODELESS: Changes = {"nodes": {}}
         (NODELESS, "south", 4, [4, 3, 2, 1], [4, 3, 2, 1]),
     ],
 )
-def test_which_channels_are_an_arrays(
+def test_channels_of_an_array_are_chosen(
     changes: Changes, array: str, channels: int, wanted: list[int] | None, expected: list[int]
 ) -> None:
     assert recording_channels(site_of(changes), array, recording(channels), wanted) == expected
@@ -193,7 +193,7 @@ def test_which_channels_are_an_arrays(
         ),
     ],
 )
-def test_recording_that_does_not_fit(
+def test_recording_that_does_not_fit_is_refused(
     changes: Changes, one: MemoryRecording, wanted: list[int] | None, said: str
 ) -> None:
     with pytest.raises(DeviceError) as caught:
@@ -202,6 +202,6 @@ def test_recording_that_does_not_fit(
     assert said in str(caught.value)
 
 
-def test_channel_wanted_twice_is_refused() -> None:
+def test_channel_given_twice_is_refused() -> None:
     with pytest.raises(DeviceError, match="expected 4 different channel numbers"):
         recording_channels(SITE, "north", recording(4), [1, 2, 2, 4])

@@ -1,4 +1,4 @@
-"""What is recorded can be replayed: the same samples at the same times, gaps as gaps."""
+"""Recorded sessions replay with the same samples at the same times, and with their gaps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def block(samples: Float32Array, first: int, stop: int, jitter_ns: int = 0, *, o
 
 
 @pytest.mark.parametrize(("kind", "subtype"), [("flac", "PCM_24"), ("wav", "FLOAT")])
-def test_wav_part_becomes_a_session_without_loss(tmp_path: Path, kind: Literal["flac", "wav"], subtype: str) -> None:
+def test_wav_recording_becomes_a_session_without_loss(
+    tmp_path: Path, kind: Literal["flac", "wav"], subtype: str
+) -> None:
     heard = {name: sixteen_bits(hiss(1.01, seed=k)) for k, name in enumerate(BOTH)}
     wavs = {name: write_wav(tmp_path / f"{name}.wav", heard[name], subtype="PCM_16") for name in BOTH}
     out = tmp_path / "out"
@@ -64,7 +66,7 @@ def test_wav_part_becomes_a_session_without_loss(tmp_path: Path, kind: Literal["
     )
 
 
-def test_recording_stops_when_told(tmp_path: Path) -> None:
+def test_recording_stops_on_request(tmp_path: Path) -> None:
     part = AssignedRecording("north", MemoryRecording("hiss", float(RATE_HZ), hiss(5.0)), START_NS, (1, 2, 3, 4))
     clock = UnpacedClock(START_NS)
     assert record_playback(tmp_path, SITE, [part], clock, lambda: clock.now_ns() >= START_NS + 500_000_000)
@@ -72,7 +74,7 @@ def test_recording_stops_when_told(tmp_path: Path) -> None:
     assert read(tmp_path / piece.file).shape == (4, RATE_HZ // 2)
 
 
-def test_channels_of_the_device_in_microphone_order(tmp_path: Path) -> None:
+def test_channels_are_recorded_in_microphone_order(tmp_path: Path) -> None:
     samples = sixteen_bits(hiss(0.2, 8))
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, samples.shape[1]))
@@ -81,8 +83,8 @@ def test_channels_of_the_device_in_microphone_order(tmp_path: Path) -> None:
         assert_array_equal(read(session.path(piece)), samples[np.array(BOTH[piece.array]) - 1])
 
 
-def test_start_is_better_than_one_jittering_stamp(tmp_path: Path) -> None:
-    """Stamps jitter by up to 20 ms, later than true; the fit over 20 s leaves their mean, to a few ms."""
+def test_start_time_is_fitted_to_all_stamps(tmp_path: Path) -> None:
+    """Stamps are up to 20 ms late; the fit over 20 s is late by their mean, to a few ms."""
     samples = hiss(20.0, 8)
     rng = np.random.default_rng(3)
     step = RATE_HZ // 50
@@ -119,7 +121,7 @@ def follows_a_gap(one: Block, before: Block) -> bool:
     return one.first_index - before.first_index != int(before.samples.shape[1])
 
 
-def test_what_is_complete_survives_a_crash(tmp_path: Path) -> None:
+def test_complete_files_survive_a_crash(tmp_path: Path) -> None:
     samples = hiss(2.0, 8)
     recorder = Recorder(tmp_path, SITE, BOTH, float(RATE_HZ))
     recorder.push(block(samples, 0, 8000))
@@ -150,7 +152,7 @@ def test_nothing_recorded_leaves_no_session(tmp_path: Path) -> None:
 
 
 class Ailing:
-    """A device that stops for a while and says so."""
+    """A device that stops for a while and reports it."""
 
     name = "UMC1820"
     sample_rate_hz = float(RATE_HZ)
@@ -169,14 +171,14 @@ class Ailing:
             yield block(samples, first, first if self.problem else first + 1600)
 
 
-def test_trouble_of_the_device_is_told_when_it_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_device_problem_is_logged_when_it_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         record_device(Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)), Ailing(), never)
     assert caplog.messages == ["unplugged", "device 'UMC1820' delivers sound again"]
 
 
 def test_wav_has_no_limit_of_4_gib(tmp_path: Path) -> None:
-    """Only the container can tell: a file that long is none for a test."""
+    """The test checks only the container format, because a file of 4 GiB takes too long to write."""
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ), "wav") as recorder:
         recorder.push(block(hiss(0.5, 8), 0, 8000))
     assert soundfile.info(tmp_path / "north-000.wav").format == "RF64"
@@ -194,7 +196,7 @@ def test_more_than_eight_microphones_are_wav(tmp_path: Path) -> None:
     assert_array_equal(read(tmp_path / "north-000.wav"), samples[:9])
 
 
-def test_24_bits_keep_what_a_converter_gives(tmp_path: Path) -> None:
+def test_24_bits_hold_the_samples_of_a_converter(tmp_path: Path) -> None:
     samples = hiss(0.5, 8, level=1e-4)
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, 8000))
@@ -202,7 +204,7 @@ def test_24_bits_keep_what_a_converter_gives(tmp_path: Path) -> None:
     assert FileRecording(tmp_path / "north-000.flac").channels == 4
 
 
-def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
+def test_every_file_that_does_not_fit_is_reported(tmp_path: Path) -> None:
     wavs = {
         "north": write_wav(tmp_path / "few.wav", hiss(0.1, 3)),
         "south": tmp_path / "missing.wav",
@@ -217,7 +219,7 @@ def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
     assert "no such array; arrays are north, south" in west
 
 
-def test_wavs_begin_together_but_for_their_offset(tmp_path: Path) -> None:
+def test_files_begin_together_except_for_their_offset(tmp_path: Path) -> None:
     site = site_of({"arrays.south.wav_offset_s": -0.25})
     path = write_wav(tmp_path / "hiss.wav", hiss(0.1))
     parts = assign_files(site, {"north": path, "south": path}, start_ns=START_NS)

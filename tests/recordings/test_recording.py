@@ -1,4 +1,4 @@
-"""Recordings that stand in for devices: what is read, when it is said to have been heard, and what is refused."""
+"""Recordings read like devices: their samples, their time stamps, and files that are refused."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4,
         ("flac", "PCM_24", 2**-23),
     ],
 )
-def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
+def test_every_sample_format_is_read(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
     samples = hiss(0.33, channels=5)
     path = write_wav(tmp_path / f"sound.{ending}", samples, subtype=subtype)
     read = FileRecording(path)
@@ -74,11 +74,11 @@ def refusal(path: Path) -> str:
     return said
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file_is_refused(tmp_path: Path) -> None:
     assert refusal(tmp_path / "missing.wav").endswith("expected a WAV or FLAC file, cannot read it: no such file")
 
 
-def test_what_is_no_sound_file(tmp_path: Path) -> None:
+def test_file_without_sound_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes.wav"
     for content in (b"", b"dear diary", b"RIFF", bytes(1000)):
         path.write_bytes(content)
@@ -86,21 +86,21 @@ def test_what_is_no_sound_file(tmp_path: Path) -> None:
     assert "expected a WAV or FLAC file, cannot read it" in refusal(tmp_path)
 
 
-def test_zero_length(tmp_path: Path) -> None:
+def test_file_of_zero_length_is_refused(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "empty.wav", np.zeros((4, 0), dtype=np.float32))
     assert "got a file of zero length; record it again" in refusal(path)
 
 
 @pytest.mark.parametrize("subtype", ["FLOAT", "DOUBLE"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_samples_that_are_not_finite(tmp_path: Path, subtype: str, bad: float) -> None:
+def test_samples_that_are_not_finite_are_refused(tmp_path: Path, subtype: str, bad: float) -> None:
     samples = hiss(20.0)
     samples[2, 300_000] = bad  # beyond the first part that is scanned
     said = refusal(write_wav(tmp_path / "broken.wav", samples, subtype=subtype))
     assert "got NaN or infinity at sample 300000 of channel 3; export it again" in said
 
 
-def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
+def test_samples_beyond_the_range_of_a_converter_are_refused(tmp_path: Path) -> None:
     samples = hiss(20.0)
     samples[2, 300_000] = -1e6  # the largest that is taken
     FileRecording(write_wav(tmp_path / "loud.wav", samples))
@@ -110,7 +110,7 @@ def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT"])
-def test_silence(tmp_path: Path, subtype: str) -> None:
+def test_all_zero_file_is_refused(tmp_path: Path, subtype: str) -> None:
     samples = np.zeros((4, 300_001), dtype=np.float32)
     assert "got all-zero samples; was the right input recorded?" in refusal(
         write_wav(tmp_path / "silence.wav", samples, subtype=subtype)
@@ -119,7 +119,7 @@ def test_silence(tmp_path: Path, subtype: str) -> None:
     FileRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
 
 
-def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
+def test_file_removed_after_the_check_is_reported(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "sound.wav", hiss())
     read = FileRecording(path)
     path.unlink()
@@ -144,7 +144,7 @@ def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -
         assert_array_equal(joined(blocks), source.samples)
 
 
-def test_merged_comes_in_the_order_of_completion() -> None:
+def test_merged_blocks_come_in_order_of_completion() -> None:
     early, late, short = recording(0.5), recording(0.3, 22050, seed=1), recording(0.05, seed=2)
     recordings = [
         TimedRecording(late, START_NS + 133_000_000),
@@ -176,14 +176,14 @@ def test_no_block_is_played_before_it_is_complete() -> None:
 
 
 class Sleeper(UnpacedClock):
-    """It never sleeps longer than 70 ms at a time."""
+    """A clock whose single sleeps last at most 70 ms."""
 
     def sleep_until_ns(self, time_ns: int) -> bool:
         return super().sleep_until_ns(min(time_ns, self.now_ns() + 70_000_000)) and self.now_ns() >= time_ns
 
 
-def test_whoever_waits_for_sound_hears_of_it() -> None:
-    """Before the beginning and in a gap come empty blocks, so that a listener can look up."""
+def test_empty_blocks_come_while_no_block_is_due() -> None:
+    """Empty blocks come before the beginning and in a gap, so that a caller can do other work."""
     spliced = SplicedRecording(
         (TimedRecording(recording(0.04), START_NS), TimedRecording(recording(0.04), START_NS + NS))
     )
@@ -197,7 +197,7 @@ def test_whoever_waits_for_sound_hears_of_it() -> None:
     assert heard.count(0) == 14 + 13  # a second and 20 ms; then a second less 20 ms
 
 
-def test_looped_goes_on_without_a_gap() -> None:
+def test_looped_recording_has_no_gaps() -> None:
     once = recording(0.05)  # not a whole number of blocks
     looped = LoopedRecording(once)
     assert (looped.name, looped.channels, looped.sample_rate_hz) == ("hiss", 4, RATE_HZ)
@@ -211,7 +211,7 @@ def test_looped_goes_on_without_a_gap() -> None:
         index += block.samples.shape[1]
 
 
-def test_spliced_keeps_the_gap() -> None:
+def test_spliced_recording_keeps_the_gap() -> None:
     first, second = recording(0.1, seed=1), recording(0.1, seed=2)
     gap_ns = 2 * NS + 31_250  # 2 s and half a sample
     spliced = SplicedRecording((TimedRecording(first, START_NS), TimedRecording(second, START_NS + gap_ns)))
@@ -227,12 +227,12 @@ def test_spliced_keeps_the_gap() -> None:
         assert after[0].first_index == round(gap_ns * RATE_HZ / 1e9) > before[-1].first_index + 320
 
 
-def test_block_of_another_shape_cannot_be_made() -> None:
+def test_block_of_a_wrong_shape_is_refused() -> None:
     for samples in (np.zeros(4, dtype=np.float32), np.zeros((4, 5))):
         with pytest.raises(ValueError, match=re.escape("(channels, n) float32")):
             Block(0, samples, 0)  # type: ignore[arg-type]
 
 
-def test_soundfile_writes_what_these_tests_believe(tmp_path: Path) -> None:
+def test_soundfile_writes_the_formats_of_these_tests(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "s.wav", hiss(0.1), subtype="PCM_24")
     assert soundfile.info(path).subtype == "PCM_24"

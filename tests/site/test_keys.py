@@ -1,4 +1,4 @@
-"""Secrets on disk: made once, readable by nobody else, and never shown by an error."""
+"""Keys and tokens on disk: they are made once, readable only by their owner, and never shown by an error."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ def site(tmp_path: Path) -> Path:
 
 
 def keyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """What a `keys` command prints."""
+    """Return the output of a `keys` command."""
     assert main(["keys", *map(str, arguments)]) == 0
     return capsys.readouterr().out.strip()
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """What a `keys` command that is wrong use says."""
+    """Return the error of a `keys` command that is wrong use."""
     assert main(["keys", *map(str, arguments)]) == 2
     return capsys.readouterr().err
 
 
-def test_token_is_kept_as_a_hash_in_a_file_of_its_owner(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_token_is_stored_as_a_hash_in_a_private_file(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     token = keyed(capsys, "token", "--site", site, "--name", "wall")
     path = site.parent / "tokens.yaml"
     assert re.fullmatch(r"livessl_[A-Za-z0-9_-]{43}", token)
@@ -51,7 +51,7 @@ def test_token_is_kept_as_a_hash_in_a_file_of_its_owner(site: Path, capsys: pyte
     assert entry == {"name": "wall", "role": "viewer", "sha256": hashlib.sha256(token.encode()).hexdigest()}
 
 
-def test_tokens_are_told_apart_and_strangers_are_nobody(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tokens_identify_their_clients_and_others_identify_none(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = {role: keyed(capsys, "token", "--site", site, "--name", f"a-{role}", "--role", str(role)) for role in Role}
     known = tokens.read_tokens(site.parent / "tokens.yaml")
     for role, token in made.items():
@@ -64,7 +64,7 @@ def test_tokens_are_told_apart_and_strangers_are_nobody(site: Path, capsys: pyte
 
 
 def test_every_known_hash_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever measures the time learns neither which token matched nor how far."""
+    """The time of a comparison reveals neither which token matched nor how much of it."""
     compared: list[bytes] = []
 
     def compare(known: bytes, presented: bytes) -> bool:
@@ -77,7 +77,7 @@ def test_every_known_hash_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     assert compared == list(held)
 
 
-def test_revoked_token_is_nobody(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_revoked_token_has_no_client(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = site.parent / "tokens.yaml"
     first, second = (keyed(capsys, "token", "--site", site, "--name", name) for name in ("wall", "desk"))
     keyed(capsys, "revoke", "--site", site, "--token", "wall")
@@ -89,7 +89,7 @@ def test_revoked_token_is_nobody(site: Path, capsys: pytest.CaptureFixture[str])
         tokens.read_tokens(path)
 
 
-def test_name_of_a_token_is_taken_once(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_name_of_a_token_is_unique(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "token", "--site", site, "--name", "wall")
     said = refused(capsys, "token", "--site", site, "--name", "wall", "--role", "admin")
     assert "a token named 'wall' exists already" in said
@@ -97,7 +97,7 @@ def test_name_of_a_token_is_taken_once(site: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o666])
-def test_secrets_open_to_others_are_not_used(site: Path, mode: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_secrets_that_others_can_read_are_refused(site: Path, mode: int, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "token", "--site", site, "--name", "wall")
     keyed(capsys, "server", "--site", site)
     loaded = load_site(site)
@@ -124,7 +124,7 @@ def test_secrets_open_to_others_are_not_used(site: Path, mode: int, capsys: pyte
         ("SECRET", "make it with|valid dictionary"),
     ],
 )
-def test_wrong_tokens_file_says_where_but_not_what(tmp_path: Path, text: str, said: str) -> None:
+def test_error_in_a_tokens_file_names_the_place_but_not_the_value(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "tokens.yaml"
     path.touch(mode=0o600)
     path.write_text(text, encoding="utf-8")
@@ -134,9 +134,7 @@ def test_wrong_tokens_file_says_where_but_not_what(tmp_path: Path, text: str, sa
     assert caught.value.__cause__ is None
 
 
-def test_node_is_enrolled_by_what_the_commands_tell(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_node_is_enrolled_with_the_printed_keys(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there = tmp_path / "node"
     there.mkdir()
     node_site = write_site(there, KEYED)
@@ -179,7 +177,7 @@ def test_dismissed_node_is_not_enrolled(site: Path, capsys: pytest.CaptureFixtur
     assert "no node 'a' is enrolled; nodes are b" in refused(capsys, "revoke", "--node", "a", "--site", site)
 
 
-def test_list_tells_who_may_but_no_secret(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_shows_clients_but_no_secret(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     token = keyed(capsys, "token", "--site", site, "--name", "wall", "--role", "operator")
     key = keyed(capsys, "enrol", "lab-pc", "ab" * 32, "--site", site) or "ab" * 32
     told = json.loads(keyed(capsys, "list", "--site", site, "--json"))
@@ -196,7 +194,7 @@ def test_list_tells_who_may_but_no_secret(site: Path, capsys: pytest.CaptureFixt
         (["token", "--name", "a"], "expected the file that holds the tokens, got none; add tokens: tokens.yaml"),
     ],
 )
-def test_site_without_keys_says_what_to_add(
+def test_commands_on_a_site_without_keys_name_the_key_to_add(
     tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert said in refused(capsys, *arguments, "--site", write_site(tmp_path))
@@ -211,7 +209,9 @@ def test_site_without_keys_says_what_to_add(
         (lambda folder: (folder / "nodes.yaml").write_text("- a"), "expected NAME: PUBLIC KEY a line"),
     ],
 )
-def test_server_keys_that_cannot_be_used(site: Path, spoil: Any, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_server_keys_are_refused(
+    site: Path, spoil: Any, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     keyed(capsys, "server", "--site", site)
     spoil(site.parent / "keys")
     with pytest.raises(ConfigError, match=said) as caught:
@@ -219,7 +219,7 @@ def test_server_keys_that_cannot_be_used(site: Path, spoil: Any, said: str, caps
     assert "TOPSECRET" not in str(caught.value)
 
 
-def test_node_without_the_servers_key_says_where_it_comes_from(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_public_key_of_the_server_names_its_source(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, "node", "lab-pc", "--site", site)
     assert "server.public: the server's public key cannot be read: No such file or directory; `livessl keys" in said
     with pytest.raises(ConfigError, match="make it with `livessl keys node lab-pc`"):
@@ -248,14 +248,14 @@ def test_socket_open_to_the_network_needs_keys(bind: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost", "::1"])
-def test_this_machine_alone_needs_nothing(host: str) -> None:
+def test_loopback_addresses_need_no_protection(host: str) -> None:
     endpoint = f"tcp://{f'[{host}]' if ':' in host else host}:5570"
     assert unprotected_addresses(site_of({"server.http.host": host, "server.bind": endpoint})) == []
     assert unprotected_addresses(site_of({"server.bind": "ipc:///run/livessl"})) == []
 
 
 @pytest.mark.parametrize("command", ["serve", "check"])
-def test_open_server_does_not_start_and_says_all_that_is_to_do(
+def test_unprotected_server_does_not_start_and_reports_all_faults(
     tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_site(tmp_path, {"server.http.host": "0.0.0.0", "server.bind": "tcp://*:5570"})
@@ -265,7 +265,7 @@ def test_open_server_does_not_start_and_says_all_that_is_to_do(
     assert "server.bind: 'tcp://*:5570' can be reached from other machines" in said
 
 
-def test_tokens_in_the_clear_are_told_of() -> None:
+def test_unencrypted_tokens_are_warned_about() -> None:
     public = {"server.http.host": "0.0.0.0", "server.http.tokens": "tokens.yaml"}
     [warning] = site_of(public).warnings
     assert warning.startswith("server.http: tokens and positions travel unencrypted; set certificate and private_key")

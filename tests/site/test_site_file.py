@@ -1,4 +1,4 @@
-"""The site file: every fault is told in one sentence, with its line and place, and all of them at once."""
+"""The site file: each fault is one sentence with its line and place, and all faults are reported at once."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SQUARE_M = [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]
 
 
 def faults_of(text: str) -> list[tuple[str, str]]:
-    """Where and what, of every fault of a text."""
+    """Return place and sentence of every fault of a text."""
     with pytest.raises(ConfigError) as caught:
         parse_site(text, "site.yaml")
     return [(fault.where, fault.what) for fault in caught.value.faults]
 
 
 def line_of(text: str, path: str) -> int | None:
-    """Number of the line on which what a dotted path leads to stands, or the last part of it that is there."""
+    """Return the number of the line of a dotted path, or of the longest part of it that the text has."""
     lines = text.splitlines()
     number = None
     for level, key in enumerate(path.split(".")):
@@ -66,8 +66,8 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         f"{NODE}.device.sample_rate",
         "unknown key 'sample_rate'; did you mean 'sample_rate_hz'",
     ),
-    "our own key": ({"specs": []}, "specs", "unknown key"),
-    "another key of our own": ({"processed": []}, "processed", "unknown key"),
+    "key of the built site": ({"specs": []}, "specs", "unknown key"),
+    "another key of the built site": ({"processed": []}, "processed", "unknown key"),
     "missing key": ({"room": ...}, "room", "missing; add it"),
     "missing key inside": ({f"{NODE}.device.name": ...}, f"{NODE}.device.name", "missing; add it"),
     "missing device": ({f"{NODE}.device": ...}, f"{NODE}.device", "missing; add it"),
@@ -205,7 +205,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "arrays.fused",
         "'fused' is the map of all arrays together; rename it",
     ),
-    "warnings of one's own": ({"warnings": ["beware"]}, "warnings", "unknown key 'warnings'; remove it"),
+    "warnings as a key": ({"warnings": ["beware"]}, "warnings", "unknown key 'warnings'; remove it"),
     "port of a node that is any": (
         {f"{NODE}.server": "tcp://127.0.0.1:*"},
         f"{NODE}.server",
@@ -303,7 +303,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
 
 
 @pytest.mark.parametrize("name", ONE_FAULT)
-def test_fault_is_told_once_with_its_line_and_place(name: str) -> None:
+def test_fault_is_reported_once_with_its_line_and_place(name: str) -> None:
     changes, path, what = ONE_FAULT[name]
     text = text_of(changes)
     [(where, said)] = faults_of(text)
@@ -324,7 +324,7 @@ def test_duplicate_key_names_the_second() -> None:
     assert faults[f"site.yaml:{last}: room"] == "expected each key once, got it twice; remove one"
 
 
-def test_spacing_that_is_suggested_does_pass() -> None:
+def test_suggested_spacing_is_accepted() -> None:
     changes: Changes = {"grid.spacing_m": 0.004}
     [(_, said)] = faults_of(text_of(changes))
     suggested = re.search(r"use a spacing of ([0-9.]+) m", said)
@@ -335,7 +335,7 @@ def test_spacing_that_is_suggested_does_pass() -> None:
     faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
 
 
-def test_several_faults_come_at_once() -> None:
+def test_several_faults_are_reported_at_once() -> None:
     changes: Changes = {
         "colour": "red",
         f"{ARRAY}.position_m": [9.0, 1.3, 1.4],
@@ -357,7 +357,7 @@ def test_several_faults_come_at_once() -> None:
     }
 
 
-def test_one_array_that_is_wrong_accuses_nobody_else() -> None:
+def test_one_faulty_array_causes_no_other_faults() -> None:
     changes: Changes = {f"{ARRAY}.position_m": "here", "fusion.min_arrays": 2, "arrays.south.position_m": [9, 9, 9]}
     for more in ({}, {JOINT: ["north", "south"]}):
         places = [where.rpartition(": ")[2] for where, _ in faults_of(text_of(changes | more))]
@@ -382,13 +382,13 @@ def test_one_array_that_is_wrong_accuses_nobody_else() -> None:
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_text_that_is_no_site(text: str, where: str, what: str) -> None:
+def test_text_that_is_not_a_site_is_refused(text: str, where: str, what: str) -> None:
     [(at, said)] = faults_of(text)
     assert at == where
     assert said.startswith(what) or what in said
 
 
-def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_file_is_refused(tmp_path: Path) -> None:
     for path, reason in (
         (tmp_path / "missing.yaml", "No such file or directory"),
         (tmp_path, "Is a directory"),
@@ -421,7 +421,7 @@ def test_file_is_named_with_its_line(tmp_path: Path) -> None:
         ("date: 2026-02-31\n", "cannot be read"),
     ],
 )
-def test_geometry_file_that_is_wrong(tmp_path: Path, content: str, what: str) -> None:
+def test_invalid_geometry_file_is_refused(tmp_path: Path, content: str, what: str) -> None:
     (tmp_path / "array.yaml").write_text(content, encoding="utf-8")
     path = write_site(tmp_path, {f"{ARRAY}.geometry": "array.yaml"})
     with pytest.raises(ConfigError) as caught:
@@ -439,7 +439,7 @@ def microphones(changes: Changes, directory: Path | None = None) -> FloatArray:
 
 
 def posed_square(directory: Path, **turn: float) -> FloatArray:
-    """Where the microphones come to lie, from the array's origin."""
+    """Return the microphones' positions relative to the array's origin."""
     (directory / "square.yaml").write_text(yaml.safe_dump({"microphones_m": SQUARE_M}), encoding="utf-8")
     array = {"geometry": "square.yaml", "position_m": [2.0, 2.0, 1.0], "orientation_deg": turn}
     return microphones({ARRAY: array}, directory) - [2.0, 2.0, 1.0]
@@ -468,7 +468,7 @@ def test_absolute_microphones_are_the_posed_ones() -> None:
     assert np.abs(microphones({}) - posed_m).max() > 0.01
 
 
-def test_shapes() -> None:
+def test_shapes_have_their_channels_in_order() -> None:
     def shape(**shape: Any) -> FloatArray:
         count = next(iter(shape.values())).get("count", 4)
         array = {"geometry": shape, "position_m": [2.0, 2.0, 1.0]}
@@ -488,7 +488,7 @@ def test_shapes() -> None:
     assert_allclose(line, np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]]), atol=1e-12)
 
 
-def test_speed_of_sound() -> None:
+def test_speed_of_sound_is_given_or_follows_from_the_temperature() -> None:
     assert site_of().c_m_s == 343.0
     assert site_of({"speed_of_sound_m_s": 340.0}).c_m_s == 340.0
     # 331.3 sqrt(1 + 20 / 273.15) = 343.2
@@ -496,7 +496,7 @@ def test_speed_of_sound() -> None:
     assert site_of({"temperature_c": 0}).c_m_s == pytest.approx(331.3)
 
 
-def test_search_volume() -> None:
+def test_search_volume_is_the_room_or_the_bounds() -> None:
     assert search_grid(site_of()).shape == (16, 20, 12)
     box = search_grid(site_of({"grid.bounds_m": [[1, 2], [0, 5], [0, 3]]}))
     assert box.shape == (4, 20, 12)
@@ -506,13 +506,13 @@ def test_search_volume() -> None:
     assert plane.nodes_m()[:, 2] == pytest.approx(1.2)
 
 
-def test_bands() -> None:
+def test_array_may_have_a_band_of_its_own() -> None:
     site = site_of({f"{ARRAY}.band_hz": [200, 3000]})
     assert site.array("north").band_hz == (200.0, 3000.0)
     assert site.array("south").band_hz == (100.0, 6000.0)
 
 
-def test_zones() -> None:
+def test_zones_hold_positions_inside_and_on_their_surface() -> None:
     site = site_of({"zones.all": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})
     assert site.zones_of([0.5, 0.5, 1.0]) == ["door", "all"]
     assert site.zones_of([1.0, 1.0, 2.5]) == ["door", "all"]
@@ -529,10 +529,10 @@ HALL: Changes = {
     "nodes": {},
     "zones": {},
 }
-"""Six microphones around a whole ceiling as one array: a tenth of a metre is many periods of 6 kHz."""
+"""Six microphones around a whole ceiling as one array: a spacing of 0.1 m is many periods of 6 kHz."""
 
 
-def test_array_too_wide_for_the_grid_is_warned_of() -> None:
+def test_array_too_wide_for_the_grid_is_warned_about() -> None:
     [said] = site_of(HALL).warnings
     found = re.fullmatch(
         r"grid.spacing_m: array 'ceiling' is 12.5 m wide: up to 6000 Hz needs a spacing of about (\S+) m, got 0.1; "
@@ -546,34 +546,34 @@ def test_array_too_wide_for_the_grid_is_warned_of() -> None:
     assert "warnings" not in site_of(HALL).model_dump()
 
 
-def test_what_is_suggested_against_wide_arrays_helps() -> None:
+def test_suggested_band_removes_the_warning() -> None:
     assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [100, 1500]}}}).warnings == ()
     assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [4000, 16000]}}}).warnings == ()
 
 
-def test_joint_array_too_wide_for_the_grid_is_warned_of() -> None:
+def test_joint_array_too_wide_for_the_grid_is_warned_about() -> None:
     [said] = site_of({JOINT: ["north", "south"]}).warnings
     assert re.search("array 'both' is 2.8 m wide: .*; positions may be wrong: .* or take joint.both away", said)
 
 
-def test_usual_arrays_are_not_warned_of() -> None:
+def test_usual_arrays_cause_no_warning() -> None:
     half_a_metre = {"geometry": {"tetrahedron": {"edge_m": 0.5}}}
     assert site_of({"grid.spacing_m": 0.1, f"{ARRAY}.geometry": half_a_metre["geometry"]}).warnings == ()
     assert site_of().warnings == ()
 
 
-def test_node_of_an_array() -> None:
+def test_array_may_be_on_a_node_or_on_none() -> None:
     site = site_of({f"{NODE}.arrays.south": ...})
     assert site.node_of("north") == "lab-pc"
     assert site.node_of("south") is None
 
 
 @pytest.mark.parametrize("endpoint", ["tcp://*:5570", "tcp://127.0.0.1:*", "tcp://[::1]:1", "ipc:///run/livessl"])
-def test_good_endpoints(endpoint: str) -> None:
+def test_valid_endpoints_are_accepted(endpoint: str) -> None:
     assert site_of({"server.bind": endpoint}).server.bind == endpoint
 
 
-def test_channels_up_to_sixteen() -> None:
+def test_array_of_sixteen_channels_is_accepted() -> None:
     positions = [[1 + 0.1 * k, 1.0, 1.0] for k in range(16)]
     changes: Changes = {ARRAY: {"microphones_m": positions}, f"{NODE}.arrays.north": list(range(9, 25))}
     assert site_of(changes).array("north").microphones_m.shape == (16, 3)
