@@ -159,7 +159,11 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "expected 4 channels, one for each microphone of 'north', got 3",
     ),
     "too many channels": ({f"{NODE}.arrays.south": [5, 6, 7, 8, 9]}, f"{NODE}.arrays.south", "expected 4 .* got 5"),
-    "channel 0": ({f"{NODE}.arrays.north": [0, 1, 2, 3]}, f"{NODE}.arrays.north.0", "greater than or equal to 1"),
+    "channel 0": (
+        {f"{NODE}.arrays.north": [0, 1, 2, 3]},
+        f"{NODE}.arrays.north.0",
+        "from 1 on, got 0; channels count from 1",
+    ),
     "channel of two arrays": (
         {f"{NODE}.arrays.south": [4, 6, 7, 8]},
         f"{NODE}.arrays.south",
@@ -223,7 +227,13 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "temperature_c",
         "expected either speed_of_sound_m_s or temperature_c, got both; remove one",
     ),
-    "temperature of an oven": ({"temperature_c": 200}, "temperature_c", "less than 80, got 200"),
+    "temperature of an oven": ({"temperature_c": 200}, "temperature_c", "between -60 and 80 .*, got 200$"),
+    "temperature in Fahrenheit": (
+        {"temperature_c": 86},
+        "temperature_c",
+        r"between -60 and 80 .*, got 86; did you mean 30\.0, from Fahrenheit",
+    ),
+    "temperature of no number": ({"temperature_c": float("nan")}, "temperature_c", "between -60 and 80 .*, got nan"),
     "min_arrays": ({"fusion.min_arrays": 3}, "fusion.min_arrays", "at most the number of arrays, 2, got 3"),
     "unknown method": ({"fusion.method": "music"}, "fusion.method", "expected one of .*srp-phat.*, got 'music'"),
     "unknown device type": (

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, get_origin
 
-from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo, ValidatorFunctionWrapHandler
 
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec
@@ -25,6 +25,13 @@ def _ordered(bounds: Bounds) -> Bounds:
         if low > high:
             raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
     return bounds
+
+
+def _celsius(temperature_c: float) -> float:
+    if -60 < temperature_c < 80:
+        return temperature_c
+    hint = f"; did you mean {(temperature_c - 32) / 1.8:.1f}, from Fahrenheit?" if 80 <= temperature_c <= 130 else ""
+    raise ValueError(f"expected a temperature between -60 and 80 degrees Celsius, got {temperature_c:g}{hint}")
 
 
 class Room(Model):
@@ -180,7 +187,7 @@ class SiteFile(Model):
     site: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]
     room: Room
     speed_of_sound_m_s: Annotated[float, Field(gt=100, lt=2000)] | None = None
-    temperature_c: Annotated[float, Field(gt=-60, lt=80)] | None = None
+    temperature_c: Annotated[float, AfterValidator(_celsius)] | None = None
     band_hz: BandHz = (100.0, 6000.0)
     grid: GridConfig = GridConfig()
     arrays: Annotated[dict[str, ArrayConfig], Field(min_length=1)]

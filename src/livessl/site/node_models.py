@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from livessl.site.addresses import check_endpoint
 from livessl.site.fields import FileName, Model, Positive
+
+
+def _from_one(channel: int) -> int:
+    if channel < 1:
+        raise ValueError(f"expected a channel number from 1 on, got {channel}; channels count from 1")
+    return channel
+
+
+Channel = Annotated[int, AfterValidator(_from_one)]
+"""Channel of a device, counted from 1."""
 
 
 class SoundDeviceConfig(Model):
@@ -56,7 +66,7 @@ class NodeConfig(Model):
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
     spool: SpoolConfig = SpoolConfig()
-    arrays: Annotated[dict[str, list[Annotated[int, Field(ge=1)]]], Field(min_length=1)]
+    arrays: Annotated[dict[str, list[Channel]], Field(min_length=1)]
 
     @model_validator(mode="before")
     @classmethod

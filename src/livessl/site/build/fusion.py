@@ -35,7 +35,7 @@ def make_fusion(
     updates : bool
         Publish updates while an event lasts.
     live : bool
-        Serve live sound: answer sooner, and skip updates that are overdue.
+        True for live sound: wait less long for requested frames, and leave out updates that are overdue.
     clock_offsets : ClockOffsets or None
         Offsets that are known already; None to begin with unknown ones.
     each : Each or None
