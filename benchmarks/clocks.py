@@ -24,7 +24,7 @@ from livessl.lab.demo import SITE_FILE
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import FileRecording
-from livessl.simulate.scene import Scene, make_scene, read_sounds, render
+from livessl.simulation.scene import Scene, make_scene, read_sounds, render
 from livessl.site.build.fusion import make_fusion
 from livessl.site.load import load_site
 from livessl.site.models import Site

@@ -20,7 +20,7 @@ from livessl.core.types import Float32Array, Frame, Mark
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
-from livessl.simulate.scene import Scene, make_scene, render
+from livessl.simulation.scene import Scene, make_scene, render
 from livessl.site.load import parse_site
 from livessl.site.models import Site
 

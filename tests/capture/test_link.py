@@ -115,6 +115,7 @@ def connect(link: Link, router: Router) -> None:
     together(link, router, lambda: len(router.hellos()) > count, "a greeting")
     router.ack()
     together(link, router, lambda: link.connected, "the connection")
+    together(link, router, lambda: len(router.hellos()) > count + 1, "the greeting with the backlog")
 
 
 def free_endpoint() -> str:

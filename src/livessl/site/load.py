@@ -25,12 +25,12 @@ from livessl.site.findings import (
 from livessl.site.models import Site, SiteFile
 
 
-def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+def load_site(path: Path | str, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
     """Read and check a site file.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
     joint : mapping of name to array names, or None
         Joint arrays in addition to those of the file.
 
@@ -39,6 +39,7 @@ def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> S
     ConfigError
         With every fault found, each with its line.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
