@@ -115,9 +115,9 @@ def test_pipeline_detects_activity_of_joint_arrays_together() -> None:
     """Activity on one of them activates all eight channels."""
     samples = hiss(2.0, 8, level=1e-4)
     samples[4:, RATE_HZ : RATE_HZ + 3200] += hiss(0.2, 4, seed=1, level=0.2)  # at the southern ones only
-    line = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
-    assert line.arrays == ["both"]
-    made = line.push(Block(0, samples, START_NS)) + line.flush()
+    pipeline = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
+    assert pipeline.arrays == ["both"]
+    made = pipeline.push(Block(0, samples, START_NS)) + pipeline.flush()
     assert {message.array for message in made} == {"both"}
     frames = [message for message in made if isinstance(message, Frame)]
     assert len([frame for frame in frames if frame.active]) == 4
@@ -250,7 +250,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [piece.array for piece in read_session(session).pieces] == ["north", "south"]
     assert read_session(session).site().joint == {"both": ("north", "south")}
     capsys.readouterr()
-    # nothing but the grid of frames of 50 ms, which a recording's beginning may cut otherwise, is not the same
+    # only the 50 ms grid of frames may differ, because the recordings may begin elsewhere on it
     replayed = told(capsys, "replay", session, "--once", "--speed", "max")
     assert [event["arrays"] for event in replayed] == [["both"], ["both"]]
     for one, other in zip(replayed, joint, strict=True):

@@ -137,7 +137,7 @@ def test_extra_bytes_are_refused(message: WireMessage) -> None:
 def test_mutated_messages_raise_only_wire_errors(message: WireMessage) -> None:
     rng = random.Random(5)
     data = encode(message)[:600]
-    if isinstance(message, Frame):  # a short one, so that header and samples are both hit
+    if isinstance(message, Frame):  # short, so that mutations reach both header and samples
         short = Frame("north", 1, 1000, 0, 16000.0, np.zeros((4, 20), dtype=np.float32), 0.5, True)
         data = encode(short)
     refused = 0
@@ -146,7 +146,7 @@ def test_mutated_messages_raise_only_wire_errors(message: WireMessage) -> None:
         for _ in range(rng.randint(1, 4)):
             mutated[rng.randrange(len(mutated))] = rng.randrange(256)
         try:
-            encode(decode(bytes(mutated)))  # what is let in can be told on
+            encode(decode(bytes(mutated)))  # whatever decodes can be encoded again
         except WireError:
             refused += 1
     assert refused > 400

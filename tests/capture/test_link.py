@@ -72,13 +72,13 @@ class Router:
             self.got.append(wire.decode(data))
         return len(self.got) - before
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self._socket.send_multipart([self.peer, data])
 
     def ack(self, settled: int | None = None, **received: int) -> None:
         """Acknowledge frames by number, and settle those before a number."""
         frame_indices = {array: FIRST_RASTER + number for array, number in received.items()}
-        self.say(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
+        self.send(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
 
     def hellos(self) -> list[wire.Hello]:
         return [message for message in self.got if isinstance(message, wire.Hello)]
@@ -172,7 +172,7 @@ def test_restarted_server_gets_all_unacknowledged_frames() -> None:
         link.send([frame(5)])
         with Router(link.endpoint) as router:
             together(link, router, lambda: router.got, "anything")
-            router.say(wire.encode(wire.Ack("?", {}, who_are_you=True)))
+            router.send(wire.encode(wire.Ack("?", {}, who_are_you=True)))
             together(link, router, router.hellos, "a greeting")
             router.ack()
             together(link, router, lambda: router.frames()[-3:] == [3, 4, 5], "the frames")
@@ -220,7 +220,7 @@ def test_only_the_newest_mark_waits_for_the_server() -> None:
             assert router.marks("south") == [100]
             assert router.frames() == [101]
             assert router.marks("north") == [102]
-            # marks are not sent again: they say how things were
+            # marks are not sent again, because they describe a past state
             router.ack(north=101, south=100)
             together(link, router, lambda: link.pending == 0, "the acknowledgement")
 
@@ -288,16 +288,16 @@ def test_spool_is_bounded_and_dropped_frames_are_counted() -> None:
         assert link.pending * size <= MEMORY_BYTES < (link.pending + 2) * size
         with Router(endpoint) as router:
             connect(link, router)
-            kept = list(range(link.dropped + 1, count + 1))  # the oldest went
+            kept = list(range(link.dropped + 1, count + 1))  # the oldest were dropped
 
             def all_taken() -> bool:
                 link.service()
                 if router.read() and router.frames():
                     frame_indices = {"north": router.frames()[-1]}
-                    router.say(wire.encode(wire.Ack("run-1", frame_indices)))
+                    router.send(wire.encode(wire.Ack("run-1", frame_indices)))
                 return link.pending == 0
 
-            wait_until(all_taken, "what was kept")
+            wait_until(all_taken, "the backlog")
             assert router.frames() == kept
 
 
@@ -311,19 +311,23 @@ def test_live_sound_goes_first_and_the_backlog_follows_in_order_of_time() -> Non
             router.ack()
             together(link, router, lambda: link.connected, "the connection")
             link.send([frame(51), frame(52)])
-            together(link, router, lambda: len(router.frames()) == 2 + BACKLOG_FRAMES, "live sound, and some kept")
-            told = router.hellos()[-1].backlog
-            assert told == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 51)}
+            together(
+                link,
+                router,
+                lambda: len(router.frames()) == 2 + BACKLOG_FRAMES,
+                "live sound, and a part of the backlog",
+            )
+            assert router.hellos()[-1].backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 51)}
             assert router.frames() == [*range(1, BACKLOG_FRAMES + 1), 51, 52] or router.frames()[:2] == [51, 52]
             router.ack(north=10)
             together(link, router, lambda: len(router.frames()) == 12 + BACKLOG_FRAMES, "ten more")
             link.send([frame(53)])
-            together(link, router, lambda: 53 in router.frames(), "the live one")
-            assert 27 not in router.frames()  # it went before what was still kept
+            together(link, router, lambda: 53 in router.frames(), "the live frame")
+            assert 27 not in router.frames()  # the live frame preceded the rest of the backlog
             for k in (26, 42, 50):
                 router.ack(north=k)
-                together(link, router, lambda k=k: min(50, k + 16) in router.frames(), "more")  # type: ignore[misc]
-            together(link, router, lambda: router.hellos()[-1].backlog == {}, "the word that all is sent")
+                together(link, router, lambda k=k: min(50, k + 16) in router.frames(), "more of the backlog")  # type: ignore[misc]
+            together(link, router, lambda: router.hellos()[-1].backlog == {}, "the greeting without backlog")
             assert sorted(router.frames()) == list(range(1, 54))
             router.ack(north=53)
             together(link, router, lambda: link.pending == 0, "the acknowledgement")
@@ -350,7 +354,7 @@ def test_refusal_lasts_until_the_server_accepts() -> None:
     with Router() as router, linked(router.endpoint, clock) as link:
         assert link.refused is None
         together(link, router, router.hellos, "a greeting")
-        router.say(wire.encode(wire.Ack("run-1", {}, refused="array 'north' is captured already")))
+        router.send(wire.encode(wire.Ack("run-1", {}, refused="array 'north' is captured already")))
         together(link, router, lambda: link.refused, "the refusal")
         assert link.refused == "array 'north' is captured already"
         assert not link.connected
@@ -390,7 +394,7 @@ def test_node_without_sound_greets_once_a_second() -> None:
         clock.time_ns += 900_000_000
         link.service()
         router.read()
-        assert len(router.hellos()) == count + 1  # sound is sign enough
+        assert len(router.hellos()) == count + 1  # a frame is a sign of life, too
 
 
 def test_messages_other_than_acknowledgements_are_ignored(caplog: pytest.LogCaptureFixture) -> None:
@@ -399,7 +403,7 @@ def test_messages_other_than_acknowledgements_are_ignored(caplog: pytest.LogCapt
         link.send([frame(1)])
         together(link, router, router.frames, "the frame")
         for data in (b"", b"rubbish", wire.encode(wire.Bye("x", "y")), wire.encode(wire.Ack("run-0", {"north": 9}))):
-            router.say(data)
+            router.send(data)
         router.ack(south=3)
         router.ack(north=1)
         together(link, router, lambda: link.pending == 0, "the acknowledgement")
@@ -414,12 +418,12 @@ def test_device_problem_is_reported_once() -> None:
             link.report("input device 'UMC' is not connected")
         link.report(None)
 
-        def told() -> list[str | None]:
+        def reported() -> list[str | None]:
             """Return the reported problems without repetitions."""
             return [problem for problem, _ in groupby(hello.problem for hello in router.hellos())]
 
-        together(link, router, lambda: len(told()) >= 3, "the trouble and its end")
-        assert told() == [None, "input device 'UMC' is not connected", None]
+        together(link, router, lambda: len(reported()) >= 3, "the problem and its end")
+        assert reported() == [None, "input device 'UMC' is not connected", None]
         assert [hello.problem for hello in router.hellos()].count("input device 'UMC' is not connected") == 1
 
 
@@ -517,10 +521,10 @@ def test_link_works_while_the_clock_is_set_back() -> None:
                 link.close(bye=False)
 
 
-def remembered(ask: BackfillRequest) -> list[Message]:
+def remembered(request: BackfillRequest) -> list[Message]:
     return [
-        frame(0, frame_index=frame_index, array=ask.array, active=False)
-        for frame_index in range(ask.first, ask.last + 1)
+        frame(0, frame_index=frame_index, array=request.array, active=False)
+        for frame_index in range(request.first, request.last + 1)
     ]
 
 
@@ -528,19 +532,21 @@ def test_requested_frames_are_sent_and_not_kept() -> None:
     with Router() as router:
         link = Link(router.endpoint, HELLO, SystemClock(), backfill=remembered)
         connect(link, router)
-        assert not [m for m in router.got if isinstance(m, wire.Hello) and m.answers]  # an older server would refuse it
-        router.say(wire.encode(wire.Request("run-1")))
+        assert not [
+            m for m in router.got if isinstance(m, wire.Hello) and m.answers
+        ]  # an older server would refuse the field
+        router.send(wire.encode(wire.Request("run-1")))
         greets = [m for m in router.got if isinstance(m, wire.Hello)]
         together(link, router, lambda: hellos(router) > len(greets), "another greeting")
         last = [m for m in router.got if isinstance(m, wire.Hello)][-1]
         assert last.answers
-        router.say(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
+        router.send(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
         together(link, router, lambda: len(sounds(router)) == 3, "the answer")
         assert [(m.array, m.frame_index, m.sequence) for m in sounds(router)] == [
             ("south", k, 0) for k in (700, 701, 702)
         ]
         assert link.kept == link.pending == 0
-        router.say(wire.encode(wire.Request("another run", {"south": (700, 703)})))
+        router.send(wire.encode(wire.Request("another run", {"south": (700, 703)})))
         router.ack()
         link.service()
         router.read()
@@ -562,7 +568,7 @@ def test_another_server_is_not_assumed_to_know_requests() -> None:
         link = Link(router.endpoint, HELLO, clock, backfill=remembered)
         connect(link, router)
         before = hellos(router)
-        router.say(wire.encode(wire.Request("run-1")))
+        router.send(wire.encode(wire.Request("run-1")))
         together(link, router, lambda: hellos(router) > before, "another greeting")
         clock.time_ns += 2 * SILENT_NS
         before = hellos(router)
@@ -576,7 +582,7 @@ def test_node_without_backfill_does_not_announce_answers() -> None:
     with Router() as router:
         link = Link(router.endpoint, HELLO, SystemClock())
         connect(link, router)
-        router.say(wire.encode(wire.Request("run-1")))
+        router.send(wire.encode(wire.Request("run-1")))
         router.ack()
         together(link, router, lambda: link.connected, "an acknowledgement")
         link.close(bye=False)

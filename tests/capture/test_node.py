@@ -87,7 +87,7 @@ def sound() -> Float32Array:
     return samples
 
 
-def parts(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[AssignedRecording]:
+def recordings(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[AssignedRecording]:
     heard = sound() if samples is None else samples
     burst = MemoryRecording("burst", float(RATE_HZ), heard)
     return [AssignedRecording(array, burst, start_ns, (1, 2, 3, 4)) for array in ARRAYS]
@@ -114,11 +114,11 @@ def assert_whole(there: There, first: int = FIRST) -> None:
 def test_session_arrives_whole_and_ends_with_a_good_bye() -> None:
     with server() as there:
         progress: list[int] = []
-        replay(there, parts(), progress.append)
+        replay(there, recordings(), progress.append)
         wait_until(lambda: there.of(Left), "the good-bye")
         hello = wire.Hello("replay", "run-1", {"north": 16000.0, "south": 16000.0}, replay=True)
         assert there.items[0] == Joined(hello)
-        assert there.items[-1] == Left(replace(hello, answers=True))  # for the server knows how to ask
+        assert there.items[-1] == Left(replace(hello, answers=True))  # because the server has announced requests
         assert_whole(there)
         assert progress == sorted(progress)
         assert progress[-1] == START_NS + 1_500_000_000
@@ -129,7 +129,7 @@ def test_session_waits_for_a_server_that_starts_later() -> None:
         site = site_of({"server.bind": there.receiver.endpoint})
     played = Thread(
         target=send_session,
-        args=(site, site.server.bind, parts(), UnpacedClock(START_NS), PatientClock(), "run-1", never),
+        args=(site, site.server.bind, recordings(), UnpacedClock(START_NS), PatientClock(), "run-1", never),
     )
     played.start()
     receiver = Receiver(site, CLOCK)
@@ -152,10 +152,10 @@ def knocking() -> Float32Array:
 
 def test_session_is_not_played_faster_than_the_server_takes_messages() -> None:
     with server() as there:
-        played = Thread(target=replay, args=(there, parts(samples=knocking())))
+        played = Thread(target=replay, args=(there, recordings(samples=knocking())))
         played.start()
         wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.monotonic_ns()), "the node")
-        wait_until(there.receiver._queue.full, "a full queue")  # nobody takes anything
+        wait_until(there.receiver._queue.full, "a full queue")  # no message is taken
         assert played.is_alive()
         wait_until(lambda: there.of(Left), "the end", 30)
         played.join()
@@ -187,9 +187,9 @@ def test_session_is_not_played_far_ahead_of_the_settled_time() -> None:
 
         def note(end_ns: int) -> None:
             reached[clock.waited_ns] = end_ns - START_NS
-            there.of(Left)  # take what has come
+            there.of(Left)  # take the messages that have arrived
 
-        played = parts(samples=hiss(15.0, level=1e-3))
+        played = recordings(samples=hiss(15.0, level=1e-3))
         pace = UnpacedClock(START_NS)
         send_session(there.site, there.receiver.endpoint, played, pace, clock, "run-1", never, note)
     before, *_, after = (reached[waited_ns] for waited_ns in sorted(reached))
@@ -202,19 +202,19 @@ def test_recordings_arrive_whole() -> None:
     """Recordings play at real speed; these began a little ago, so that the test need not wait."""
     with server() as there:
         first = CLOCK.now_ns() // FRAME_NS - 30
-        capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), PatientClock(), "run-1", never)
+        capture_recordings(there.site, "lab-pc", recordings(first * FRAME_NS), PatientClock(), "run-1", never)
         wait_until(lambda: there.of(Left), "the good-bye")
         assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
         for array in ARRAYS:
             frames = [m.frame_index - first for m in there.messages(array) if isinstance(m, Frame)]
-            assert sorted(frames) == list(range(12, 30))  # live ones overtake what was cut before the connection
+            assert sorted(frames) == list(range(12, 30))  # live frames overtake those cut before the connection
 
 
 def test_absent_server_is_reported_at_the_end() -> None:
     with server() as there:
         endpoint, site = there.receiver.endpoint, there.site
     with pytest.raises(UndeliveredError) as caught:
-        capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", never)
+        capture_recordings(site, "lab-pc", recordings(), UnpacedClock(START_NS), "run-1", never)
     assert str(caught.value).endswith(f"were never acknowledged by the server at {endpoint}; is one running there?")
     assert int(str(caught.value).split()[0]) >= 36
 
@@ -226,14 +226,14 @@ def test_refusal_is_reported() -> None:
         sequence = count(1)
 
         def heard() -> bool:
-            first.send([mark(next(sequence))])  # who is silent for 2 s no longer holds its arrays
+            first.send([mark(next(sequence))])  # a node that is silent for 2 s loses its arrays
             return False
 
         start_ns = CLOCK.now_ns() - 2_000_000_000
         with pytest.raises(UndeliveredError, match="refused the sound: array 'north' is captured by node 'other-pc'"):
-            capture_recordings(there.site, "lab-pc", parts(start_ns), CLOCK, "run-1", heard)
+            capture_recordings(there.site, "lab-pc", recordings(start_ns), CLOCK, "run-1", heard)
         with pytest.raises(UndeliveredError, match="refused the sound: live nodes are connected"):
-            send_session(there.site, first.endpoint, parts()[1:], UnpacedClock(START_NS), CLOCK, "run-2", heard)
+            send_session(there.site, first.endpoint, recordings()[1:], UnpacedClock(START_NS), CLOCK, "run-2", heard)
         first.close(bye=True)
 
 
@@ -241,8 +241,10 @@ def test_stopping_is_not_an_error() -> None:
     with server() as there:
         site = there.site
     asked = count()
-    capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", lambda: next(asked) > 10)
-    send_session(site, "tcp://127.0.0.1:1", parts(), UnpacedClock(START_NS), CLOCK, "run-1", lambda: next(asked) > 15)
+    capture_recordings(site, "lab-pc", recordings(), UnpacedClock(START_NS), "run-1", lambda: next(asked) > 10)
+    send_session(
+        site, "tcp://127.0.0.1:1", recordings(), UnpacedClock(START_NS), CLOCK, "run-1", lambda: next(asked) > 15
+    )
 
 
 class Scripted:
@@ -336,7 +338,7 @@ def test_samples_beyond_full_scale_arrive_unchanged() -> None:
     samples = sound()
     samples[:, RATE_HZ] = 1.7
     with server() as there:
-        replay(there, parts(samples=samples))
+        replay(there, recordings(samples=samples))
         wait_until(lambda: there.of(Left), "the good-bye")
         frames = [item for item in there.items if isinstance(item, Frame)]
         assert max(float(frame.samples.max()) for frame in frames) == pytest.approx(1.7)

@@ -88,7 +88,7 @@ def test_clock_set_back_removes_later_frames(place: Path | None) -> None:
 def test_frames_outlive_the_process(tmp_path: Path) -> None:
     spool = filled(tmp_path)
     expected = contents(spool)
-    # no close: the node was killed
+    # not closed, as after a kill
     again = Spool(tmp_path)
     assert contents(again) == expected
     assert again.torn == 0

@@ -39,13 +39,13 @@ SCENE = scene()
 
 def messages(cuts: Sequence[int], channels: dict[str, list[int]], site: Site = SITE) -> list[Message]:
     """Return the pipeline's messages for the scene, cut at these samples."""
-    line = make_pipeline(site, channels, float(RATE_HZ))
+    pipeline = make_pipeline(site, channels, float(RATE_HZ))
     made: list[Message] = []
     edges = [0, *sorted(cuts), SCENE.shape[1]]
     for first, stop in pairwise(edges):
         stamp_ns = START_NS + round(first / RATE_HZ * 1e9)
-        made += line.push(Block(first, np.ascontiguousarray(SCENE[:, first:stop]), stamp_ns))
-    return made + line.flush()
+        made += pipeline.push(Block(first, np.ascontiguousarray(SCENE[:, first:stop]), stamp_ns))
+    return made + pipeline.flush()
 
 
 BOTH = {"north": [1, 2, 3, 4], "south": [5, 6, 7, 8]}
@@ -104,14 +104,14 @@ def test_different_sound_gives_different_messages() -> None:
 
 
 def test_paced_messages_are_those_of_the_pipelines() -> None:
-    lines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
+    pipelines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
     recordings = [TimedRecording(MemoryRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
     clock = UnpacedClock(START_NS)
     made: list[Message] = []
-    for known_ns, batch in paced_messages(lines, recordings, clock):
+    for known_ns, batch in paced_messages(pipelines, recordings, clock):
         assert known_ns == clock.now_ns()
         for message in batch:
-            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
+            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # no message precedes its sound
         made += batch
     assert known_ns == START_NS + 2_000_000_000
     for array in BOTH:
@@ -120,9 +120,9 @@ def test_paced_messages_are_those_of_the_pipelines() -> None:
 
 def test_messages_of_a_short_recording_are_flushed() -> None:
     """The recording is shorter than the warm-up, so that all messages come at its end."""
-    line = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
+    pipeline = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
     short = TimedRecording(MemoryRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
-    batches = [batch for _, batch in paced_messages([line], [short], UnpacedClock())]
+    batches = [batch for _, batch in paced_messages([pipeline], [short], UnpacedClock())]
     assert [len(batch) for batch in batches[:-1]] == [0] * (len(batches) - 1)
     assert len(batches[-1]) == 5
 
@@ -141,12 +141,12 @@ NODELESS: Changes = {"nodes": {}}
 @pytest.mark.parametrize(
     ("changes", "array", "channels", "wanted", "expected"),
     [
-        ({}, "south", 4, None, [1, 2, 3, 4]),  # as many as microphones: they are the array's
+        ({}, "south", 4, None, [1, 2, 3, 4]),  # as many channels as microphones
         ({}, "south", 8, None, [5, 6, 7, 8]),  # the whole device: the node's channels
         ({}, "south", 6, None, [1, 2, 3, 4]),  # not the whole device
         ({}, "north", 8, None, [1, 2, 3, 4]),
         (NODELESS, "south", 8, None, [1, 2, 3, 4]),
-        ({}, "south", 8, [8, 7, 2, 1], [8, 7, 2, 1]),  # as wanted
+        ({}, "south", 8, [8, 7, 2, 1], [8, 7, 2, 1]),  # the channels given
         (NODELESS, "south", 4, [4, 3, 2, 1], [4, 3, 2, 1]),
     ],
 )

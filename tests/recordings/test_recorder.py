@@ -92,7 +92,7 @@ def test_start_time_is_fitted_to_all_stamps(tmp_path: Path) -> None:
         for first in range(0, samples.shape[1], step):
             recorder.push(block(samples, first, first + step, jitter_ns=int(rng.uniform(0, 20e6))))
     for piece in read_session(tmp_path).pieces:
-        # mean 10 ms; the line's error at its end is 2 sigma / sqrt(n) = 2 * 5.8 ms / sqrt(1000) = 0.4 ms
+        # mean 10 ms; the fit's error at its end is 2 sigma / sqrt(n) = 2 * 5.8 ms / sqrt(1000) = 0.4 ms
         assert_allclose((piece.start_ns - START_NS) / 1e6, 10.0, rtol=0, atol=4 * 0.4)
 
 
@@ -100,11 +100,11 @@ def test_gap_begins_a_new_file(tmp_path: Path) -> None:
     samples = sixteen_bits(hiss(3.0, 8))
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, 8000))
-        recorder.push(block(samples, 8000, 8000))  # nothing, yet no gap
+        recorder.push(block(samples, 8000, 8000))  # an empty block is not a gap
         recorder.push(block(samples, 8000, 16000))
         assert recorder.recorded
         recorder.push(block(samples, 24000, 32000))  # samples are missing before it
-        recorder.push(block(samples, 32000, 40000, overflow=True))  # as here, nobody knows how many
+        recorder.push(block(samples, 32000, 40000, overflow=True))  # an unknown number is missing here
     session = read_session(tmp_path)
     north = [piece for piece in session.pieces if piece.array == "north"]
     assert [piece.file for piece in north] == ["north-000.flac", "north-001.flac", "north-002.flac"]
@@ -131,10 +131,10 @@ def test_complete_files_survive_a_crash(tmp_path: Path) -> None:
     assert starts(tmp_path) == dict.fromkeys(names[:2], 0)
     recorder.push(block(samples, 10000, 12000))
     second = round(10000 / RATE_HZ * 1e9)
-    told = starts(tmp_path)  # the recorder still runs
-    assert list(told) == names
-    assert told[names[0]] == told[names[1]] > 0  # all stamps of a stretch tell its start, once it is whole
-    assert told[names[2]] == told[names[3]] == second
+    written = starts(tmp_path)  # the recorder still runs
+    assert list(written) == names
+    assert written[names[0]] == written[names[1]] > 0  # a complete segment has a start fitted to all stamps
+    assert written[names[2]] == written[names[3]] == second
     assert FileRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
     recorder.__exit__(None, None, None)
     assert len(assign_sessions(SITE, [read_session(tmp_path)])) == 2

@@ -95,14 +95,14 @@ def test_file_of_zero_length_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_samples_that_are_not_finite_are_refused(tmp_path: Path, subtype: str, bad: float) -> None:
     samples = hiss(20.0)
-    samples[2, 300_000] = bad  # beyond the first part that is scanned
+    samples[2, 300_000] = bad  # beyond the first samples that are scanned
     said = refusal(write_wav(tmp_path / "broken.wav", samples, subtype=subtype))
     assert "got NaN or infinity at sample 300000 of channel 3; export it again" in said
 
 
 def test_samples_beyond_the_range_of_a_converter_are_refused(tmp_path: Path) -> None:
     samples = hiss(20.0)
-    samples[2, 300_000] = -1e6  # the largest that is taken
+    samples[2, 300_000] = -1e6  # the largest that is accepted
     FileRecording(write_wav(tmp_path / "loud.wav", samples))
     samples[2, 300_000] = -1.001e6
     said = refusal(write_wav(tmp_path / "broken.wav", samples))
@@ -154,13 +154,13 @@ def test_merged_blocks_come_in_order_of_completion() -> None:
     entries = list(merged_blocks(recordings))
     ends = [end_ns for end_ns, _, _ in entries]
     assert ends == sorted(ends)
-    for line, item in enumerate(recordings):
-        mine = [(end_ns, block) for end_ns, of, block in entries if of == line]
+    for index, item in enumerate(recordings):
+        mine = [(end_ns, block) for end_ns, of, block in entries if of == index]
         assert_array_equal(joined(block for _, block in mine), joined_of(item))
         assert mine[0][1].stamp_ns == item.start_ns
         for end_ns, block in mine:
             assert abs(end_ns - block.stamp_ns - block.samples.shape[1] / item.recording.sample_rate_hz * 1e9) <= 1
-    assert [line for _, line, _ in entries] != sorted(line for _, line, _ in entries)  # they do interleave
+    assert [index for _, index, _ in entries] != sorted(index for _, index, _ in entries)  # the recordings interleave
 
 
 def joined_of(item: TimedRecording) -> Float32Array:
@@ -217,7 +217,7 @@ def test_spliced_recording_keeps_the_gap() -> None:
     spliced = SplicedRecording((TimedRecording(first, START_NS), TimedRecording(second, START_NS + gap_ns)))
     assert spliced.duration_s == pytest.approx(2.1, abs=1e-4)
     assert (spliced.name, spliced.channels, spliced.sample_rate_hz) == ("hiss", 4, RATE_HZ)
-    for shift_ns in (0, 500 * NS):  # played when it was recorded, or at any other time
+    for shift_ns in (0, 500 * NS):  # at the time of recording, or at any other
         blocks = list(spliced.blocks(START_NS + shift_ns))
         before, after = blocks[:5], blocks[5:]
         assert_array_equal(joined(before), first.samples)

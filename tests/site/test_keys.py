@@ -85,7 +85,9 @@ def test_revoked_token_has_no_client(site: Path, capsys: pytest.CaptureFixture[s
     assert tokens.read_tokens(path).client(second) is not None
     assert "no token named 'wall'; tokens are desk" in refused(capsys, "revoke", "--site", site, "--token", "wall")
     keyed(capsys, "revoke", "--site", site, "--token", "desk")
-    with pytest.raises(ConfigError, match="make a token with `livessl keys token`"):  # none left: not open to all
+    with pytest.raises(
+        ConfigError, match="make a token with `livessl keys token`"
+    ):  # the last token was revoked, but the server stays closed
         tokens.read_tokens(path)
 
 
@@ -150,7 +152,7 @@ def test_node_is_enrolled_with_the_printed_keys(site: Path, tmp_path: Path, caps
     assert at_node.own.secret not in (at_node.own.public, at_server.own.secret)
     for path in (site.parent / "keys" / "server.secret", there / "keys" / "lab-pc.secret"):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert not list((site.parent / "keys").glob("lab-pc*"))  # the node's secret never was here
+    assert not list((site.parent / "keys").glob("lab-pc*"))  # the node's secret was never on the server
 
 
 def test_secrets_are_in_no_repr(site: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -341,7 +341,7 @@ def test_suggested_spacing_is_accepted() -> None:
     assert suggested is not None
     spacing_m = float(suggested[1])
     site_of(changes | {"grid.spacing_m": spacing_m})
-    # and it is not needlessly coarse: half of it has eight times the nodes
+    # it is not needlessly coarse: half of it has eight times the grid points
     faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
 
 
@@ -643,7 +643,7 @@ def test_any_value_anywhere_is_fine_or_a_config_error(
     data = yaml.safe_load(yaml.safe_dump(WHOLE))
     for path, new in ((place, value), (other, scalar)):
         holder = data
-        with suppress(KeyError, IndexError, TypeError):  # the first change may have taken the second's place away
+        with suppress(KeyError, IndexError, TypeError):  # the first change may have removed the second's place
             for key in path[:-1]:
                 holder = holder[key]
             holder[path[-1]] = new
