@@ -60,6 +60,11 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         f"{ARRAY}.positon_m",
         "unknown key 'positon_m'; did you mean 'position_m'",
     ),
+    "fault of an array that is named like a type": (
+        {"arrays.str": {"microphones_m": [[1, 1, 1], [1, 2, 1]], "colour": "red"}},
+        "arrays.str.colour",
+        "unknown key",
+    ),
     "misspelt key": ({"temprature_c": 20}, "temprature_c", "unknown key 'temprature_c'; did you mean 'temperature_c'"),
     "misspelt key of a device": (
         {f"{NODE}.device.sample_rate": 16000},
