@@ -170,7 +170,8 @@ def test_channels_of_an_array_are_chosen(
             {},
             recording(4),
             [0, 1, 2, 3],
-            "expected 4 different channel numbers from 1 to 4 for array 'north', got [0, 1, 2, 3]; channels count from 1",
+            "expected 4 different channel numbers from 1 to 4 for array 'north', got [0, 1, 2, 3]; channels "
+            "count from 1",
         ),
         (
             {},
