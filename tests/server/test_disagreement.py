@@ -10,8 +10,8 @@ import numpy as np
 from livessl.capture.node import capture_recordings
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
 from livessl.simulation.scene import Scene, Source, render
 from livessl.site.models import Site
@@ -30,7 +30,7 @@ def play(server: Server, true_site: Site, sounding: Scene) -> None:
     for seed, spec in enumerate(true_site.specs):
         samples = render(sounding, spec.microphones_m, seed=seed)
         parts.append(
-            Part(spec.name, Placed(ArrayRecording(spec.name, float(RATE_HZ), samples), start_ns), (1, 2, 3, 4))
+            AssignedRecording(spec.name, MemoryRecording(spec.name, float(RATE_HZ), samples), start_ns, (1, 2, 3, 4))
         )
     node = site_of({**THREE, "nodes.lab-pc.server": server.endpoint})
     capture_recordings(node, "lab-pc", parts, CLOCK, "run-1", lambda: False)

@@ -21,11 +21,12 @@ from livessl.capture.link import Link
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Frame
+from livessl.errors import ConfigError
 from livessl.server.receiver import Joined, Receiver
 from livessl.site import keys
 from livessl.site.keys import KeyPair, NodeKeys
-from livessl.site.models import ConfigError, Site
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.models import Site
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
@@ -336,9 +337,9 @@ def test_scene_is_located_with_keys_live_and_replayed(folder: Path) -> None:
     with running_server(keyed(folder)) as server:
         site = keyed(folder, {"nodes.lab-pc.server": server.endpoint})
         start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
-        capture_recordings(site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events, live")
-        send_session(site, server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
+        send_session(site, server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 4, "both events, replayed")
         with linked(server.endpoint, keys_of(folder, "stranger")) as link:
             until(link, lambda: server.parts.refusals.count("nodes"), "the refusal")

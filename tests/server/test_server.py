@@ -23,14 +23,14 @@ from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
-from livessl.recordings.recording import Placed, Spliced
+from livessl.recordings.recording import SplicedRecording
 from livessl.server import app, site_time
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
-from livessl.site.keys import add_token
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.tokens import add_token
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 START_NS = 1_767_225_600_000_000_000
@@ -70,7 +70,9 @@ class Subscriber:
 def play(server: Server, speed: float | None = None) -> None:
     """Send the scene as a replay, as fast as it goes or at a speed."""
     pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
-    send_session(site_of(), server.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False)
+    send_session(
+        site_of(), server.endpoint, scene_recordings(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
     server.wait_idle()
 
 
@@ -78,7 +80,7 @@ def offline_events() -> list[dict[str, Any]]:
     """Return the events of the scene, located without a server."""
     site = site_of()
     encoder = Messages(site, START_NS, utc=True)
-    outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
+    outputs = offline.run(site, scene_recordings(START_NS), UnpacedClock(START_NS))
     return [encoder.event(output) for output in outputs if isinstance(output, Event)]
 
 
@@ -155,8 +157,8 @@ def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
     twice = [
-        replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
-        for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
+        replace(first, recording=SplicedRecording((first.timed, second.timed)), start_ns=START_NS)
+        for first, second in zip(scene_recordings(START_NS), scene_recordings(START_NS + gap_ns), strict=True)
     ]
     with running_server(site_of()) as server:
         send_session(site_of(), server.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
@@ -267,7 +269,7 @@ def test_problem_of_a_device_reaches_subscribers() -> None:
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, "?kinds=arrays")
         link = connected(server, LIVE)
-        link.tell("input device 'UMC1820' is not connected")
+        link.report("input device 'UMC1820' is not connected")
 
         def told() -> bool:
             link.service()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from livessl.server.sinks import SinkError, Sinks
-from livessl.site.models import SinkConfig
+from livessl.site.server_models import SinkConfig
 
 EVENT = {"kind": "event", "id": "lab-1", "position_m": [1.0, 2.0, 3.0], "reason": "für immer"}
 

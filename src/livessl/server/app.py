@@ -9,11 +9,11 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.core.locate.peak_search import warm_up
+from livessl.errors import ConfigError
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -31,8 +31,9 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
 from livessl.server.tracks import Tracks
-from livessl.site.keys import file_stamp, read_tokens
-from livessl.site.models import ConfigError, Site, open_doors
+from livessl.site.checks import unprotected_addresses
+from livessl.site.models import Site
+from livessl.site.tokens import file_stamp, read_tokens
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread keeps the interpreter while another one waits for it. The fusion thread
@@ -143,7 +144,7 @@ class Server:
         receiver: Inbox | None = None,
         stepped: bool = False,
     ) -> None:
-        faults = open_doors(site)
+        faults = unprotected_addresses(site)
         if faults:
             raise ConfigError(faults)
         if method is not None:
@@ -162,9 +163,9 @@ class Server:
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
-            sinks = Sinks(site.server.sinks)
+            sinks = Sinks([sink.model_copy(update={"path": str(site.file(sink.path))}) for sink in site.server.sinks])
             undo.callback(sinks.close)
-            store = Store(Path(site.server.events_db) if site.server.events_db else None)
+            store = Store(site.file(site.server.events_db) if site.server.events_db else None)
             undo.callback(store.close)
             _compile_kernels()
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver)

@@ -12,8 +12,9 @@ from fastapi import FastAPI
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import InvalidState
 
+from livessl.errors import ConfigError, Fault
 from livessl.server.receiver import BindError, address_cure
-from livessl.site.models import ConfigError, Fault, HttpConfig, Site
+from livessl.site.server_models import HttpConfig
 
 SHUTDOWN_S: Final = 2
 """Time, in seconds, that open connections get to end."""

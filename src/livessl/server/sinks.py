@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from livessl.errors import RunError
 from livessl.server.api.encode import JsonObject
-from livessl.site.models import SinkConfig
+from livessl.site.server_models import SinkConfig
 
 _log = logging.getLogger(__name__)
 

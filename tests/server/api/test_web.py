@@ -28,8 +28,8 @@ from livessl.core.types import FRAME_NS
 from livessl.server import http
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
-from livessl.site.keys import add_token
-from small_site import SMALL, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.tokens import add_token
+from small_site import SMALL, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 RUNS = count()
@@ -55,14 +55,16 @@ def server() -> Iterator[Server]:
     with running_server(site_of({"zones.room": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})) as server:
         node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
-        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events")
         yield server
 
 
 def play(server: Server) -> None:
     """Let the server hear the scene as a replay."""
-    send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False)
+    send_session(
+        site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
     server.wait_idle()
 
 
@@ -528,7 +530,7 @@ def test_answers_say_where_their_time_went() -> None:
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
         node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
-        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events")
         told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
         now_ns = CLOCK.now_ns()
