@@ -14,6 +14,7 @@ from websockets.exceptions import InvalidState
 
 from livessl.errors import ConfigError, Fault
 from livessl.server.receiver import BindError, address_cure
+from livessl.site.models import Site
 from livessl.site.server_models import HttpConfig
 
 SHUTDOWN_S: Final = 2
