@@ -36,4 +36,5 @@ ruff check
 ruff format --check
 mypy
 lint-imports
-pytest "$@"
+python -c 'from livessl.core.locate.peak_search import warm_up; warm_up()' # compile once, not in every worker
+pytest -n 4 --dist loadfile "$@"

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from livessl.core.locate.map_estimator import MapEstimator
     from livessl.core.methods import METHODS
     from livessl.core.types import ArraySpec, Estimate, Event
+    from livessl.errors import ConfigError
     from livessl.offline import PowerMap, locate, power_map
     from livessl.simulation.of_site import Simulation, simulate
     from livessl.site.load import load_site
-    from livessl.site.models import ConfigError, Site
+    from livessl.site.models import Site
 
 __version__ = "0.2.0"
 
@@ -47,7 +48,7 @@ __all__ = [
 _HOMES: Final = {
     "METHODS": "core.methods",
     "ArraySpec": "core.types",
-    "ConfigError": "site.models",
+    "ConfigError": "errors",
     "Estimate": "core.types",
     "Estimator": "core.locate.estimator",
     "Event": "core.types",

@@ -70,7 +70,8 @@ def test_capture_without_a_server_fails_at_the_end(run: Run, recorded: Recorded,
     done = run("capture", "--site", site, "--node", "lab-pc", *recorded.wavs(), "--start-at", begin)
     assert done.code == 1
     assert re.search(
-        rf"livessl: error: \d+ messages were never taken by the server at {endpoint}; is one running there\?", done.err
+        rf"livessl: error: \d+ messages were never acknowledged by the server at {endpoint}; is one running there\?",
+        done.err,
     )
 
 

@@ -137,7 +137,7 @@ def test_all_unusable_recordings_are_reported_at_once(run: Run, recorded: Record
         ("north=1,2,3", "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3]"),
         ("north=1,2,3,5", "expected 4 different channel numbers from 1 to 4"),
         ("north=1,2,3,3", "expected 4 different channel numbers from 1 to 4"),
-        ("west=1,2,3,4", "channels of array 'west': no recording of it is given; there are north, south"),
+        ("west=1,2,3,4", "channels of array 'west': expected an array with a recording (north, south)"),
     ],
 )
 def test_invalid_channels_are_an_error(run: Run, recorded: Recorded, channels: str, message: str) -> None:

@@ -14,9 +14,10 @@ from cli.command_runs import Recorded, Run, interrupted, simulate_arguments
 from livessl.capture.link import Link
 from livessl.cli.main import main
 from livessl.clock import SystemClock
+from livessl.errors import ConfigError, Fault
 from livessl.lab import demo
 from livessl.recordings.session import read_session
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.site.models import Site
 from livessl.wire import Hello
 from small_site import RATE_HZ, running_server, site_of, write_site
 

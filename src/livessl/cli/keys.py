@@ -12,9 +12,9 @@ from typing import Any, Final
 from livessl.cli import argument
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json, add_site
-from livessl.site import keys
+from livessl.errors import ConfigError, Fault
+from livessl.site import keys, tokens
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, Fault
 
 ONE_OBJECT: Final = "print one JSON object"
 
@@ -50,7 +50,7 @@ def add_arguments(parser: Any) -> None:
     sub.add_argument("--name", required=True, help="name of the client, by which its token can be revoked")
     sub.add_argument(
         "--role",
-        choices=[str(role) for role in keys.Role],
+        choices=[str(role) for role in tokens.Role],
         default="viewer",
         help="what the client may do (default viewer)",
     )
@@ -113,7 +113,7 @@ def _enrol(arguments: argparse.Namespace) -> int:
 
 
 def _token(arguments: argparse.Namespace) -> int:
-    token = keys.add_token(_tokens_file(arguments), arguments.name, arguments.role)
+    token = tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role)
     print(json.dumps({"name": arguments.name, "role": arguments.role, "token": token}) if arguments.json else token)
     logging.info("store the token now, because it is shown only once; a running server accepts it within a second")
     return OK
@@ -124,7 +124,7 @@ def _revoke(arguments: argparse.Namespace) -> int:
         keys.dismiss(_folder(arguments), arguments.node)
         logging.info("node %r is no longer enrolled; restart a running server to disconnect it", arguments.node)
     else:
-        keys.revoke_token(_tokens_file(arguments), arguments.token)
+        tokens.revoke_token(_tokens_file(arguments), arguments.token)
         logging.info("a running server refuses the token within a second")
     return OK
 
@@ -132,8 +132,8 @@ def _revoke(arguments: argparse.Namespace) -> int:
 def _list(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     nodes = {} if site.keys is None else keys.enrolled(site.file(site.keys))
-    tokens = site.server.http.tokens
-    clients = () if tokens is None else keys.read_tokens(site.file(tokens)).clients
+    file = site.server.http.tokens
+    clients = () if file is None else tokens.read_tokens(site.file(file)).clients
     if arguments.json:
         listed = [{"name": client.name, "role": str(client.role)} for client in clients]
         print(json.dumps({"nodes": {name: key.hex() for name, key in nodes.items()}, "clients": listed}))

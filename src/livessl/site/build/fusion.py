@@ -1,4 +1,4 @@
-"""The fusion of a site: estimator, parameters and clock offsets. It loads everything that locates."""
+"""The fusion of a site: estimator, parameters and clock offsets. It imports everything that locates."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import Each
 from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
 from livessl.core.stream.segmenter import RECENT_S
+from livessl.errors import ConfigError, Fault
 from livessl.site.build.grid import search_grid
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.site.models import Site
 
 
 def make_clock_offsets(site: Site) -> ClockOffsets:
-    """What nobody knows yet of this site's clocks: one each node, or each array that is on none."""
+    """Return clock offsets, all still unknown: one clock for each node, and one for each array without a node."""
     return ClockOffsets({spec.name: site.node_of(spec.name) or spec.name for spec in site.processed}, site.c_m_s)
 
 
@@ -39,9 +40,21 @@ def make_fusion(
     clock_offsets: ClockOffsets | None = None,
     each: Each | None = None,
 ) -> Fusion:
-    """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
+    """Return a new fusion of this site's arrays.
 
-    `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
+    Parameters
+    ----------
+    site : Site
+    method : str or None
+        Registered name, or `MODULE:NAME`; None for the site's own.
+    updates : bool
+        Publish updates while an event lasts.
+    live : bool
+        True for live sound: wait less long for requested frames, and leave out updates that are overdue.
+    clock_offsets : ClockOffsets or None
+        Offsets that are known already; None to begin with unknown ones.
+    each : Each or None
+        Parallel `for_each` that correlates the arrays' frames; None for a plain loop.
     """
     f, a = site.fusion, site.activity
     parameters = FusionParameters(
