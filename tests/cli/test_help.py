@@ -142,3 +142,12 @@ def test_devices_lists_the_inputs(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert done.code == 0
     assert re.search(r"^ +8 +48000Hz  ALSA: UMC1820$", done.out, re.MULTILINE)
     assert json.loads(run("devices", "--json").out) == [asdict(found[0])]
+
+
+def test_evaluate_prints_the_files_written(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "livessl.cli.evaluate.evaluate", lambda *_: [Path("out/results.parquet"), Path("out/report.md")]
+    )
+    arguments = ["evaluate", "report", "--out", "out", "--with", "out"]
+    assert run(*arguments).out.split() == ["out/results.parquet", "out/report.md"]
+    assert json.loads(run(*arguments, "--json").out) == {"files": ["out/results.parquet", "out/report.md"]}

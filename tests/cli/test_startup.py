@@ -39,7 +39,7 @@ NEVER_LIVE = {"matplotlib", "pyarrow", "scipy.signal", "scipy.sparse", "scipy.sp
 def loaded(*arguments: str, code: int) -> set[str]:
     """Run a command that ends with `code`; return the names of all modules that it has imported."""
     done = subprocess.run([sys.executable, "-c", RUN, *arguments], capture_output=True, text=True, check=True)
-    got, names = json.loads(done.stdout)
+    got, names = json.loads(done.stdout.splitlines()[-1])
     assert got == code, done.stderr
     return set(names)
 

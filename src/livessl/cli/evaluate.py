@@ -28,22 +28,17 @@ REPORT: Final = "report"
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
         help=f"experiment of the paper; or {LOCALIZER}: compare the methods onset and srp-phat; or {REPORT}: simulate "
         "nothing, and report the folders of --with together",
     )
-    parser.add_argument(
-        "--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity"
-    )
-    parser.add_argument(
-        "--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav"
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results; an interrupted run resumes"
-    )
-    parser.add_argument(
+    add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
+    add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the results; an interrupted run resumes")
+    add(
         "--with",
         dest="others",
         action="append",
@@ -52,50 +47,46 @@ def add_arguments(parser: Any) -> None:
         metavar="DIR",
         help="--out of another experiment, to be reported together; may be repeated",
     )
-    parser.add_argument(
-        "--positions",
-        type=argument.positive,
-        metavar="N",
-        help="positions of the source (default: as many as in the paper)",
-    )
-    parser.add_argument(
-        "--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="random seed; the same seed gives the same results (default 0)"
-    )
-    parser.add_argument("--jobs", type=argument.positive, help="worker processes (default: one for each core)")
-    parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")
-    parser.add_argument("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
-    parser.add_argument(
+    add("--jobs", type=argument.positive, help="worker processes (default: one for each core)")
+    add("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")
+    add_json(parser, "print the paths of the files written as one JSON object")
+    _add_simulation(parser.add_argument_group("simulation"))
+    _add_localization(parser.add_argument_group("localization"))
+    _add_comparison(parser.add_argument_group(f"with {LOCALIZER}"))
+
+
+def _add_simulation(group: Any) -> None:
+    add = group.add_argument
+    add("--positions", type=argument.positive, metavar="N", help="source positions (default: as many as in the paper)")
+    add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
+    add("--seed", type=int, default=0, help="random seed; the same seed gives the same results (default 0)")
+    add("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
+    add(
         "--snr",
         metavar="DB[,DB…]",
         help="signal-to-noise ratio: white sensor noise this far below each recording's mean power; inf for no noise "
         f"(default: no noise); only {LOCALIZER} takes several",
     )
-    parser.add_argument("--grid", type=float, metavar="M", help="spacing of the search grid (default: the paper's)")
-    parser.add_argument(
-        "--sample-rate",
-        type=argument.positive,
-        default=16000,
-        metavar="HZ",
-        help="sampling rate of the simulation (default 16000)",
-    )
-    parser.add_argument(
-        "--segment", choices=("longest", "peak"), default="longest", help="segment to localize (default longest)"
-    )
-    parser.add_argument(
-        "--half", choices=HALVES, default="test", help=f"half of the sounds to play; for {LOCALIZER} (default test)"
-    )
-    parser.add_argument(
+    add("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="sampling rate (default 16000)")
+
+
+def _add_localization(group: Any) -> None:
+    add = group.add_argument
+    add("--grid", type=float, metavar="M", help="spacing of the search grid (default: the paper's)")
+    add("--segment", choices=("longest", "peak"), default="longest", help="segment to localize (default longest)")
+    add("--no-band-limit", action="store_true", help="do not limit the band to avoid spatial aliasing")
+
+
+def _add_comparison(group: Any) -> None:
+    add = group.add_argument
+    add("--half", choices=HALVES, default="test", help="half of the sounds to play (default test)")
+    add(
         "--scenario",
         default=ROOMS,
         metavar="NAME[,NAME…]",
-        help=f"for {LOCALIZER}: one or more of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); "
+        help=f"one or more of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); "
         f"or one of {', '.join(SESSIONS)} alone",
     )
-    add_json(parser, "print the paths of the files written as one JSON object")
-    parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band to avoid spatial aliasing")
 
 
 def run(arguments: argparse.Namespace) -> int:
