@@ -23,14 +23,14 @@ from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
-from livessl.recordings.recording import Placed, Spliced
-from livessl.server import engine
+from livessl.recordings.recording import SplicedRecording
+from livessl.server import app, site_time
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
-from livessl.site.keys import add_token
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.tokens import add_token
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 START_NS = 1_767_225_600_000_000_000
@@ -71,25 +71,25 @@ def play(server: Server, speed: float | None = None) -> None:
     """Send the scene as a replay, as fast as it goes or at a speed."""
     pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
     send_session(
-        site_of(), server.engine.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
+        site_of(), server.endpoint, scene_recordings(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
     )
-    server.engine.wait_idle()
+    server.wait_idle()
 
 
 def offline_events() -> list[dict[str, Any]]:
-    """The events of the scene without any server."""
+    """Return the events of the scene, located without a server."""
     site = site_of()
-    told = Messages(site, START_NS, utc=True)
-    outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
-    return [told.event(output) for output in outputs if isinstance(output, Event)]
+    encoder = Messages(site, START_NS, utc=True)
+    outputs = offline.run(site, scene_recordings(START_NS), UnpacedClock(START_NS))
+    return [encoder.event(output) for output in outputs if isinstance(output, Event)]
 
 
 def without_delays(event: dict[str, Any]) -> dict[str, Any]:
-    """An event but for what depends on how fast it was played, and on its place among the messages."""
+    """Return an event without what depends on the speed of the replay and on its place among the messages."""
     return {name: value for name, value in event.items() if name not in ("latency_s", "start_s", "seq", "v")}
 
 
-def test_replay_reaches_subscribers_and_rest_as_it_would_be_offline() -> None:
+def test_replay_gives_subscribers_and_rest_the_same_events_as_offline() -> None:
     with running_server(site_of()) as server:
         subscriber, events_only = Subscriber(server), Subscriber(server, "?kinds=event")
         play(server)
@@ -130,7 +130,7 @@ def test_replay_twice_gives_the_same() -> None:
     assert len(stored) == 2  # the same events, not four
 
 
-def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> None:
+def test_running_replay_has_maps_tracks_and_its_own_time() -> None:
     with running_server(site_of()) as server:
         playing = Thread(target=play, args=(server, 2.0))
         playing.start()
@@ -153,16 +153,16 @@ def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> Non
 
 
 def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nine seconds without sound at six times the speed, and a server that soon loses its patience."""
-    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    """Nine seconds without sound, at six times the speed, outlast the silence that ends a replay."""
+    monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
     twice = [
-        replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
-        for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
+        replace(first, recording=SplicedRecording((first.timed, second.timed)), start_ns=START_NS)
+        for first, second in zip(scene_recordings(START_NS), scene_recordings(START_NS + gap_ns), strict=True)
     ]
     with running_server(site_of()) as server:
-        send_session(site_of(), server.engine.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
-        server.engine.wait_idle()
+        send_session(site_of(), server.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
+        server.wait_idle()
         stored = httpx.get(f"{server.url}/api/v1/events").json()["events"][::-1]
     assert len(stored) == 4
     assert stored[0]["position_m"] == stored[2]["position_m"]
@@ -170,32 +170,32 @@ def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPa
 
 
 def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     with running_server(site_of()) as server:
         link = connected(server, REPLAY)
-        wait_until(lambda: server.engine.mode == "replay", "the replay")
+        wait_until(lambda: server.parts.site_time.mode == "replay", "the replay")
         link.close(bye=False)
-        server.engine.wait_idle()
-        assert server.engine.mode == "replay"
+        server.wait_idle()
+        assert server.parts.site_time.mode == "replay"
         live = connected(server, LIVE)
         assert live.connected
-        wait_until(lambda: server.engine.mode == "live", "live again")
+        wait_until(lambda: server.parts.site_time.mode == "live", "live again")
         live.close(bye=True)
 
 
 @pytest.mark.parametrize(("say_s", "said"), [(0.0, True), (5.0, False)], ids=["long", "short"])
-def test_start_that_waits_for_the_compiler_says_so(
+def test_start_that_waits_for_the_compiler_is_logged(
     say_s: float, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def compile_slowly() -> None:
         if said:
-            wait_until(lambda: "preparing the search" in caplog.text, "the message")
+            wait_until(lambda: "compiling kernels" in caplog.text, "the message")
 
-    monkeypatch.setattr(engine, "SAY_S", say_s)
-    monkeypatch.setattr(engine, "warm_up", compile_slowly)
+    monkeypatch.setattr(app, "NOTICE_S", say_s)
+    monkeypatch.setattr(app, "warm_up", compile_slowly)
     with caplog.at_level("INFO"), running_server(site_of()):
         pass
-    assert ("preparing the search" in caplog.text) == said
+    assert ("compiling kernels" in caplog.text) == said
 
 
 def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
         "server.events_db": str(tmp_path / "events.db"),
     }
     with running_server(site_of()) as server:
-        refused(changes | {"server.bind": server.engine.endpoint})
+        refused(changes | {"server.bind": server.endpoint})
     with pytest.raises(StoreError):
         Server(site_of(changes | {"server.events_db": str(tmp_path)}), CLOCK)
 
@@ -219,7 +219,7 @@ def test_events_are_written_as_lines(tmp_path: Path) -> None:
 
 
 def connected(server: Server, hello: wire.Hello) -> Link:
-    link = Link(server.engine.endpoint, hello, CLOCK)
+    link = Link(server.endpoint, hello, CLOCK)
     link.wait_connected(lambda: False)
     return link
 
@@ -246,7 +246,7 @@ def test_live_and_replay_do_not_mix(first: wire.Hello, second: wire.Hello, reaso
 
         wait_until(let_in, "the place that has become free")
         other.close(bye=True)
-        server.engine.wait_idle()
+        server.wait_idle()
 
 
 def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
@@ -265,11 +265,11 @@ def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
         link.close(bye=True)
 
 
-def test_trouble_of_a_device_is_seen_by_everyone() -> None:
+def test_problem_of_a_device_reaches_subscribers() -> None:
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, "?kinds=arrays")
         link = connected(server, LIVE)
-        link.tell("input device 'UMC1820' is not connected")
+        link.report("input device 'UMC1820' is not connected")
 
         def told() -> bool:
             link.service()
@@ -283,7 +283,7 @@ def test_trouble_of_a_device_is_seen_by_everyone() -> None:
 
 
 @pytest.mark.parametrize("query", ["", "?kinds=event"])
-def test_server_ends_while_someone_listens(query: str) -> None:
+def test_server_stops_while_a_client_listens(query: str) -> None:
     began_ns = CLOCK.now_ns()
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, query)
@@ -299,7 +299,7 @@ def refused(changes: Changes, directory: Path | None = None) -> str:
     return str(caught.value)
 
 
-def test_addresses_that_are_taken() -> None:
+def test_taken_addresses_are_errors_with_their_cures() -> None:
     with running_server(site_of()) as server:
         port = int(server.url.rpartition(":")[2])
         assert refused({"server.http.port": port}) == (
@@ -309,29 +309,29 @@ def test_addresses_that_are_taken() -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             free = int(probe.getsockname()[1])
-        said = refused({"server.bind": server.engine.endpoint, "server.http.port": free})
-        assert said.startswith(f"server.bind: cannot listen on {server.engine.endpoint}: Address already in use")
+        said = refused({"server.bind": server.endpoint, "server.http.port": free})
+        assert said.startswith(f"server.bind: cannot listen on {server.endpoint}: Address already in use")
     with running_server(site_of({"server.http.port": free})):
         pass  # the failed start has given its port back
 
 
-def test_method_of_the_command_line_is_the_sites() -> None:
+def test_method_of_the_command_line_replaces_the_sites() -> None:
     with running_server(site_of(), method="averaged") as server:
         assert httpx.get(f"{server.url}/api/v1/site").json()["method"] == "averaged"
         play(server)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         told = httpx.get(f"{server.url}/api/v1/events").json()["events"]
     assert {event["method"] for event in told} == {"averaged"}
 
 
-def test_host_that_is_not_ours(tmp_path: Path) -> None:
+def test_address_of_another_machine_is_an_error(tmp_path: Path) -> None:
     add_token(tmp_path / "tokens.yaml", "tests", "viewer")
     said = refused({"server.http.host": "192.0.2.1", "server.http.tokens": "tokens.yaml"}, tmp_path)
     assert said.startswith("server.http: cannot listen on 192.0.2.1:0: ")
     assert said.endswith("; write an address of this machine")
 
 
-def test_address_of_version_six() -> None:
+def test_server_listens_on_an_ipv6_address() -> None:
     with running_server(site_of({"server.http.host": "::1"})) as server:
         assert server.url.startswith("http://[::1]:")
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
@@ -341,19 +341,19 @@ def test_database_outlives_the_server(tmp_path: Path) -> None:
     site = site_of({"server.events_db": str(tmp_path / "events.db")})
     with running_server(site) as server:
         play(server)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
     with running_server(site) as server:
         stored = httpx.get(f"{server.url}/api/v1/events").json()["events"]
         assert len(stored) == 2
-        assert server.engine.events == 0
+        assert server.parts.event_log.published == 0
 
 
-def test_database_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_database_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"server\.events_db: cannot use"):
         Server(site_of({"server.events_db": str(tmp_path)}), CLOCK)
 
 
-def test_events_are_handed_on_too() -> None:
+def test_events_are_handed_to_the_embedding_program() -> None:
     taken: list[dict[str, Any]] = []
     server = Server(site_of(), CLOCK, on_event=taken.append)
     thread = Thread(target=server.run)
