@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from livessl.core.geometry import Grid
-    from livessl.core.locate.estimator import Estimator, Localization, Sound
+    from livessl.core.locate.estimator import Estimator, Localization, Sound, register
+    from livessl.core.locate.map_estimator import MapEstimator
     from livessl.core.methods import METHODS
     from livessl.core.types import ArraySpec, Estimate, Event
     from livessl.errors import ConfigError
@@ -31,6 +32,7 @@ __all__ = [
     "Event",
     "Grid",
     "Localization",
+    "MapEstimator",
     "PowerMap",
     "Simulation",
     "Site",
@@ -39,6 +41,7 @@ __all__ = [
     "load_site",
     "locate",
     "power_map",
+    "register",
     "simulate",
 ]
 
@@ -51,6 +54,7 @@ _HOMES: Final = {
     "Event": "core.types",
     "Grid": "core.geometry",
     "Localization": "core.locate.estimator",
+    "MapEstimator": "core.locate.map_estimator",
     "PowerMap": "offline",
     "Simulation": "simulation.of_site",
     "Site": "site.models",
@@ -58,6 +62,7 @@ _HOMES: Final = {
     "load_site": "site.load",
     "locate": "offline",
     "power_map": "offline",
+    "register": "core.locate.estimator",
     "simulate": "simulation.of_site",
 }
 """The module of each name, below `livessl`."""
