@@ -88,7 +88,7 @@ class Store:
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
-                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, frame index INTEGER)")
+                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
                 db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
                 db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
             if path is not None:
@@ -142,7 +142,7 @@ class Store:
 
     def settled(self, site: str) -> tuple[int | None, JsonObject | None]:
         """The frame index before which all sound of the site has become events that stay; what clocks were then."""
-        sql = "SELECT frame index, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
+        sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
         rows = self._reading.rows(sql, (site,))
         if not rows:
             return None, None
