@@ -157,7 +157,7 @@ def needed_role(method: str, path: str) -> Role | None:
 
     A route that is added later is guarded before anyone thinks of it.
     """
-    if method in _READING and (path in ("/", HEALTH) or path.startswith("/static/")):
+    if method in _READING and (path in ("/", "/docs", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
     if path == ACCESS:
         return Role.ADMIN

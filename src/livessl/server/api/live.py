@@ -1,0 +1,158 @@
+"""The two WebSockets: messages as JSON, and power maps as binary pictures."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from typing import Any, Final
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+
+from livessl.clock import Clock, utc_text
+from livessl.server.api import queries
+from livessl.server.api.encode import API_VERSION
+from livessl.server.engine import Engine
+from livessl.server.fanout import Hub, Subscription, Told
+from livessl.server.latency import Latency
+from livessl.server.maps import FUSED
+from livessl.site.models import Site
+
+LIVE: Final = "/api/v1/live"
+MAP: Final = "/api/v1/map"
+
+SEND_TIMEOUT_S: Final = 30.0
+"""A client that accepts no byte for this long, in seconds, is disconnected."""
+
+MAX_REASON: Final = 120
+"""Longest reason of a closing frame, in bytes; RFC 6455 allows 123."""
+
+POLICY_VIOLATION: Final = 1008
+"""Close code of RFC 6455 for a request that the server refuses."""
+
+
+def live_routes(site: Site, clock: Clock, engine: Engine, hub: Hub) -> APIRouter:
+    """The WebSocket of messages and the WebSocket of power maps."""
+    router = APIRouter()
+
+    @router.websocket(LIVE)
+    async def live(
+        socket: WebSocket,
+        kinds: str | None = None,
+        min_confidence: str = "0",
+        zone: str | None = None,
+        since_seq: str | None = None,
+    ) -> None:
+        await socket.accept()  # only a connected client can receive a reason
+        try:
+            _refuse_other_pages(socket)
+            queries.check_parameters(socket.query_params, queries.LiveParameters)
+            wanted = queries.live_filter(site, kinds, min_confidence, zone)
+            since = queries.message_number("since_seq", since_seq)
+        except ValueError as error:
+            await _refuse(socket, error)
+            return
+        arrays = await asyncio.to_thread(engine.arrays)
+        subscription = hub.subscribe(wanted, since)
+        hello = {
+            "v": API_VERSION,
+            "seq": hub.last_seq,
+            "kind": "hello",
+            "now_utc": utc_text(engine.now_ns()),
+            "site": site.site,
+            "mode": engine.mode,
+            "last_seq": hub.last_seq,
+            "role": str(socket.scope["client_role"]),
+            "arrays": arrays,
+        }
+        try:
+            await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
+        finally:
+            hub.unsubscribe(subscription)
+
+    @router.websocket(MAP)
+    async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
+        await socket.accept()
+        try:
+            _refuse_other_pages(socket)
+            queries.check_parameters(socket.query_params, queries.MapParameters)
+            chosen = queries.chosen_views(site, array, views)
+        except ValueError as error:
+            await _refuse(socket, error)
+            return
+        news, loop = asyncio.Event(), asyncio.get_running_loop()
+
+        def drawn() -> None:
+            loop.call_soon_threadsafe(news.set)
+
+        with engine.maps.watching(array, chosen, drawn):
+            await _while_connected(socket, _send_pictures(socket, engine, array, chosen, news))
+
+    return router
+
+
+def _refuse_other_pages(socket: WebSocket) -> None:
+    """Raise ValueError if a page of another server opened the WebSocket: browsers do not prevent that themselves."""
+    origin = socket.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
+        raise ValueError("origin: pages of other servers may not listen")
+
+
+async def _refuse(socket: WebSocket, error: ValueError) -> None:
+    reason = str(error).encode()[:MAX_REASON].decode(errors="ignore")
+    await socket.close(POLICY_VIOLATION, reason)
+
+
+async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -> None:
+    """Do the work until it ends or the client disconnects."""
+    tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
+    try:
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises the exception that ended the task, if there was one
+
+
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, clock: Clock, latency: Latency) -> None:
+    told = first
+    while await _sent(socket.send_text(told.text)):
+        if told.told_ns is not None:
+            latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+        if subscription.lags:  # otherwise the whole queue is sent in one turn, even to a client that has disconnected
+            await asyncio.sleep(0)
+        told = await subscription.next()
+
+
+async def _send_pictures(
+    socket: WebSocket, engine: Engine, array: str, views: tuple[str, ...], news: asyncio.Event
+) -> None:
+    """Send each window's pictures as they are drawn; a slow client skips windows."""
+    shown = None
+    while True:
+        news.clear()
+        drawn = engine.maps.drawn
+        pictures = [] if drawn is None else [drawn.pictures.get((array, view)) for view in views]
+        if drawn is not None and drawn.window is not shown and all(pictures):
+            shown = drawn.window
+            for picture in pictures:
+                if picture is not None and not await _sent(socket.send_bytes(picture.packed(engine.now_ns()))):
+                    return
+        await news.wait()
+
+
+async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
+    """Whether the client accepted a message within `SEND_TIMEOUT_S`."""
+    try:
+        async with asyncio.timeout(SEND_TIMEOUT_S):
+            await sending
+    except (TimeoutError, WebSocketDisconnect, RuntimeError):
+        return False
+    return True
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Read and discard the client's messages, so that its disconnection is noticed."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
