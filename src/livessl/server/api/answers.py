@@ -245,7 +245,7 @@ class ValidationError(BaseModel):
     )
     type: str = Field(description="Kind of the fault.", examples=["less_than_equal", "value_error"])
     input: Any = Field(default=None, description="The value that was received.")
-    ctx: dict[str, Any] | None = Field(default=None, description="Limits that the value was checked against.")
+    ctx: dict[str, Any] = Field(default={}, description="Limits that the value was checked against.")
 
 
 class HTTPValidationError(BaseModel):

@@ -73,7 +73,7 @@ def create_app(
         routes.event_routes(site, store),
         routes.map_route(site, engine),
     ):
-        app.include_router(router, dependencies=strict)
+        app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(engine, hub, store, sinks))
     app.include_router(live_routes(site, clock, engine, hub))
     app.include_router(asyncapi_route(site, access))

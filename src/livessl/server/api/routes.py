@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, HTTPException, Query, Request, Response
+from pydantic import WithJsonSchema
 
 from livessl import __version__
 from livessl.clock import utc_text
@@ -27,26 +28,21 @@ from livessl.site.models import Site
 
 _log = logging.getLogger(__name__)
 
+_DATE_TIME: Final = {"type": "string", "format": "date-time"}
+_BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _MAP_HEADERS: Final = {
-    name: {"description": description, "schema": {"type": "string"}, "example": example}
-    for name, description, example in (
-        ("X-Map-Shape", "Lengths of the axes, separated by commas: rows,columns, or x,y,z of a volume.", "200,160"),
-        ("X-Map-Bounds-M", "Lowest and highest coordinate of each axis in metres, in the shape's order.", "0,10,0,8"),
-        ("X-Map-Time-Utc", "RFC 3339 time of the middle of the window.", "2026-01-31T12:00:00.050000Z"),
-        ("X-Map-Age-S", "Age of the window in seconds.", "0.250"),
-        ("X-Map-Min", "Smallest power.", "0.0123"),
-        ("X-Map-Max", "Largest power.", "0.873"),
+    name: {"description": description, "schema": schema, "example": example}
+    for name, schema, example, description in (
+        ("X-Map-Shape", {"type": "string"}, "200,160", "Lengths of the axes: rows and columns, or x, y and z."),
+        ("X-Map-Bounds-M", {"type": "string"}, "0,10,0,8", "Lowest and highest coordinate of each axis, in metres."),
+        ("X-Map-Time-Utc", _DATE_TIME, "2026-01-31T12:00:00.050000Z", "Middle of the window, in UTC."),
+        ("X-Map-Age-S", {"type": "number"}, 0.25, "Age of the window in seconds."),
+        ("X-Map-Min", {"type": "number"}, 0.0123, "Smallest power."),
+        ("X-Map-Max", {"type": "number"}, 0.873, "Largest power."),
     )
 }
-_DATE_TIME: Final[dict[str, Any]] = {"format": "date-time"}
-_BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 
-Since = Annotated[
-    str | None, Query(description="RFC 3339 time: events that began then or later", json_schema_extra=_DATE_TIME)
-]
-Until = Annotated[
-    str | None, Query(description="RFC 3339 time: events that began then or earlier", json_schema_extra=_DATE_TIME)
-]
+Time = Annotated[str, WithJsonSchema(_DATE_TIME)]
 
 
 def as_json(found: JsonObject, status: int = 200) -> Response:
@@ -164,7 +160,7 @@ def switch_route(site: Site, engine: Engine) -> APIRouter:
         "/api/v1/arrays/{name}/enabled",
         tags=["state"],
         response_model=answers.Switched,
-        responses=errors(400, 404, 411, 413, 422, 503, texts={404: "There is no array of that name."}),
+        responses=errors(400, 404, 411, 413, 503, texts={404: "There is no array of that name."}),
     )
     def put_enabled(name: str, switch: answers.Switch, request: Request) -> Response:
         """Disable an array that does harm, or enable it again; for operators."""
@@ -210,11 +206,11 @@ def event_routes(site: Site, store: Store) -> APIRouter:
         "/api/v1/events",
         tags=["estimates"],
         response_model=answers.EventPage,
-        responses=errors(404, 422, texts={404: "There is no zone of that name."}),
+        responses=errors(404, texts={404: "There is no zone of that name."}),
     )
     def get_events(
-        since: Since = None,
-        until: Until = None,
+        since: Annotated[Time | None, Query(description="only events that began then or later; RFC 3339")] = None,
+        until: Annotated[Time | None, Query(description="only events that began then or earlier; RFC 3339")] = None,
         zone: Annotated[str | None, Query(description="only events inside this zone")] = None,
         min_confidence: Annotated[
             float | None, Query(ge=0, le=1, description="only events of at least this confidence")
@@ -236,7 +232,7 @@ def event_routes(site: Site, store: Store) -> APIRouter:
         "/api/v1/events/{event_id}",
         tags=["estimates"],
         response_model=answers.OneEvent,
-        responses=errors(404, 422, texts={404: "There is no event of that id."}),
+        responses=errors(404, texts={404: "There is no event of that id."}),
     )
     def get_event(event_id: str) -> Response:
         """One event."""
@@ -263,7 +259,7 @@ def map_route(site: Site, engine: Engine) -> APIRouter:
                 "headers": _MAP_HEADERS,
             },
             204: {"description": "No window has been localized yet."},
-            **errors(404, 422, texts={404: "There is no array of that name, or it has no part in the newest map."}),
+            **errors(404, texts={404: "There is no array of that name, or it has no part in the newest map."}),
         },
     )
     def get_map(

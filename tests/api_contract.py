@@ -1,0 +1,159 @@
+"""Holds every message and every answer of the servers that tests run against the models of the API.
+
+A plugin of pytest: it watches each application that a `Server` makes. What breaks the contract makes the test that ran
+at that moment fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Final
+
+import orjson
+import pytest
+from fastapi import FastAPI
+from pydantic import TypeAdapter, ValidationError
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Message as Sent
+
+from livessl.server.api.answers import Error, HTTPValidationError
+from livessl.server.api.app import create_app
+from livessl.server.api.live import LIVE
+from livessl.server.api.schema import Message
+from livessl.server.fanout import Hub
+
+UNMODELLED: Final = ("/api/v1/openapi.json", "/api/v1/asyncapi.json")
+"""JSON whose form others define."""
+
+
+class Contract:
+    """What has been checked, and what broke the contract."""
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+        self.messages = 0
+        self.answers = 0
+
+    def take(self) -> list[str]:
+        """The faults since the last call."""
+        faults, self.faults = self.faults, []
+        return faults
+
+    @contextmanager
+    def broken(self) -> Iterator[list[str]]:
+        """Collect the faults of a context in a list instead of failing the test."""
+        before, faults = self.take(), []  # type: tuple[list[str], list[str]]
+        self.faults = faults
+        try:
+            yield faults
+        finally:
+            self.faults = before
+
+    def check(self, model: Any, text: str | bytes, what: str) -> None:
+        """Note a fault unless a JSON text is an instance of a model: strictly, and without further fields."""
+        try:
+            _adapter(model).validate_json(text, strict=True, extra="forbid")
+        except ValidationError as error:
+            self.faults.append(f"{what}: {error}\n{text[:500]!r}")
+
+    def check_message(self, text: str | bytes) -> None:
+        """Check a message of the live WebSocket."""
+        self.messages += 1
+        self.check(Message, text, "message")
+
+    def check_answer(self, scope: Scope, status: int, headers: dict[bytes, bytes], body: bytes) -> None:
+        """Check a REST answer against what its route and the OpenAPI description declare."""
+        path, route = scope["path"], scope.get("route")
+        if not path.startswith("/api/") or path in UNMODELLED:
+            return
+        self.answers += 1
+        what = f"{scope['method']} {path} -> {status}"
+        form = headers.get(b"content-type", b"").decode()
+        model = HTTPValidationError if status == 422 else Error
+        if route is not None and status != 405:
+            method = scope["method"].replace("HEAD", "GET").lower()
+            described = scope["app"].openapi()["paths"][route.path][method]["responses"]
+            if str(status) not in described or form not in described[str(status)].get("content", [""]):
+                self.faults.append(f"{what}: status {status} with content {form!r} is not described")
+            model = route.response_model if status == 200 else route.responses.get(status, {}).get("model", model)
+        if form == "application/json" and body:
+            self.check(model, body, what)
+
+    def watch(self, hub: Hub) -> None:
+        """Check all that a hub publishes, with or without subscribers."""
+        publish = hub.publish
+
+        def checked(message: dict[str, Any], *rest: Any) -> None:
+            publish(message, *rest)
+            self.check_message(orjson.dumps({"v": 1, "seq": hub.last_seq, **message}))
+
+        vars(hub)["publish"] = checked
+
+
+CONTRACT: Final = Contract()
+
+
+@cache
+def _adapter(model: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(model)
+
+
+class Checked:
+    """ASGI middleware that checks what leaves the application."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one connection of the ASGI interface."""
+        started: dict[str, Any] = {}
+        body = bytearray()
+
+        async def checked(message: Sent) -> None:
+            if message["type"] == "websocket.send" and scope["path"] == LIVE:
+                CONTRACT.check_message(message["text"])
+            elif message["type"] == "http.response.start":
+                started.update(message)
+            elif message["type"] == "http.response.body":
+                body.extend(message.get("body", b""))
+                if not message.get("more_body"):
+                    CONTRACT.check_answer(scope, started["status"], dict(started["headers"]), bytes(body))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, checked)
+        except Exception as error:
+            CONTRACT.faults.append(f"{scope['type']} {scope['path']}: {error!r}")
+            raise
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch every application that a server makes from now on."""
+    monkey = pytest.MonkeyPatch()
+    config.add_cleanup(monkey.undo)
+
+    def watched(*parts: Any, **named: Any) -> FastAPI:
+        application = create_app(*parts, **named)
+        application.add_middleware(Checked)
+        [hub] = [part for part in (*parts, *named.values()) if isinstance(part, Hub)]
+        CONTRACT.watch(hub)
+        return application
+
+    monkey.setattr("livessl.server.app.create_app", watched)
+
+
+@pytest.fixture(autouse=True)
+def _contract_of_the_api() -> Iterator[None]:
+    """The test fails if a message or an answer breaks the contract meanwhile."""
+    yield
+    faults = CONTRACT.take()
+    if faults:
+        pytest.fail("\n".join(faults))
+
+
+@pytest.fixture
+def contract() -> Contract:
+    """What is known of the messages and answers of this run."""
+    return CONTRACT
