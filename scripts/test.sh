@@ -2,7 +2,7 @@
 # Sets livessl up with all that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
 set -eu
 cd "$(dirname "$0")/.."
-packages="chromium libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl"
+packages="chromium libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl nodejs npm"
 
 missing=
 for package in $packages; do
@@ -23,7 +23,7 @@ if [ -n "$missing" ]; then
     # shellcheck disable=SC2086  # a list of words
     if ! { apt_get update && apt_get install -y --no-install-recommends $missing; }; then
         echo "test: could not. Skipped are the tests of the dashboard in a browser without chromium, of the units in deploy/" >&2
-        echo "test: without systemd, of TLS without openssl, of a sound card without the others. To have them:" >&2
+        echo "test: without systemd, of TLS without openssl, of TypeScript clients without npm, of a sound card without the others. To have them:" >&2
         echo "test: sudo apt-get install$missing" >&2
     fi
 fi
