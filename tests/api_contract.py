@@ -20,9 +20,11 @@ from starlette.types import Message as Sent
 
 from livessl.server.api.answers import Error, HTTPValidationError
 from livessl.server.api.app import create_app
+from livessl.server.api.auth import Access
 from livessl.server.api.live import LIVE
 from livessl.server.api.schema import Message
-from livessl.server.fanout import Hub
+from livessl.server.fanout import Fanout
+from livessl.server.parts import Parts
 
 UNMODELLED: Final = ("/api/v1/openapi.json", "/api/v1/asyncapi.json")
 """JSON whose form others define."""
@@ -81,15 +83,15 @@ class Contract:
         if form == "application/json" and body:
             self.check(model, body, what)
 
-    def watch(self, hub: Hub) -> None:
-        """Check all that a hub publishes, with or without subscribers."""
-        publish = hub.publish
+    def watch(self, fanout: Fanout) -> None:
+        """Check all that a fan-out publishes, with or without subscribers."""
+        publish = fanout.publish
 
         def checked(message: dict[str, Any], *rest: Any) -> None:
             publish(message, *rest)
-            self.check_message(orjson.dumps({"v": 1, "seq": hub.last_seq, **message}))
+            self.check_message(orjson.dumps({"v": 1, "seq": fanout.last_seq, **message}))
 
-        vars(hub)["publish"] = checked
+        vars(fanout)["publish"] = checked
 
 
 CONTRACT: Final = Contract()
@@ -134,11 +136,10 @@ def pytest_configure(config: pytest.Config) -> None:
     monkey = pytest.MonkeyPatch()
     config.add_cleanup(monkey.undo)
 
-    def watched(*parts: Any, **named: Any) -> FastAPI:
-        application = create_app(*parts, **named)
+    def watched(parts: Parts, access: Access) -> FastAPI:
+        application = create_app(parts, access)
         application.add_middleware(Checked)
-        [hub] = [part for part in (*parts, *named.values()) if isinstance(part, Hub)]
-        CONTRACT.watch(hub)
+        CONTRACT.watch(parts.fanout)
         return application
 
     monkey.setattr("livessl.server.app.create_app", watched)

@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from api_contract import Contract
 from livessl.server.api import live, routes
-from livessl.server.fanout import Hub
+from livessl.server.fanout import Fanout
 from small_site import running_server, site_of
 
 
@@ -55,11 +55,11 @@ def test_a_wrong_message_is_found_without_subscribers(
 ) -> None:
     right = {"kind": "arrays", "now_utc": "2026-01-31T12:00:00Z", "mode": "live", "arrays": []}
     with contract.broken() as faults:
-        hub = Hub()
-        contract.watch(hub)
-        hub.publish(right)
+        fanout = Fanout()
+        contract.watch(fanout)
+        fanout.publish(right)
         assert faults == []
-        hub.publish({**right, **change})
+        fanout.publish({**right, **change})
         [found] = faults
     assert fault in found
 

@@ -65,14 +65,14 @@ def server_and_messages() -> Iterator[tuple[Server, list[str]]]:
             start_ns = SystemClock().now_ns()
             send_session(
                 site_of(),
-                server.engine.endpoint,
+                server.endpoint,
                 scene_parts(start_ns),
                 UnpacedClock(),
                 SystemClock(),
                 "run",
                 lambda: False,
             )
-            server.engine.wait_idle()
+            server.wait_idle()
             messages, events = [], 0
             while events < 2:
                 messages.append(str(socket.recv(timeout=10)))

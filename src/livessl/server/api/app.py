@@ -13,7 +13,6 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
-from livessl.clock import Clock
 from livessl.server.api import documentation, routes
 from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
@@ -22,11 +21,8 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.queries import refuse_unknown_parameters
-from livessl.server.engine import Engine
-from livessl.server.fanout import Hub
-from livessl.server.sinks import Sinks
-from livessl.server.store import Store
-from livessl.site.models import Site, is_loopback
+from livessl.server.parts import Parts
+from livessl.site.models import is_loopback
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""
@@ -42,10 +38,9 @@ not the server's own, where it uses no tokens, and 503 when too many connections
 """
 
 
-def create_app(
-    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, access: Access
-) -> FastAPI:
-    """The application around a running engine, open to everyone or to clients that have a token."""
+def create_app(parts: Parts, access: Access) -> FastAPI:
+    """The application around a running server's parts, open to everyone or to clients that have a token."""
+    site = parts.site
     app = FastAPI(
         title="livessl",
         version=__version__,
@@ -56,7 +51,7 @@ def create_app(
         responses=errors(401, 403) if access.wanted else {},
     )
     app.add_middleware(_HeadAsGet)
-    app.add_middleware(Gate, access=access, refusals=engine.refusals)
+    app.add_middleware(Gate, access=access, refusals=parts.refusals)
     if not access.wanted and is_loopback(site.server.http.host):
         # otherwise any web page could point its own host name at this server and read the answers as its own
         app.add_middleware(
@@ -67,15 +62,15 @@ def create_app(
 
     strict = [Depends(refuse_unknown_parameters)]
     for router in (
-        routes.state_routes(site, engine),
-        routes.switch_route(site, engine),
-        routes.access_route(engine, access),
-        routes.event_routes(site, store),
-        routes.map_route(site, engine),
+        routes.state_routes(parts),
+        routes.switch_route(parts),
+        routes.access_route(parts, access),
+        routes.event_routes(parts),
+        routes.map_route(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
-    app.include_router(metrics_route(engine, hub, store, sinks))
-    app.include_router(live_routes(site, clock, engine, hub))
+    app.include_router(metrics_route(parts))
+    app.include_router(live_routes(parts))
     app.include_router(asyncapi_route(site, access))
     documentation.add_documentation(app)
 

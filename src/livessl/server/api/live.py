@@ -8,14 +8,12 @@ from typing import Any, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from livessl.clock import Clock, utc_text
+from livessl.clock import utc_text
 from livessl.server.api import queries
 from livessl.server.api.encode import API_VERSION
-from livessl.server.engine import Engine
-from livessl.server.fanout import Hub, Subscription, Told
-from livessl.server.latency import Latency
+from livessl.server.fanout import Numbered, Subscription
 from livessl.server.maps import FUSED
-from livessl.site.models import Site
+from livessl.server.parts import Parts
 
 LIVE: Final = "/api/v1/live"
 MAP: Final = "/api/v1/map"
@@ -30,9 +28,9 @@ POLICY_VIOLATION: Final = 1008
 """Close code of RFC 6455 for a request that the server refuses."""
 
 
-def live_routes(site: Site, clock: Clock, engine: Engine, hub: Hub) -> APIRouter:
+def live_routes(parts: Parts) -> APIRouter:
     """The WebSocket of messages and the WebSocket of power maps."""
-    router = APIRouter()
+    site, fanout, router = parts.site, parts.fanout, APIRouter()
 
     @router.websocket(LIVE)
     async def live(
@@ -51,23 +49,23 @@ def live_routes(site: Site, clock: Clock, engine: Engine, hub: Hub) -> APIRouter
         except ValueError as error:
             await _refuse(socket, error)
             return
-        arrays = await asyncio.to_thread(engine.arrays)
-        subscription = hub.subscribe(wanted, since)
+        arrays = await asyncio.to_thread(parts.array_states.describe)
+        subscription = fanout.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
-            "seq": hub.last_seq,
+            "seq": fanout.last_seq,
             "kind": "hello",
-            "now_utc": utc_text(engine.now_ns()),
+            "now_utc": utc_text(parts.site_time.now_ns()),
             "site": site.site,
-            "mode": engine.mode,
-            "last_seq": hub.last_seq,
+            "mode": parts.site_time.mode,
+            "last_seq": fanout.last_seq,
             "role": str(socket.scope["client_role"]),
             "arrays": arrays,
         }
         try:
-            await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
+            await _while_connected(socket, _send_all(socket, subscription, Numbered(hello), parts))
         finally:
-            hub.unsubscribe(subscription)
+            fanout.unsubscribe(subscription)
 
     @router.websocket(MAP)
     async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
@@ -84,8 +82,8 @@ def live_routes(site: Site, clock: Clock, engine: Engine, hub: Hub) -> APIRouter
         def drawn() -> None:
             loop.call_soon_threadsafe(news.set)
 
-        with engine.maps.watching(array, chosen, drawn):
-            await _while_connected(socket, _send_pictures(socket, engine, array, chosen, news))
+        with parts.maps.watching(array, chosen, drawn):
+            await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
 
     return router
 
@@ -115,29 +113,29 @@ async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -
         task.result()  # raises the exception that ended the task, if there was one
 
 
-async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, clock: Clock, latency: Latency) -> None:
-    told = first
-    while await _sent(socket.send_text(told.text)):
-        if told.told_ns is not None:
-            latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Numbered, parts: Parts) -> None:
+    message = first
+    while await _sent(socket.send_text(message.text)):
+        if message.published_ns is not None:
+            parts.latency.delivered(message.message, (parts.clock.monotonic_ns() - message.published_ns) / 1e9)
         if subscription.lags:  # otherwise the whole queue is sent in one turn, even to a client that has disconnected
             await asyncio.sleep(0)
-        told = await subscription.next()
+        message = await subscription.next()
 
 
 async def _send_pictures(
-    socket: WebSocket, engine: Engine, array: str, views: tuple[str, ...], news: asyncio.Event
+    socket: WebSocket, parts: Parts, array: str, views: tuple[str, ...], news: asyncio.Event
 ) -> None:
     """Send each window's pictures as they are drawn; a slow client skips windows."""
     shown = None
     while True:
         news.clear()
-        drawn = engine.maps.drawn
+        drawn = parts.maps.drawn
         pictures = [] if drawn is None else [drawn.pictures.get((array, view)) for view in views]
         if drawn is not None and drawn.window is not shown and all(pictures):
             shown = drawn.window
             for picture in pictures:
-                if picture is not None and not await _sent(socket.send_bytes(picture.packed(engine.now_ns()))):
+                if picture is not None and not await _sent(socket.send_bytes(picture.packed(parts.site_time.now_ns()))):
                     return
         await news.wait()
 

@@ -10,20 +10,17 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from livessl.server.api.encode import JsonObject
-from livessl.server.engine import Engine
-from livessl.server.fanout import Hub
-from livessl.server.sinks import Sinks
-from livessl.server.store import Store
+from livessl.server.parts import Parts
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
-def metrics_route(engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> APIRouter:
+def metrics_route(parts: Parts) -> APIRouter:
     """`GET /metrics`."""
     router = APIRouter()
     registry = CollectorRegistry()
-    registry.register(_Metrics(engine, hub, store, sinks))
-    registry.register(engine.latency.histogram)
+    registry.register(_Metrics(parts))
+    registry.register(parts.latency.histogram)
 
     @router.get(
         "/metrics",
@@ -41,46 +38,47 @@ def metrics_route(engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> APIRo
 class _Metrics(Collector):
     """Counts and states of the whole server."""
 
-    def __init__(self, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
-        self._engine = engine
-        self._hub = hub
-        self._store = store
-        self._sinks = sinks
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
 
     def collect(self) -> Iterator[Metric]:
-        yield from self._server()
-        yield from self._events()
-        yield from array_metrics(self._engine.arrays())
+        yield from server_metrics(self._parts)
+        yield from event_metrics(self._parts)
+        yield from array_metrics(self._parts.array_states.describe())
 
-    def _server(self) -> Iterator[Metric]:
-        engine, hub = self._engine, self._hub
-        yield GaugeMetricFamily("livessl_uptime_seconds", "Seconds since the server started.", engine.uptime_s())
-        yield GaugeMetricFamily("livessl_websocket_clients", "Connected live subscribers.", hub.clients)
-        yield GaugeMetricFamily("livessl_map_watchers", "Connected subscribers to power maps.", engine.maps.watchers)
-        yield CounterMetricFamily("livessl_maps_drawn", "Power maps drawn on demand.", engine.maps.drawings)
-        yield CounterMetricFamily(
-            "livessl_messages_superseded",
-            "Messages not sent to slow subscribers, because a newer one replaced them or their queue was full.",
-            hub.superseded,
-        )
-        yield GaugeMetricFamily(
-            "livessl_updates_left_out",
-            "Windows of this live run that were not localized, because newer ones were due.",
-            engine.updates_left_out,
-        )
-        yield CounterMetricFamily("livessl_messages_refused", "Malformed messages from nodes.", engine.malformed)
-        refused = CounterMetricFamily("livessl_refused", "Peers and requests refused.", labels=["door", "reason"])
-        for (door, reason), count in engine.refusals.counts().items():
-            refused.add_metric([door, reason], count)
-        yield refused
 
-    def _events(self) -> Iterator[Metric]:
-        engine = self._engine
-        yield CounterMetricFamily("livessl_events", "Events published since the server started.", engine.events)
-        yield CounterMetricFamily("livessl_events_unkept", "Events that could not be stored.", engine.unkept)
-        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait to be stored.", engine.unsaved)
-        yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", self._store.count())
-        yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not accept.", self._sinks.failures)
+def server_metrics(parts: Parts) -> Iterator[Metric]:
+    """Gauges and counters of connections, maps and refusals."""
+    yield GaugeMetricFamily("livessl_uptime_seconds", "Seconds since the server started.", parts.site_time.uptime_s())
+    yield GaugeMetricFamily("livessl_websocket_clients", "Connected live subscribers.", parts.fanout.clients)
+    yield GaugeMetricFamily("livessl_map_watchers", "Connected subscribers to power maps.", parts.maps.watchers)
+    yield CounterMetricFamily("livessl_maps_drawn", "Power maps drawn on demand.", parts.maps.drawings)
+    yield CounterMetricFamily(
+        "livessl_messages_superseded",
+        "Messages not sent to slow subscribers, because a newer one replaced them or their queue was full.",
+        parts.fanout.superseded,
+    )
+    yield GaugeMetricFamily(
+        "livessl_updates_left_out",
+        "Windows of this live run that were not localized, because newer ones were due.",
+        parts.engine.updates_left_out,
+    )
+    malformed = parts.receiver.ingest.malformed
+    yield CounterMetricFamily("livessl_messages_refused", "Malformed messages from nodes.", malformed)
+    refused = CounterMetricFamily("livessl_refused", "Peers and requests refused.", labels=["door", "reason"])
+    for (door, reason), count in parts.refusals.counts().items():
+        refused.add_metric([door, reason], count)
+    yield refused
+
+
+def event_metrics(parts: Parts) -> Iterator[Metric]:
+    """Gauges and counters of events."""
+    log = parts.event_log
+    yield CounterMetricFamily("livessl_events", "Events published since the server started.", log.published)
+    yield CounterMetricFamily("livessl_events_unkept", "Events that could not be stored.", log.unkept)
+    yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait to be stored.", log.unsaved)
+    yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", parts.store.count())
+    yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not accept.", parts.sinks.failures)
 
 
 def array_metrics(arrays: Iterable[JsonObject]) -> Iterator[Metric]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -19,10 +20,10 @@ from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
 from livessl.server.api.queries import array_names, instant, map_names, page_cursor, unprocessable
-from livessl.server.engine import Engine
 from livessl.server.maps import FUSED, bounds_of_view_m, projection
+from livessl.server.parts import Parts
 from livessl.server.store import Query as EventQuery
-from livessl.server.store import Store, StoreError
+from livessl.server.store import StoreError
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 
@@ -83,24 +84,25 @@ def _privacy(site: Site) -> JsonObject:
     return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
-def state_routes(site: Site, engine: Engine) -> APIRouter:
+def state_routes(parts: Parts) -> APIRouter:
     """Site, arrays, tracks and health."""
-    router = APIRouter()
+    site, router = parts.site, APIRouter()
 
     @router.get("/api/v1/site", tags=["state"], response_model=answers.Site)
     def get_site() -> Response:
         """Room, grid, arrays and settings."""
-        return as_json(describe_site(site, engine.mode))
+        return as_json(describe_site(site, parts.site_time.mode))
 
     @router.get("/api/v1/arrays", tags=["state"], response_model=answers.Arrays)
     def get_arrays() -> Response:
         """State, age of the last message, levels, drift and counters of every array."""
-        return as_json({"v": API_VERSION, "now_utc": utc_text(engine.now_ns()), "arrays": engine.arrays()})
+        now_utc = utc_text(parts.site_time.now_ns())
+        return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": parts.array_states.describe()})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:
         """The tracks that live now."""
-        return as_json({"v": API_VERSION, "tracks": engine.tracks()})
+        return as_json({"v": API_VERSION, "tracks": parts.tracks.all()})
 
     @router.get(
         HEALTH,
@@ -110,8 +112,8 @@ def state_routes(site: Site, engine: Engine) -> APIRouter:
     )
     def get_health(request: Request) -> Response:
         """Condition of the server and of its arrays; without a token the status alone. The code is 503 on failure."""
-        arrays = engine.arrays()
-        status, reasons = _condition(engine, arrays)
+        arrays = parts.array_states.describe()
+        status, reasons = _condition(parts, arrays)
         code = 503 if status == "failed" else 200
         if request.scope["client_role"] is None:
             return as_json({"v": API_VERSION, "status": status}, code)
@@ -119,8 +121,8 @@ def state_routes(site: Site, engine: Engine) -> APIRouter:
             "v": API_VERSION,
             "status": status,
             "version": __version__,
-            "mode": engine.mode,
-            "uptime_s": round(engine.uptime_s(), 3),
+            "mode": parts.site_time.mode,
+            "uptime_s": round(parts.site_time.uptime_s(), 3),
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
             "privacy": _privacy(site),
@@ -129,32 +131,33 @@ def state_routes(site: Site, engine: Engine) -> APIRouter:
                 "tokens": site.server.http.tokens is not None,
                 "tls": site.server.http.certificate is not None,
             },
-            "refused": {door: engine.refusals.count(door) for door in ("nodes", "http")},
+            "refused": {door: parts.refusals.count(door) for door in ("nodes", "http")},
         }
         return as_json(found, code)
 
     return router
 
 
-def _condition(engine: Engine, arrays: list[JsonObject]) -> tuple[str, list[str]]:
+def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[str]]:
     """Status of the server, and the reasons for it."""
     reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
     states = {a["state"] for a in arrays if a["enabled"]}  # an operator disables an array on purpose
     status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
-    if engine.unkept:
-        reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
-        status = "degraded" if status == "ok" else status
-    if engine.unsaved:
-        reasons.append(f"server.events_db: {engine.unsaved} events wait for it; free space or release the file")
-        status = "degraded" if status == "ok" else status
-    if engine.failure is not None:
-        return "failed", [f"fusion: {engine.failure!r}", *reasons]
+    unkept, unsaved = parts.event_log.unkept, parts.event_log.unsaved
+    if unkept:
+        reasons.append(f"server.events_db: {unkept} events were not kept; free space or release the file")
+    if unsaved:
+        reasons.append(f"server.events_db: {unsaved} events wait for it; free space or release the file")
+    if (unkept or unsaved) and status == "ok":
+        status = "degraded"
+    if parts.failure is not None:
+        return "failed", [f"fusion: {parts.failure!r}", *reasons]
     return status, reasons
 
 
-def switch_route(site: Site, engine: Engine) -> APIRouter:
+def switch_route(parts: Parts) -> APIRouter:
     """Disable and enable an array."""
-    router = APIRouter()
+    site, router = parts.site, APIRouter()
 
     @router.put(
         "/api/v1/arrays/{name}/enabled",
@@ -167,7 +170,7 @@ def switch_route(site: Site, engine: Engine) -> APIRouter:
         if name not in array_names(site):
             raise HTTPException(404, f"no array {name!r}; there are {', '.join(array_names(site))}")
         try:
-            engine.enable(name, switch.enabled)
+            parts.array_states.enable(name, switch.enabled)
         except StoreError as error:
             raise HTTPException(503, str(error)) from error
         done = "enabled" if switch.enabled else "disabled"
@@ -177,7 +180,7 @@ def switch_route(site: Site, engine: Engine) -> APIRouter:
     return router
 
 
-def access_route(engine: Engine, access: Access) -> APIRouter:
+def access_route(parts: Parts, access: Access) -> APIRouter:
     """Clients, nodes and refusals."""
     router = APIRouter()
 
@@ -187,10 +190,10 @@ def access_route(engine: Engine, access: Access) -> APIRouter:
         found = {
             "v": API_VERSION,
             "clients": [{"name": c.name, "role": str(c.role)} for c in access.clients],
-            "nodes": engine.enrolled,
+            "nodes": list(parts.receiver.enrolled),
             "refused": [
                 {"door": r.door, "who": r.who, "reason": r.reason, "count": r.count, "last_utc": utc_text(r.last_ns)}
-                for r in engine.refusals.known()
+                for r in parts.refusals.known()
             ],
         }
         return as_json(found)
@@ -198,9 +201,9 @@ def access_route(engine: Engine, access: Access) -> APIRouter:
     return router
 
 
-def event_routes(site: Site, store: Store) -> APIRouter:
+def event_routes(parts: Parts) -> APIRouter:
     """The history of events."""
-    router = APIRouter()
+    site, store, router = parts.site, parts.store, APIRouter()
 
     @router.get(
         "/api/v1/events",
@@ -244,9 +247,9 @@ def event_routes(site: Site, store: Store) -> APIRouter:
     return router
 
 
-def map_route(site: Site, engine: Engine) -> APIRouter:
+def map_route(parts: Parts) -> APIRouter:
     """Power maps."""
-    router = APIRouter()
+    site, router = parts.site, APIRouter()
 
     @router.get(
         "/api/v1/map",
@@ -277,12 +280,12 @@ def map_route(site: Site, engine: Engine) -> APIRouter:
             raise HTTPException(404, f"no array {array!r}; there are {', '.join(map_names(site))}")
         if view == "volume" and format == "png":
             raise unprocessable("view", "view=volume has no picture; use format=float32")
-        return newest_map(engine, array, view, format)
+        return newest_map(parts, array, view, format)
 
     return router
 
 
-def newest_map(engine: Engine, array: str, view: str, form: str) -> Response:
+def newest_map(parts: Parts, array: str, view: str, form: str) -> Response:
     """The newest window's map as a picture or as numbers; 204 before the first window.
 
     Raises
@@ -290,7 +293,7 @@ def newest_map(engine: Engine, array: str, view: str, form: str) -> Response:
     HTTPException
         404 if the array has no part in that window.
     """
-    drawn = engine.maps.newest(array)
+    drawn = parts.maps.newest(array)
     if drawn is None:
         return Response(status_code=204)
     power = drawn.power(array)
@@ -305,7 +308,7 @@ def newest_map(engine: Engine, array: str, view: str, form: str) -> Response:
         "X-Map-Shape": ",".join(str(n) for n in image.shape),
         "X-Map-Bounds-M": ",".join(f"{edge:g}" for edge in bounds_m),
         "X-Map-Time-Utc": utc_text(time_ns),
-        "X-Map-Age-S": f"{(engine.now_ns() - time_ns) / 1e9:.3f}",
+        "X-Map-Age-S": f"{(parts.site_time.now_ns() - time_ns) / 1e9:.3f}",
         "X-Map-Min": f"{image.min():.6g}",
         "X-Map-Max": f"{image.max():.6g}",
     }
