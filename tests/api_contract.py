@@ -31,7 +31,7 @@ UNMODELLED: Final = ("/api/v1/openapi.json", "/api/v1/asyncapi.json")
 
 
 class Contract:
-    """What has been checked, and what broke the contract."""
+    """Counts of checked messages and answers, and the faults found in them."""
 
     def __init__(self) -> None:
         self.faults: list[str] = []
@@ -54,7 +54,7 @@ class Contract:
             self.faults = before
 
     def check(self, model: Any, text: str | bytes, what: str) -> None:
-        """Note a fault unless a JSON text is an instance of a model: strictly, and without further fields."""
+        """Note a fault unless a JSON text is an instance of a model in strict mode, without further fields."""
         try:
             _adapter(model).validate_json(text, strict=True, extra="forbid")
         except ValidationError as error:
@@ -156,5 +156,5 @@ def _contract_of_the_api() -> Iterator[None]:
 
 @pytest.fixture
 def contract() -> Contract:
-    """What is known of the messages and answers of this run."""
+    """The check that runs beside all tests."""
     return CONTRACT

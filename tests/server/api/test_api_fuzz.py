@@ -1,4 +1,4 @@
-"""The API under requests that nobody would think of: what it answers is what its own description says, never a 500.
+"""The API under random requests: every answer is as the OpenAPI description says, and none is a 500.
 
 A small part of `schemathesis run`; docs/security.md has the whole command.
 """
@@ -21,7 +21,7 @@ from livessl.site.keys import add_token
 from small_site import running_server, scene_parts, site_of
 
 TOO_STRICT = [positive_data_acceptance]
-"""It does not know that a text is a time, nor that a volume has no picture."""
+"""This check does not know that a volume has no picture, nor which arrays and zones exist."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def headers(token: tuple[str, Path]) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def api(token: tuple[str, Path], headers: dict[str, str]) -> Iterator[Any]:
-    """What a server that has heard something says of itself."""
+    """The OpenAPI description of a server that has located something."""
     with running_server(site_of({"server.http.tokens": "tokens.yaml"}, token[1])) as server:
         send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), SystemClock(), "run", lambda: False)
         server.wait_idle()
@@ -58,7 +58,7 @@ def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:
         answers_as_described()
 
 
-def test_a_body_that_is_no_text_is_refused_as_described(api: Any, headers: dict[str, str]) -> None:
+def test_binary_body_is_refused_as_described(api: Any, headers: dict[str, str]) -> None:
     path = "/api/v1/arrays/{name}/enabled"
     answer = httpx.put(
         api.location.replace("/api/v1/openapi.json", path.format(name="north")),

@@ -97,9 +97,9 @@ def test_queries_are_described(described: dict[str, Any]) -> None:
 def test_picture_is_described_as_it_is_packed(described: dict[str, Any]) -> None:
     picture = described["components"]["messages"]["Picture"]
     assert picture["contentType"] == "application/octet-stream"
-    told = re.sub(r"\s+", " ", picture["description"])
-    assert f"a header of {HEADER.size} bytes" in told
-    fields = re.findall(r"(\d?) ?(bytes|u?int\d+|float32)\b", told.partition("The header holds:")[2])
+    text = re.sub(r"\s+", " ", picture["description"])
+    assert f"a header of {HEADER.size} bytes" in text
+    fields = re.findall(r"(\d?) ?(bytes|u?int\d+|float32)\b", text.partition("The header holds:")[2])
     codes = {"bytes": "s", "uint8": "B", "uint16": "H", "int64": "q", "float32": "f"}
     packed = "".join(code * (1 if code == "s" else int(n or 1)) for n, form in fields for code in codes[form])
     assert packed == "sBBHqfffffffHH"

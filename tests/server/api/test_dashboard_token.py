@@ -1,4 +1,4 @@
-"""The dashboard of a server that wants a token: it asks once, and then works as any other."""
+"""The dashboard of a server with tokens asks for one once per tab, and then works as without."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_dashboard_asks_once_for_the_token(tmp_path: Path) -> None:
         expect(connection).to_have_attribute("data-state", "live", timeout=10_000)
         expect(dialog).to_be_hidden()
 
-        stranger = browser.new_context().new_page()  # another tab's session: it has to have a token of its own
+        stranger = browser.new_context().new_page()  # another tab has a session and needs a token of its own
         stranger.goto(server.url)
         expect(stranger.get_by_test_id("token-dialog")).to_be_visible()
         browser.close()

@@ -30,7 +30,7 @@ def test_page_shows_the_api_and_asks_no_other_server(tmp_path: Path, tokens: boo
         faults: list[str] = []
         page.on("request", lambda request: requests.append(request.url))
         page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("console", lambda said: faults.append(said.text) if said.type == "error" else None)
+        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
         if tokens:
             page.add_init_script(f"sessionStorage.setItem('livessl-token', '{token}')")
         page.goto(f"{server.url}/docs")

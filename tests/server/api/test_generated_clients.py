@@ -1,4 +1,4 @@
-"""Clients that other people's tools generate from the descriptions: they are typed, and read what the server sends."""
+"""Clients that common tools generate from the descriptions are typed and read what the server sends."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from livessl.server.app import Server
 from small_site import running_server, scene_parts, site_of
 
 PACKAGES = {"openapi-typescript": "7.13.0", "typescript": "5.9.3", "@asyncapi/specs": "6.11.1"}
-"""From npm, at fixed versions: what they do must not change from one day to the next."""
+"""Packages from npm, at fixed versions, so that a new release cannot break the tests."""
 
 TYPESCRIPT_CLIENT = """\
 import type { components, paths } from "./api";

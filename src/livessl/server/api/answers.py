@@ -39,7 +39,7 @@ class HealthState(StrEnum):
 
 
 class PrivacyMode(StrEnum):
-    """Whether nodes may record sound, or positions only leave the server."""
+    """Privacy mode: `recording` permits recordings of sound, `positions-only` forbids them."""
 
     RECORDING = "recording"
     POSITIONS_ONLY = "positions-only"
@@ -96,7 +96,7 @@ class ZoneBounds(BaseModel):
 
 
 class Privacy(BaseModel):
-    """What is kept of sound and events."""
+    """Rules for keeping sound and events."""
 
     mode: PrivacyMode
     retention_days: float | None = Field(
@@ -159,7 +159,7 @@ class Secured(BaseModel):
 
 
 class Refused(BaseModel):
-    """How many peers and requests were refused since the start."""
+    """Numbers of peers and requests that were refused since the start."""
 
     nodes: int = Field(ge=0, description="Refused at the nodes' socket.", examples=[0])
     http: int = Field(ge=0, description="Refused by the HTTP server.", examples=[0])
@@ -214,7 +214,7 @@ class AccessList(_Versioned):
 
 
 class Switch(BaseModel):
-    """Whether an array's sound is used."""
+    """Request to use an array's sound or to ignore it."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 

@@ -92,7 +92,7 @@ def _refuse_other_pages(socket: WebSocket) -> None:
     """Raise ValueError if a page of another server opened the WebSocket: browsers do not prevent that themselves."""
     origin = socket.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
-        raise ValueError("origin: pages of other servers may not listen")
+        raise ValueError("origin: expected a page of this server; pages of other servers may not connect")
 
 
 async def _refuse(socket: WebSocket, error: ValueError) -> None:
@@ -114,6 +114,7 @@ async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -
 
 
 async def _send_all(socket: WebSocket, subscription: Subscription, first: Numbered, parts: Parts) -> None:
+    """Send the first message, and then those of the subscription, until the client is gone."""
     message = first
     while await _sent(socket.send_text(message.text)):
         if message.published_ns is not None:
@@ -141,7 +142,7 @@ async def _send_pictures(
 
 
 async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
-    """Whether the client accepted a message within `SEND_TIMEOUT_S`."""
+    """Await a sending; return whether the client accepted it within `SEND_TIMEOUT_S`."""
     try:
         async with asyncio.timeout(SEND_TIMEOUT_S):
             await sending

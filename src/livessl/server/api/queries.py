@@ -137,15 +137,15 @@ def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | 
     """
     chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
     if chosen is not None and not chosen <= KINDS:
-        raise ValueError(f"kinds: expected some of {', '.join(sorted(KINDS))}")
+        raise ValueError(f"kinds: expected some of {', '.join(sorted(KINDS))}, got {kinds!r}")
     try:
         least = float(min_confidence)
     except ValueError:
         least = float("nan")
     if not 0.0 <= least <= 1.0:
-        raise ValueError("min_confidence: expected a number from 0 to 1")
+        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
     if zone is not None and zone not in site.zones:
-        raise ValueError(f"zone: none of that name; zones are {', '.join(site.zones) or 'none'}")
+        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
     return Filter(chosen, least, zone)
 
 
@@ -158,7 +158,7 @@ def message_number(name: str, text: str | None) -> int | None:
         If the text is no decimal number of at most 19 digits.
     """
     if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
-        raise ValueError(f"{name}: expected the seq of a message")
+        raise ValueError(f"{name}: expected the seq of a message, got {text!r}")
     return None if text is None else int(text)
 
 
@@ -181,8 +181,8 @@ def chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
         If the array or a view does not exist.
     """
     if array not in map_names(site):
-        raise ValueError(f"array: none of that name; there are {', '.join(map_names(site))}")
+        raise ValueError(f"array: no array {array!r}; there are {', '.join(map_names(site))}")
     chosen = tuple(dict.fromkeys(view.strip() for view in views.split(",")))
     if not set(chosen) <= VIEWS.keys():
-        raise ValueError(f"views: expected some of {', '.join(VIEWS)}")
+        raise ValueError(f"views: expected some of {', '.join(VIEWS)}, got {views!r}")
     return chosen

@@ -71,14 +71,14 @@ LatencyS = Annotated[float, Field(description="Seconds from the end of the sound
 
 
 class Mode(StrEnum):
-    """Where the server's sound comes from."""
+    """Source of the server's sound: nodes that capture it now, or a recorded session."""
 
     LIVE = "live"
     REPLAY = "replay"
 
 
 class RoleName(StrEnum):
-    """What a client may do: read; also change settings; also see clients, nodes and refusals."""
+    """Rights of a client: read; also enable and disable arrays; also see clients, nodes and refusals."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
@@ -136,7 +136,7 @@ class Contribution(BaseModel):
 
 
 class LatencyStages(BaseModel):
-    """Where the time from the end of the sound to the answer went: seconds, whose sum is `latency_s`."""
+    """Stages between the end of the sound and the answer, in seconds; their sum is `latency_s`."""
 
     waited: float = Field(description="Wait for the quiet that ends an event; 0 for an update.", examples=[0.3])
     sent: float = Field(
@@ -224,7 +224,7 @@ class Track(BaseModel):
 
 
 class Agreement(BaseModel):
-    """How often an array agreed with the others over the last ten sounds that three or more arrays detected."""
+    """Agreement of an array with the others in the last ten sounds that three or more arrays detected."""
 
     agreed: int = Field(ge=0, le=10, description="Sounds in which it agreed.", examples=[9])
     disagreed: int = Field(ge=0, le=10, description="Sounds in which it was an outlier.", examples=[1])
@@ -379,4 +379,4 @@ MESSAGES: Final[tuple[type[BaseModel], ...]] = (Hello, EventMessage, UpdateMessa
 Message = Annotated[
     Hello | EventMessage | UpdateMessage | TrackMessage | ArraysMessage | Gap, Field(discriminator="kind")
 ]
-"""One message of the live WebSocket, told apart by `kind`."""
+"""One message of the live WebSocket; `kind` selects its model."""
