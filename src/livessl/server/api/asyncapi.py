@@ -28,6 +28,13 @@ since 1970, UTC; float32 its age in seconds when sent; 2 float32, the powers tha
 lowest and highest coordinate of the rows and then of the columns, in metres; 2 uint16, the numbers of rows and columns.
 """
 
+_TOKEN: Final = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "Send `Authorization: Bearer TOKEN`, or from a browser offer the WebSocket protocols "
+    f"`{PROTOCOL}` and `{TOKEN_PROTOCOL}TOKEN`.",
+}
+
 
 def asyncapi_route(site: Site, access: Access) -> APIRouter:
     """`GET /api/v1/asyncapi.json`."""
@@ -66,14 +73,7 @@ def describe(site: str, host: str, protocol: str, *, tokens: bool) -> JsonObject
     }
     if tokens:
         server["security"] = [{"$ref": "#/components/securitySchemes/token"}]
-        components["securitySchemes"] = {
-            "token": {
-                "type": "http",
-                "scheme": "bearer",
-                "description": "Send `Authorization: Bearer TOKEN`, or from a browser offer the WebSocket protocols "
-                f"`{PROTOCOL}` and `{TOKEN_PROTOCOL}TOKEN`.",
-            }
-        }
+        components["securitySchemes"] = {"token": _TOKEN}
     live = [model.__name__ for model in MESSAGES]
     return {
         "asyncapi": "3.0.0",

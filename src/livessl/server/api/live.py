@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from typing import Any, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from livessl.clock import utc_text
 from livessl.server.api import queries
-from livessl.server.api.encode import API_VERSION
+from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.fanout import Numbered, Subscription
 from livessl.server.maps import FUSED
 from livessl.server.parts import Parts
@@ -51,19 +51,9 @@ def live_routes(parts: Parts) -> APIRouter:
             return
         arrays = await asyncio.to_thread(parts.array_states.describe)
         subscription = fanout.subscribe(wanted, since)
-        hello = {
-            "v": API_VERSION,
-            "seq": fanout.last_seq,
-            "kind": "hello",
-            "now_utc": utc_text(parts.site_time.now_ns()),
-            "site": site.site,
-            "mode": parts.site_time.mode,
-            "last_seq": fanout.last_seq,
-            "role": str(socket.scope["client_role"]),
-            "arrays": arrays,
-        }
+        hello = Numbered(_hello(parts, str(socket.scope["client_role"]), arrays))
         try:
-            await _while_connected(socket, _send_all(socket, subscription, Numbered(hello), parts))
+            await _while_connected(socket, _send_all(socket, subscription, hello, parts))
         finally:
             fanout.unsubscribe(subscription)
 
@@ -86,6 +76,21 @@ def live_routes(parts: Parts) -> APIRouter:
             await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
 
     return router
+
+
+def _hello(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
+    """Encode the first message of a connection."""
+    return {
+        "v": API_VERSION,
+        "seq": parts.fanout.last_seq,
+        "kind": "hello",
+        "now_utc": utc_text(parts.site_time.now_ns()),
+        "site": parts.site.site,
+        "mode": parts.site_time.mode,
+        "last_seq": parts.fanout.last_seq,
+        "role": role,
+        "arrays": arrays,
+    }
 
 
 def _refuse_other_pages(socket: WebSocket) -> None:

@@ -84,6 +84,14 @@ def _privacy(site: Site) -> JsonObject:
     return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
+def _secured(site: Site) -> JsonObject:
+    return {
+        "nodes": site.keys is not None,
+        "tokens": site.server.http.tokens is not None,
+        "tls": site.server.http.certificate is not None,
+    }
+
+
 def state_routes(parts: Parts) -> APIRouter:
     """Site, arrays, tracks and health."""
     site, router = parts.site, APIRouter()
@@ -126,11 +134,7 @@ def state_routes(parts: Parts) -> APIRouter:
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
             "privacy": _privacy(site),
-            "secured": {
-                "nodes": site.keys is not None,
-                "tokens": site.server.http.tokens is not None,
-                "tls": site.server.http.certificate is not None,
-            },
+            "secured": _secured(site),
             "refused": {door: parts.refusals.count(door) for door in ("nodes", "http")},
         }
         return as_json(found, code)
