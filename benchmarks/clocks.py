@@ -24,7 +24,7 @@ from livessl.lab.demo import SITE_FILE
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import Placed, WavRecording
-from livessl.simulate.scene import Scene, make_scene, read_sounds, render
+from livessl.simulation.scene import Scene, make_scene, read_sounds, render
 from livessl.site.build.fusion import make_fusion
 from livessl.site.load import load_site
 from livessl.site.models import Site

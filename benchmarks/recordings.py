@@ -24,7 +24,7 @@ from livessl.core.types import Event, Float32Array, FloatArray
 from livessl.lab.demo import SITE_FILE
 from livessl.recordings.assign import Part, parts_from_wavs
 from livessl.recordings.recording import ArrayRecording, Placed
-from livessl.simulate.scene import NamedSound, make_scene, read_sounds, render
+from livessl.simulation.scene import NamedSound, make_scene, read_sounds, render
 from livessl.site.load import load_site, parse_site
 from livessl.site.models import Site
 

@@ -24,7 +24,7 @@ from livessl.core.types import Event, Status
 from livessl.lab.demo import SITE_FILE
 from livessl.recordings.assign import Part
 from livessl.recordings.recording import Placed, WavRecording
-from livessl.simulate.scene import Scene, render
+from livessl.simulation.scene import Scene, render
 from livessl.site.load import load_site
 from livessl.site.models import Site
 
@@ -77,7 +77,7 @@ def main() -> None:
                 scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, seed), noise_dbfs=a.noise_dbfs)
                 name = f"{a.sounds}-{a.rt60:g}-{seed}{a.noise_dbfs:g}"
                 parts = parts_of(site, scene, a.cache, name, lower_db)
-                outputs = offline.run(site, parts, UnpacedClock(), ask=ask)
+                outputs = offline.run(site, parts, UnpacedClock(), backfill=ask)
                 total += Counter(figures(scene, [output for output in outputs if isinstance(output, Event)]))
             print(json.dumps({"lower_db": lower_db, "ask": ask, **total}), flush=True)
 

@@ -22,7 +22,7 @@ from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Ev
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import ArrayRecording, Placed
-from livessl.simulate.scene import render
+from livessl.simulation.scene import render
 from livessl.site.build.fusion import make_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, running_server, scene, site_of
@@ -64,7 +64,7 @@ def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[P
 
 
 def offline_events(*, ask: bool = True, method: str | None = None, ahead_ns: int = 0) -> list[Event]:
-    outputs = offline.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), ask=ask, method=method)
+    outputs = offline.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), backfill=ask, method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
 

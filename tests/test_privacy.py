@@ -16,6 +16,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.server import app
 from livessl.server.store import Query, Store
 from livessl.site.models import ConfigError
+from messages import event_message
 from small_site import running_server, scene_parts, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
@@ -24,7 +25,7 @@ PRIVATE = {"privacy": "positions-only"}
 
 
 def event(number: int) -> dict[str, Any]:
-    return {"id": f"small-{number}", "confidence": 0.5, "zones": [], "note": f"uttered {number}"}
+    return event_message(id=f"small-{number}", reason=f"uttered {number}")
 
 
 def test_nothing_is_recorded_where_only_positions_may_be_kept(

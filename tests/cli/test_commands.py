@@ -24,7 +24,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from livessl import __version__
 from livessl.capture.link import Link
-from livessl.cli import main as command_line
 from livessl.cli.main import main
 from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.lab import demo
@@ -159,7 +158,7 @@ def test_wrong_use(run: Run, arguments: str, said: str) -> None:
 def test_check_of_a_good_site(run: Run, recorded: Recorded) -> None:
     done = run("check", recorded.site)
     assert done.code == 0
-    assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid nodes" in done.out
+    assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid points" in done.out
     [told] = run("check", recorded.site, "--json").objects
     expected = {"valid": True, "faults": [], "warnings": [], "site": "small", "arrays": ["north", "south"]}
     assert told == {**expected, "nodes": 3840}
@@ -475,9 +474,7 @@ def test_what_is_for_files_is_not_for_an_audio_interface(
 ) -> None:
     done = run("capture", "--site", recorded.site, "--node", "lab-pc", *options)
     assert done.code == 2
-    assert done.err == (
-        f"livessl: error: {options[0]}: applies to files, and none is given; take it away or add --wav\n"
-    )
+    assert done.err == (f"livessl: error: {options[0]}: applies to files, and none is given; remove it or add --wav\n")
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 0), (("--once",), 130)])
@@ -490,7 +487,7 @@ def test_interrupted_demo(run: Run, monkeypatch: pytest.MonkeyPatch, options: tu
 def test_interrupted_simulation_is_cut_short(
     run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.simulate.export.write_scene", interrupted)
+    monkeypatch.setattr("livessl.cli.simulate.write_scene", interrupted)
     assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
 
 
@@ -695,7 +692,12 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
     seen: list[set[int]] = []
-    monkeypatch.setattr(command_line, "load_site", lambda _: seen.append(threads()) or site_of())  # type: ignore[func-returns-value]
+
+    def load(_: Path) -> Site:
+        seen.append(threads())
+        return site_of()
+
+    monkeypatch.setattr("livessl.cli.check.load_site", load)
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")
@@ -718,7 +720,7 @@ def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
             [Fault(site.server.http.host, f"{site.server.http.port} {site.server.http.tokens} {site.keys}")]
         )
 
-    monkeypatch.setattr("livessl.server.app.Server", refuse)
+    monkeypatch.setattr("livessl.cli.replay.Server", refuse)
     assert main(["replay", str(session), *([] if own else ["--site", str(path)])]) == 2
     expected = "127.0.0.1: 8001 None None" if own else "0.0.0.0: 8001 tokens.yaml None"
     assert expected in capsys.readouterr().err

@@ -39,7 +39,7 @@ from livessl.recordings.play import played_messages
 from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
 from livessl.server.latency import Arrival
-from livessl.simulate.scene import make_scene, render
+from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
 

@@ -13,7 +13,7 @@ from livessl.core.types import FRAME_NS
 from livessl.recordings.assign import Part
 from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
-from livessl.simulate.scene import Scene, Source, render
+from livessl.simulation.scene import Scene, Source, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, running_server, scene, site_of, wait_until
 

@@ -19,25 +19,15 @@ def parts_from_scene(
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Part]:
     """A simulated scene as the arrays of one node would record it; every node with the same numbers hears the same."""
-    from livessl.simulate.scene import make_scene, render, synthesised_sounds  # heavy, and no other device needs it
+    from livessl.simulation.of_site import rendered, scene_of  # heavy, and no other device needs it
 
-    scene = make_scene(
-        site.room.size_m,
-        rt60_s=config.rt60_s,
-        sounds=synthesised_sounds(config.sample_rate_hz, config.seed),
-        count=config.events,
-        sample_rate_hz=config.sample_rate_hz,
-        c_m_s=site.c_m_s,
-        keep_away_m=[spec.centre_m for spec in site.specs],
-        seed=config.seed,
+    scene = scene_of(
+        site, rt60_s=config.rt60_s, count=config.events, sample_rate_hz=config.sample_rate_hz, seed=config.seed
     )
-    order = list(site.arrays)
     parts = []
-    for array in arrays:
-        microphones = site.array(array).microphones_m
-        samples = render(scene, microphones, seed=config.seed + 1 + order.index(array), progress=progress)
+    for spec, samples in rendered(site, scene, list(arrays), seed=config.seed, progress=progress):
         recording = ArrayRecording(f"scene {config.seed}", config.sample_rate_hz, samples)
-        parts.append(Part(array, Placed(recording, start_ns), tuple(range(1, len(microphones) + 1))))
+        parts.append(Part(spec.name, Placed(recording, start_ns), tuple(range(1, len(samples) + 1))))
     return parts
 
 

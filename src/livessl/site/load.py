@@ -16,7 +16,7 @@ from livessl.site.checks import Finding, Place, cross_faults, leaks, processed_s
 from livessl.site.models import ArrayConfig, ConfigError, Fault, GeometryFile, Orientation, Site
 
 
-def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
+def load_site(path: Path | str, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
     """Read and check a site file; `joint` adds to its own.
 
     Raises
@@ -24,6 +24,7 @@ def load_site(path: Path, joint: Mapping[str, Sequence[str]] | None = None) -> S
     ConfigError
         With every fault found, each with its line.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
-from conftest import require
+from browser import running_browser
 from livessl.server.api import documentation
 from livessl.site.keys import add_token
 from small_site import Changes, running_server, site_of
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.mark.browser
 @pytest.mark.parametrize("tokens", [False, True])
 def test_page_shows_the_api_and_asks_no_other_server(tmp_path: Path, tokens: bool) -> None:
-    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
     changes: Changes = {"server.http.tokens": "tokens.yaml"} if tokens else {}
     token = add_token(tmp_path / "tokens.yaml", "wall", "viewer")
-    with running_server(site_of(changes, tmp_path)) as server, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+    with running_server(site_of(changes, tmp_path)) as server, running_browser() as browser:
         page = browser.new_page()
         requests: list[str] = []
         faults: list[str] = []
@@ -39,7 +34,6 @@ def test_page_shows_the_api_and_asks_no_other_server(tmp_path: Path, tokens: boo
         page.get_by_role("button", name="Try it out").click()
         page.get_by_role("button", name="Execute").click()
         expect(page.locator(".live-responses-table tbody .response-col_status").first).to_contain_text("200")
-        browser.close()
         assert faults == []
         assert len(requests) >= 5
         outside = [url for url in requests if not url.startswith((f"{server.url}/", "data:"))]

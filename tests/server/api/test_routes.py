@@ -108,11 +108,23 @@ def test_arrays(client: httpx.Client) -> None:
         assert array["age_s"] >= 0
         assert len(array["channel_levels_dbfs"]) == 4
         assert array["level_dbfs"] < -40
+        # four times the noise's power, the default factor; both levels are rounded to 0.1 dB
+        assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 6.02, abs=0.1)
         assert array["sample_rate_hz"] == 16000.0
         assert array["drift_ppm"] == 0.0
         assert array["counters"]["frames"] > 10
         assert array["counters"]["marks"] > 0
         assert set(array["counters"]) >= {"late", "rejected", "lost_frames", "overflows", "duplicates", "sequence_gaps"}
+
+
+def test_activity_threshold_follows_the_site_file() -> None:
+    with (
+        running_server(site_of({"activity.floor_factor": 100.0})) as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        replay_scene(server)
+        for array in get(client, "arrays")["arrays"]:
+            assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 20.0, abs=0.1)
 
 
 def test_arrays_before_their_first_message(fresh: httpx.Client) -> None:

@@ -67,6 +67,10 @@ class ActivityParameters:
     pre_roll_s: float = 0.4
     hang_over_s: float = 0.3
 
+    def least_power(self, floor_power: float) -> float:
+        """Return the least power, full scale squared, at which a frame can be active over a background."""
+        return max(self.floor_factor * floor_power, self.min_power)
+
 
 class CausalActivity:
     """The rule, frame by frame, knowing only the past."""
@@ -91,8 +95,7 @@ class CausalActivity:
         """Whether the next frame, of this mean power, is active."""
         parameters = self._parameters
         self._maximum = max(self._maximum * self._keep, power)
-        least = max(parameters.floor_factor * self.floor_power, parameters.min_power)
-        reference = max(self._maximum, least / parameters.threshold)
+        reference = max(self._maximum, parameters.least_power(self.floor_power) / parameters.threshold)
         self._latest.append(power)
         self._smoothed.append(sum(self._latest) / len(self._latest))
         return bool(is_active(np.asarray(power), reference, parameters.threshold))

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Final
 
 from fastapi import HTTPException, Request
+from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field
 
 from livessl.clock import utc_ns
@@ -52,7 +53,7 @@ class MapParameters(BaseModel):
 
 
 async def refuse_unknown_parameters(request: Request) -> None:
-    """Answer 422 to a request with a query parameter that the OpenAPI description of its route does not name.
+    """Answer 422 to a request with a query parameter that its route does not have.
 
     Raises
     ------
@@ -61,9 +62,8 @@ async def refuse_unknown_parameters(request: Request) -> None:
     """
     if not request.query_params:
         return
-    path, method = request.scope["route"].path, request.method.lower()
-    described = request.app.openapi()["paths"][path][method].get("parameters", ())
-    known = [parameter["name"] for parameter in described if parameter["in"] == "query"]
+    route: APIRoute = request.scope["route"]
+    known = [parameter.alias for parameter in route.dependant.query_params]
     faults = [
         {"type": "extra_forbidden", "loc": ["query", name], "msg": unknown_parameter(name, known), "input": value}
         for name, value in request.query_params.items()

@@ -284,6 +284,9 @@ class Array(BaseModel):
     )
     level_dbfs: LevelDbfs | None = Field(description="Level now; null for digital silence or before the first message.")
     noise_floor_dbfs: LevelDbfs | None = Field(description="Level of the background; null until it is known.")
+    activity_threshold_dbfs: LevelDbfs | None = Field(
+        description="Level above which its node's activity detection finds sound; null until the background is known."
+    )
     channel_levels_dbfs: list[LevelDbfs | None] = Field(
         description="Level of each channel in the site file's order; null for digital silence.",
         examples=[[-52.1, -51.8, -52.4, -52.0]],

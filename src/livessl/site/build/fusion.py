@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livessl.core.locate.estimators import ESTIMATORS
+from livessl.core.locate.estimators import ESTIMATORS, Estimator
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import Each
 from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
@@ -14,6 +14,11 @@ from livessl.site.models import Site
 def make_clock_offsets(site: Site) -> ClockOffsets:
     """What nobody knows yet of this site's clocks: one each node, or each array that is on none."""
     return ClockOffsets({spec.name: site.node_of(spec.name) or spec.name for spec in site.processed}, site.c_m_s)
+
+
+def make_estimator(site: Site, method: str | None = None) -> Estimator:
+    """Return a new estimator of a site's arrays: the site's method, or another of `METHODS`."""
+    return ESTIMATORS[method or site.fusion.method](site.processed, search_grid(site), site.c_m_s)
 
 
 def make_fusion(
@@ -30,7 +35,6 @@ def make_fusion(
     `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
     """
     f, a = site.fusion, site.activity
-    estimator = ESTIMATORS[method or f.method](site.processed, search_grid(site), site.c_m_s)
     parameters = FusionParameters(
         deadline_s=f.deadline_s,
         answer_s=ANSWER_S if live else RECENT_S,
@@ -47,7 +51,7 @@ def make_fusion(
     return Fusion(
         site.site,
         site.processed,
-        estimator,
+        make_estimator(site, method),
         parameters,
         updates=updates,
         newest_only=live,
