@@ -20,8 +20,8 @@ import yaml
 
 from livessl.clock import SystemClock
 from livessl.core.types import Float32Array, Frame, Mark
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
 from livessl.simulation.scene import Scene, make_scene, render
 from livessl.site.load import parse_site
@@ -125,10 +125,10 @@ def heard(array: str, count: int = 2) -> Float32Array:
     return render(scene(count), site_of().array(array).microphones_m, seed=3 + len(array))
 
 
-def scene_parts(start_ns: int, count: int = 2) -> list[Part]:
+def scene_recordings(start_ns: int, count: int = 2) -> list[AssignedRecording]:
     """The scene's recordings, begun at a site time."""
     return [
-        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard(name, count)), start_ns), (1, 2, 3, 4))
+        AssignedRecording(name, MemoryRecording(name, float(RATE_HZ), heard(name, count)), start_ns, (1, 2, 3, 4))
         for name in SMALL["arrays"]
     ]
 

@@ -19,9 +19,9 @@ from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, ne
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording
 from livessl.simulation.scene import render
 from livessl.site.build.fusion import make_fusion
 from livessl.site.models import Site
@@ -53,12 +53,12 @@ def recorded(array: str) -> Any:
     return render(weaker, site().array(array).microphones_m, seed=3 + len(array))
 
 
-def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[Part]:
+def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[AssignedRecording]:
     """North hears the scene, so many times, well; south, whose clock may be ahead, faintly."""
     begin = {"north": start_ns, "south": start_ns + ahead_ns}
     heard = {name: np.tile(recorded(name), (1, times)) for name in begin}
     return [
-        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard[name]), begin[name]), (1, 2, 3, 4))
+        AssignedRecording(name, MemoryRecording(name, float(RATE_HZ), heard[name]), begin[name], (1, 2, 3, 4))
         for name in begin
     ]
 
@@ -106,7 +106,7 @@ class Live:
     """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
 
     def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
-        self.lines, self.placed = pipelines_of(site(), parts(ahead_ns=ahead_ns))
+        self.lines, self.inputs = make_pipelines(site(), parts(ahead_ns=ahead_ns))
         self.settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
@@ -116,7 +116,7 @@ class Live:
     def run(self) -> list[Output | FinalResults]:
         outputs: list[Output | FinalResults] = []
         coming: list[tuple[int, list[Message]]] = []
-        for k, (now_ns, batch) in enumerate(played_messages(self.lines, self.placed, UnpacedClock())):
+        for k, (now_ns, batch) in enumerate(paced_messages(self.lines, self.inputs, UnpacedClock())):
             answers = [message for due, messages in coming if due <= k for message in messages]
             coming = [entry for entry in coming if entry[0] > k]
             new = self.settling.step([*batch, *answers], now_ns)
@@ -190,13 +190,15 @@ def test_arrays_are_asked_by_their_own_clocks() -> None:
 
 def test_nobody_is_asked_where_the_answer_is_sure() -> None:
     loud = [
-        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        replace(
+            part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
+        )
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
     fusion.can_backfill = {"north", "south"}
     outputs: list[Output] = []
-    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
+    for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
@@ -245,7 +247,7 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
     """At four times real time, and as fast as it goes: longer than what a node remembers, or it could not forget."""
     times = 1 if speed else 4
     played = parts(times=times)
-    assert speed or played[0].placed.recording.duration_s > 2 * RECENT_S
+    assert speed or played[0].recording.duration_s > 2 * RECENT_S
     outputs = offline.run(site(), played, UnpacedClock())
     expected = [output for output in outputs if isinstance(output, Event)]
     assert [event.estimate and event.estimate.arrays for event in expected] == [("north", "south")] * SOUNDS * times
@@ -265,7 +267,9 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
 def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> None:
     """A node stood still: its sound comes after the live event has asked it, and before it answers."""
     loud = [
-        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        replace(
+            part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
+        )
         for part in parts()
     ]
     settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
@@ -274,7 +278,7 @@ def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> No
     held: list[Message] | None = []
     asked = False
     told: list[Output | FinalResults] = []
-    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
+    for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         if held is not None:
             held += [message for message in batch if message.array == "south"]
             batch = [message for message in batch if message.array == "north"]

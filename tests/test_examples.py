@@ -14,7 +14,7 @@ import pytest
 
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
-from small_site import running_server, scene_parts, site_of, wait_until
+from small_site import running_server, scene_recordings, site_of, wait_until
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 START_NS = 1_767_225_600_000_000_000
@@ -73,7 +73,7 @@ def test_subscriber_prints_the_events_of_a_server() -> None:
             reader.start()
             try:
                 wait_until(lambda: server.parts.fanout.clients == 1, "the subscriber", HANGS_AFTER_S)
-                parts = scene_parts(START_NS)
+                parts = scene_recordings(START_NS)
                 pace = UnpacedClock(START_NS)
                 send_session(site_of(), server.endpoint, parts, pace, SystemClock(), "run", lambda: False)
                 printed = [lines.get(timeout=HANGS_AFTER_S) for _ in range(2)]

@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from livessl.core.geometry import Grid
     from livessl.core.locate.estimators import Estimator, Localization, Sound
     from livessl.core.types import ArraySpec, Estimate, Event
+    from livessl.errors import ConfigError
     from livessl.offline import PowerMap, locate, power_map
     from livessl.simulation.of_site import Simulation, simulate
     from livessl.site.load import load_site
-    from livessl.site.models import METHODS, ConfigError, Site
+    from livessl.site.models import METHODS, Site
 
 __version__ = "0.2.0"
 
@@ -43,7 +44,7 @@ __all__ = [
 _HOMES: Final = {
     "METHODS": "site.models",
     "ArraySpec": "core.types",
-    "ConfigError": "site.models",
+    "ConfigError": "errors",
     "Estimate": "core.types",
     "Estimator": "core.locate.estimators",
     "Event": "core.types",

@@ -26,9 +26,9 @@ from livessl.core.types import (
     read_only,
 )
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, parts_from_wavs, pipelines_of, recording_channels
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording, assign_files, make_pipelines, recording_channels
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording
 from livessl.site.build.fusion import make_estimator, make_fusion
 from livessl.site.load import load_site
 from livessl.site.models import Site
@@ -130,8 +130,8 @@ def power_map(
     loaded = _site(site)
     sounds = {}
     for part in _parts(loaded, recordings, sample_rate_hz):
-        rate_hz = part.placed.recording.sample_rate_hz
-        samples = np.concatenate([block.samples for block in part.placed.recording.blocks(0)], axis=1)
+        rate_hz = part.recording.sample_rate_hz
+        samples = np.concatenate([block.samples for block in part.recording.blocks(0)], axis=1)
         stop = None if stop_s is None else round(stop_s * rate_hz)
         segment = samples[np.array(part.channels) - 1, round(start_s * rate_hz) : stop]
         if not segment.any():
@@ -151,7 +151,7 @@ def power_map(
 
 def run(
     site: Site,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     clock: Clock,
     *,
     method: str | None = None,
@@ -168,11 +168,11 @@ def run(
         Where recordings of arrays that the site joins do not belong together.
     """
     fusion = make_fusion(site, method, updates=False)
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     if backfill:
         fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
     now_ns = 0
-    for now_ns, batch in played_messages(pipelines, placed, clock):
+    for now_ns, batch in paced_messages(pipelines, inputs, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
         while requests := [output for output in outputs if isinstance(output, BackfillRequest)]:
             yield from (output for output in outputs if not isinstance(output, BackfillRequest))
@@ -196,17 +196,17 @@ def _site(site: SiteOrPath) -> Site:
     return site if isinstance(site, Site) else load_site(site)
 
 
-def _parts(site: Site, recordings: Mapping[str, Given], sample_rate_hz: float | None) -> list[Part]:
+def _parts(site: Site, recordings: Mapping[str, Given], sample_rate_hz: float | None) -> list[AssignedRecording]:
     if not recordings:
         raise DeviceError(f"recordings: expected one for each of {', '.join(site.arrays)}, got none")
     files = {name: Path(given) for name, given in recordings.items() if isinstance(given, str | Path)}
     samples = {name: given for name, given in recordings.items() if not isinstance(given, str | Path)}
-    parts = {part.array: part for part in parts_from_wavs(site, files)}
+    parts = {part.array: part for part in assign_files(site, files)}
     parts |= {name: _part(site, name, given, sample_rate_hz) for name, given in samples.items()}
     return [parts[name] for name in recordings]
 
 
-def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None) -> Part:
+def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None) -> AssignedRecording:
     known = (*site.arrays, *site.joint)
     if array not in known:
         raise DeviceError(f"recordings: no array {array!r}; arrays are {', '.join(known)}")
@@ -214,8 +214,8 @@ def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None
     rate_hz = sample_rate_hz or (site.nodes[node].device.sample_rate_hz if node else None)
     if rate_hz is None:
         raise DeviceError(f"array {array!r}: expected the sampling rate of its samples; pass sample_rate_hz")
-    recording = ArrayRecording(f"array {array!r}", float(rate_hz), _checked(array, np.asarray(samples)))
-    return Part(array, Placed(recording, 0), tuple(recording_channels(site, array, recording)))
+    recording = MemoryRecording(f"array {array!r}", float(rate_hz), _checked(array, np.asarray(samples)))
+    return AssignedRecording(array, recording, 0, tuple(recording_channels(site, array, recording)))
 
 
 def _checked(array: str, samples: Samples) -> Float32Array:

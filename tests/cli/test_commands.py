@@ -26,10 +26,11 @@ from livessl import __version__
 from livessl.capture.link import Link
 from livessl.cli.main import main
 from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.errors import ConfigError, Fault
 from livessl.lab import demo
 from livessl.recordings.session import read_session
 from livessl.server.receiver import Receiver
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.site.models import Site
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
@@ -348,7 +349,7 @@ def test_all_files_that_do_not_fit_are_told(run: Run, recorded: Recorded, tmp_pa
         ("north=1,2,3", "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3]"),
         ("north=1,2,3,5", "expected 4 different channel numbers from 1 to 4"),
         ("north=1,2,3,3", "expected 4 different channel numbers from 1 to 4"),
-        ("west=1,2,3,4", "channels of array 'west': no recording of it is given; there are north, south"),
+        ("west=1,2,3,4", "channels of array 'west': expected an array with a recording (north, south)"),
     ],
 )
 def test_channels_that_do_not_fit(run: Run, recorded: Recorded, channels: str, said: str) -> None:
@@ -516,7 +517,8 @@ def test_capture_with_no_server_says_so_at_the_end(run: Run, recorded: Recorded,
     done = run("capture", "--site", site, "--node", "lab-pc", *recorded.wavs(), "--start-at", begin)
     assert done.code == 1
     assert re.search(
-        rf"livessl: error: \d+ messages were never taken by the server at {endpoint}; is one running there\?", done.err
+        rf"livessl: error: \d+ messages were never acknowledged by the server at {endpoint}; is one running there\?",
+        done.err,
     )
 
 

@@ -10,9 +10,10 @@ from typing import Any
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json
 from livessl.cli.output import print_warnings
+from livessl.errors import ConfigError, Fault
 from livessl.site.build.grid import search_grid
+from livessl.site.checks import unprotected_addresses
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, Fault, open_doors
 
 
 def add_arguments(parser: Any) -> None:
@@ -25,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     try:
         site = load_site(arguments.site)
-        doors = open_doors(site)
+        doors = unprotected_addresses(site)
         if doors:
             raise ConfigError([Fault(f"{arguments.site}: {door.where}", door.what) for door in doors])
     except ConfigError as error:

@@ -12,9 +12,9 @@ from typing import Any
 from livessl.cli import argument
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json, add_site
-from livessl.site import keys
+from livessl.errors import ConfigError, Fault
+from livessl.site import keys, tokens
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, Fault
 
 
 def add_arguments(parser: Any) -> None:
@@ -40,7 +40,7 @@ def add_arguments(parser: Any) -> None:
     sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` printed it")
     sub = action("token", _token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
     sub.add_argument("--name", required=True, help="name of the client, to revoke its token by")
-    sub.add_argument("--role", choices=[str(role) for role in keys.Role], default="viewer", help="default viewer")
+    sub.add_argument("--role", choices=[str(role) for role in tokens.Role], default="viewer", help="default viewer")
     sub = action("revoke", _revoke, "stop admitting a node or a client", "revoke --site site.yaml --token wall")
     which = sub.add_mutually_exclusive_group(required=True)
     which.add_argument("--node", metavar="NAME")
@@ -95,7 +95,7 @@ def _enrol(arguments: argparse.Namespace) -> int:
 
 
 def _token(arguments: argparse.Namespace) -> int:
-    print(keys.add_token(_tokens_file(arguments), arguments.name, arguments.role))
+    print(tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role))
     logging.info("the token is shown only now; a running server accepts it within a second")
     return OK
 
@@ -105,7 +105,7 @@ def _revoke(arguments: argparse.Namespace) -> int:
         keys.dismiss(_folder(arguments), arguments.node)
         logging.info("node %r is no longer enrolled; restart a running server to shut it out", arguments.node)
     else:
-        keys.revoke_token(_tokens_file(arguments), arguments.token)
+        tokens.revoke_token(_tokens_file(arguments), arguments.token)
         logging.info("a running server refuses the token within a second")
     return OK
 
@@ -113,8 +113,8 @@ def _revoke(arguments: argparse.Namespace) -> int:
 def _list(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     nodes = {} if site.keys is None else keys.enrolled(site.file(site.keys))
-    tokens = site.server.http.tokens
-    clients = () if tokens is None else keys.read_tokens(site.file(tokens)).clients
+    file = site.server.http.tokens
+    clients = () if file is None else tokens.read_tokens(site.file(file)).clients
     if arguments.json:
         listed = [{"name": client.name, "role": str(client.role)} for client in clients]
         print(json.dumps({"nodes": {name: key.hex() for name, key in nodes.items()}, "clients": listed}))

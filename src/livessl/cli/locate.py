@@ -12,7 +12,7 @@ from livessl.cli.options import add_joint, add_json, add_method, add_site, add_w
 from livessl.cli.output import complain, print_event, print_warnings
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event
-from livessl.recordings.assign import parts_from_wavs, span_ns
+from livessl.recordings.assign import assign_files, span_ns
 from livessl.server.api.encode import Messages
 
 
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     site = read_site(arguments)
     print_warnings(site)
-    parts = parts_from_wavs(site, *wavs(arguments))
+    parts = assign_files(site, *wavs(arguments))
     messages = Messages(site, 0, utc=False)
     found = 0
     with progress.timed("locating", *span_ns(parts)) as bar:

@@ -10,8 +10,10 @@ from livessl.capture.device import Device
 from livessl.cli import progress
 from livessl.cli.options import wavs
 from livessl.clock import Clock
-from livessl.recordings.assign import Part
-from livessl.site.models import ConfigError, Fault, NodeConfig, Site, SoundDeviceConfig
+from livessl.errors import ConfigError, Fault
+from livessl.recordings.assign import AssignedRecording
+from livessl.site.models import Site
+from livessl.site.node_models import NodeConfig, SoundDeviceConfig
 
 
 def node_config(site: Site, name: str, path: Path) -> NodeConfig:
@@ -62,18 +64,18 @@ def audio_device(arguments: argparse.Namespace, config: NodeConfig, clock: Clock
     return SoundDevice(config.device, max(map(max, config.arrays.values())), clock)
 
 
-def recordings(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[Part]:
+def recordings(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[AssignedRecording]:
     """Return what a node plays instead of an audio device: the files of --wav, or what the site file names."""
-    from livessl.capture.stand_in import parts_from_node
-    from livessl.recordings.assign import common_start_ns, parts_from_wavs, repeated
+    from livessl.capture.playback import node_recordings
+    from livessl.recordings.assign import assign_files, common_start_ns, looped
 
     start_ns = getattr(arguments, "start_at", None) or common_start_ns(now_ns, len(site.nodes))
     if not arguments.wav:
         with progress.counted("simulating the room", "source") as bar:
-            parts = parts_from_node(site, arguments.node, start_ns, arguments.site.parent, bar)
+            parts = node_recordings(site, arguments.node, start_ns, bar)
     else:
-        parts = parts_from_wavs(site, *wavs(arguments), start_ns)
-    return repeated(parts) if getattr(arguments, "loop", False) else parts
+        parts = assign_files(site, *wavs(arguments), start_ns)
+    return looped(parts) if getattr(arguments, "loop", False) else parts
 
 
 def run_id(node: str, clock: Clock) -> str:

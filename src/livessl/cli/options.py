@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from livessl.cli import argument
+from livessl.errors import ConfigError, Fault
 from livessl.site.load import load_site
-from livessl.site.models import METHODS, ConfigError, Fault, Site
+from livessl.site.models import METHODS, Site
 
 T = TypeVar("T")
 

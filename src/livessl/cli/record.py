@@ -14,10 +14,10 @@ from livessl.cli.node_input import audio_device, check_files, node_config, recor
 from livessl.cli.options import add_site, add_wav
 from livessl.cli.output import complain
 from livessl.clock import SystemClock
-from livessl.recordings.recorder import Recorder, record_parts
+from livessl.errors import ConfigError, Fault
+from livessl.recordings.recorder import Recorder, record_playback
 from livessl.recordings.session import SESSION_FILE
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, Fault
 
 
 def add_arguments(parser: Any) -> None:
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
             recorded = recorder.recorded
         else:
             parts = recordings(arguments, site, begun_ns)
-            recorded = record_parts(arguments.out, site, parts, clock, over, arguments.format)
+            recorded = record_playback(arguments.out, site, parts, clock, over, arguments.format)
     if not recorded:
         complain("nothing was recorded: the device delivered no sound")
         return FAILED

@@ -17,11 +17,12 @@ from livessl.cli.options import add_joint, add_json, add_method, joints
 from livessl.cli.output import print_event
 from livessl.cli.serve import run_until_stopped
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
-from livessl.recordings.assign import Part, parts_from_sessions, span_ns
+from livessl.recordings.assign import AssignedRecording, assign_sessions, span_ns
 from livessl.recordings.session import read_session
 from livessl.server.app import Server
 from livessl.site.load import load_site
-from livessl.site.models import HttpConfig, Site, StoreConfig
+from livessl.site.models import Site
+from livessl.site.server_models import HttpConfig, StoreConfig
 
 
 def add_arguments(parser: Any) -> None:
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = joints(arguments)
     site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
-    parts = parts_from_sessions(site, sessions)
+    parts = assign_sessions(site, sessions)
     if arguments.server is not None:
         with stop_on_signal() as stop:
             _send(site, arguments.server, parts, arguments.speed, stop)
@@ -54,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Part]) -> None:
+def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[AssignedRecording]) -> None:
     """Run a server in this process, with dashboard, and play the session to it."""
     server = Server(
         _private(site, own_http=arguments.site is not None),
@@ -96,7 +97,7 @@ def _private(site: Site, *, own_http: bool) -> Site:
     return site.model_copy(update={"server": here, "keys": None, "store": StoreConfig()})
 
 
-def _send(site: Site, endpoint: str, parts: Sequence[Part], speed: float, stop: threading.Event) -> None:
+def _send(site: Site, endpoint: str, parts: Sequence[AssignedRecording], speed: float, stop: threading.Event) -> None:
     clock = SystemClock()
     begin_ns, end_ns = span_ns(parts)
     pace = UnpacedClock(begin_ns) if speed == float("inf") else PacedClock(begin_ns, speed)

@@ -11,12 +11,12 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_site
 from livessl.cli.output import complain
+from livessl.errors import ConfigError, Fault
 from livessl.recordings.session import SESSION_FILE
 from livessl.simulation.export import TRUTH_FILE, write_scene
 from livessl.simulation.of_site import scene_of
 from livessl.simulation.scene import read_sounds
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, Fault
 
 
 def add_arguments(parser: Any) -> None:

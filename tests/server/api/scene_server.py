@@ -15,7 +15,7 @@ from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.server.app import Server
-from small_site import running_server, scene_parts, site_of, wait_until
+from small_site import running_server, scene_recordings, site_of, wait_until
 
 CLOCK: Final = SystemClock()
 _RUNS = count()
@@ -33,14 +33,14 @@ def capture_scene(server: Server) -> None:
     """Send the scene to the server as a live node does, and wait for both events."""
     node_site = site_of({"nodes.lab-pc.server": server.endpoint})
     start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # in the future: old sound would not be published as live
-    capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+    capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
     wait_until(lambda: server.parts.event_log.published == 2, "both events")
 
 
 def replay_scene(server: Server) -> None:
     """Send the scene to the server as a replay, and wait for its end."""
     run = f"run-{next(_RUNS)}"
-    send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, run, lambda: False)
+    send_session(site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, run, lambda: False)
     server.wait_idle()
 
 

@@ -13,7 +13,7 @@ import pytest
 from livessl.server.api.queries import KINDS
 from livessl.server.app import Server
 from livessl.server.maps import HEADER
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import running_server, site_of
 
 PATH = "/api/v1/asyncapi.json"

@@ -14,7 +14,7 @@ from browser import faultless_page, running_browser
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.server.app import Server
-from small_site import running_server, scene_parts, site_of
+from small_site import running_server, scene_recordings, site_of
 
 pytestmark = [pytest.mark.browser]
 
@@ -38,7 +38,7 @@ def replayed() -> Iterator[Server]:
 
 def replay_scene(server: Server) -> None:
     """Replay the small scene through a running server, to its end."""
-    send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), SystemClock(), "run-1", lambda: False)
+    send_session(site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), SystemClock(), "run-1", lambda: False)
     server.wait_idle()
 
 

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from browser import faultless_page, running_browser
-from livessl.site.keys import RoleName, add_token
+from livessl.site.tokens import RoleName, add_token
 from small_site import Changes, running_server, site_of
 
 SECURED: Changes = {

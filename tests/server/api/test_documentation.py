@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 from browser import running_browser
 from livessl.server.api import documentation
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import Changes, running_server, site_of
 
 

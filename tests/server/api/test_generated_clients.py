@@ -22,7 +22,7 @@ from conftest import require
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.server.app import Server
-from small_site import running_server, scene_parts, site_of
+from small_site import running_server, scene_recordings, site_of
 
 PACKAGES = {"openapi-typescript": "7.13.0", "typescript": "5.9.3", "@asyncapi/specs": "6.11.1"}
 """Packages from npm, at fixed versions, so that a new release cannot break the tests."""
@@ -66,7 +66,7 @@ def server_and_messages() -> Iterator[tuple[Server, list[str]]]:
             send_session(
                 site_of(),
                 server.endpoint,
-                scene_parts(start_ns),
+                scene_recordings(start_ns),
                 UnpacedClock(),
                 SystemClock(),
                 "run",

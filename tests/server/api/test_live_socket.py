@@ -13,7 +13,7 @@ from scene_server import CLOCK, capture_scene, live, located_scene
 from websockets.exceptions import ConnectionClosed
 
 from livessl.clock import utc_ns
-from livessl.server import app
+from livessl.server import http
 from livessl.server.app import Server
 from small_site import running_server, site_of, wait_until
 
@@ -97,7 +97,7 @@ def test_subscriber_that_sends_too_much_is_disconnected(server: Server) -> None:
 
 
 def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(app, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(http, "MAX_CONNECTIONS", 2)
     with running_server(site_of()) as server:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from livessl.clock import utc_ns, utc_text
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
-from livessl.site.keys import add_token
+from livessl.site.tokens import add_token
 from small_site import SMALL, running_server, scene, site_of, wait_until
 
 PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}

@@ -22,7 +22,7 @@ from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.parts import Parts
-from livessl.site.models import is_loopback
+from livessl.site.addresses import is_loopback
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""

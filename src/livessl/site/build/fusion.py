@@ -1,4 +1,4 @@
-"""The fusion of a site: estimator, parameters and clock offsets. It loads everything that locates."""
+"""The fusion of a site: estimator, parameters and clock offsets. It imports everything that locates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from livessl.site.models import Site
 
 
 def make_clock_offsets(site: Site) -> ClockOffsets:
-    """What nobody knows yet of this site's clocks: one each node, or each array that is on none."""
+    """Return clock offsets, all still unknown: one clock for each node, and one for each array without a node."""
     return ClockOffsets({spec.name: site.node_of(spec.name) or spec.name for spec in site.processed}, site.c_m_s)
 
 
@@ -30,9 +30,21 @@ def make_fusion(
     clock_offsets: ClockOffsets | None = None,
     each: Each | None = None,
 ) -> Fusion:
-    """A new fusion of this site's arrays, by the site's method or another of `METHODS`.
+    """Return a new fusion of this site's arrays.
 
-    `clock_offsets` is what is known already of the arrays' clocks; `each` is what arrays are listened to by.
+    Parameters
+    ----------
+    site : Site
+    method : str or None
+        One of `METHODS`; None for the site's own.
+    updates : bool
+        Publish updates while an event lasts.
+    live : bool
+        True for live sound: wait less long for requested frames, and leave out updates that are overdue.
+    clock_offsets : ClockOffsets or None
+        Offsets that are known already; None to begin with unknown ones.
+    each : Each or None
+        Parallel `for_each` that correlates the arrays' frames; None for a plain loop.
     """
     f, a = site.fusion, site.activity
     parameters = FusionParameters(
