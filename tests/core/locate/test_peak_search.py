@@ -174,7 +174,7 @@ def test_a_search_that_gives_up_is_not_proven(kernels: ModuleType) -> None:
 
 def test_memory_does_not_grow_with_the_grid() -> None:
     specs = arrays(2, 2)
-    coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.1, 0.02))
+    coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.05, 0.01))
     assert coarse.table_bytes == fine.table_bytes
     hall = PeakSearch(specs, Grid(((0.0, 60.0), (0.0, 80.0), (0.0, 20.0)), 0.5), C_M_S)
     pairs = sum(len(spec.microphones_m) * (len(spec.microphones_m) - 1) // 2 for spec in specs)

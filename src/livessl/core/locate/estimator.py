@@ -131,9 +131,12 @@ class PowerMaps:
 class Estimator(Protocol):
     """The interface of a localization method, as fusion uses it.
 
-    Offline, only `locate` does any work. Live, `prepare` is called when a node connects, `onset_front_end` for every
-    array before its first frame, and `power_maps` when a client requests a map. All calls come from one thread, except
-    those of `power_maps`. An estimator may cache, but must give the same answer to the same sounds.
+    `locate` does the work, live and offline; everything else may do nothing: `prepare` is only called live, when a node
+    connects; `onset_front_end` may return None; `power_maps` is only called when a client requests a map. An estimator
+    may cache, but must give the same answer to the same sounds, and must not depend on their order.
+
+    Calls come from one thread, with two exceptions: `onset_front_end` may be called for several arrays at once, and
+    `power_maps` from another thread.
     """
 
     name: str
