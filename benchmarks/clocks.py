@@ -96,9 +96,7 @@ def heard_with(
             start_ns += round(offset_s * 1e9)
         placed = Placed(Drifting(recording, drift_ppm if array == late else 0.0), start_ns)
         parts.append(Part(array, placed, tuple(range(1, 5))))
-    fusion = make_fusion(site, updates=False)
-    if not corrected:
-        fusion.clock_offsets = None
+    fusion = make_fusion(site, updates=False, corrects_clocks=corrected)
     outputs: list[Output] = []
     now_ns = 0
     for now_ns, batch in played_messages(*pipelines_of(site, parts), UnpacedClock()):

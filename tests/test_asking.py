@@ -16,14 +16,15 @@ from livessl import offline
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
-from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.final_pass import FinalResults
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
 from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.simulate.scene import render
-from livessl.site.build.fusion import make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, running_server, scene, site_of
 
@@ -105,9 +106,17 @@ def test_methods_that_cannot_weigh_an_array_ask_nobody() -> None:
 class Live:
     """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
 
-    def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
+    def __init__(
+        self,
+        way: int,
+        *,
+        answers: bool = True,
+        deaf: bool = False,
+        ahead_ns: int = 0,
+        clocks: ClockOffsets | None = None,
+    ) -> None:
         self.lines, self.placed = pipelines_of(site(), parts(ahead_ns=ahead_ns))
-        self.settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
+        self.settling = make_two_pass_fusion(site(), ("north", "south"), live=True, clock_offsets=clocks)
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
         self.way, self.deaf = way, deaf
@@ -174,14 +183,10 @@ def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
 def test_arrays_are_asked_by_their_own_clocks() -> None:
     """Nobody can know the offset before three sounds that both heard; here it is known already."""
     ahead_ns = 150_000_000
-    live = Live(1, ahead_ns=ahead_ns)
-    clocks = live.settling.live.clock_offsets
-    assert clocks is not None
+    clocks = make_clock_offsets(site())
     for k in range(3):
         clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-    live.settling = TwoPassFusion(live.settling.live, ("north", "south"))
-    live.settling.greet("south", None, START_NS, answers=True)
-    events = settled(live.run())
+    events = settled(Live(1, ahead_ns=ahead_ns, clocks=clocks).run())
     expected = offline_events()
     assert [event.estimate and event.estimate.arrays for event in events] == [("north", "south")] * SOUNDS
     for event, other in zip(events, expected, strict=True):
@@ -194,7 +199,7 @@ def test_nobody_is_asked_where_the_answer_is_sure() -> None:
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
-    fusion.can_backfill = {"north", "south"}
+    fusion.can_backfill.update({"north", "south"})
     outputs: list[Output] = []
     for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
@@ -234,7 +239,7 @@ def test_frames_that_nobody_asked_for_change_nothing() -> None:
     fusion = make_fusion(site(), updates=False)
     samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
     frame_index = START_NS // FRAME_NS
-    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True)
+    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True, requested=True)
     assert fusion.step([stray], START_NS) == []
     assert fusion.closed is None
     assert fusion.status(START_NS)[1].counters["frames"] == 0
@@ -268,7 +273,7 @@ def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> No
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
     ]
-    settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
+    settling = make_two_pass_fusion(site(), ("north", "south"), live=True)
     for name in ("north", "south"):
         settling.greet(name, None, START_NS, answers=True)
     held: list[Message] | None = []

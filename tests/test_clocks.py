@@ -12,14 +12,13 @@ import pytest
 
 from livessl.clock import UnpacedClock
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
-from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset
+from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset, ClockOffsets
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
-from livessl.core.stream.fusion import Fusion
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
 from livessl.recordings.assign import pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import Placed
-from livessl.site.build.fusion import make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, scene, scene_parts, site_of
 
@@ -112,15 +111,12 @@ def test_sounds_close_to_one_another_stay_apart() -> None:
     """
 
     def told_of(*, corrected: bool) -> list[Event]:
-        fusion = make_fusion(site(), updates=False)
-        if not corrected:
-            fusion.clock_offsets = None
-        else:
-            assert fusion.clock_offsets is not None
-            for k in range(LEAST_SOUNDS):
-                fusion.clock_offsets.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-            fusion.step([], START_NS)
-            fusion._align()
+        clocks = make_clock_offsets(site())
+        for k in range(LEAST_SOUNDS):
+            clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
+        fusion = make_fusion(
+            site(), updates=False, corrects_clocks=corrected, clock_offsets=clocks if corrected else None
+        )
         messages: list[Message] = []
         for first in (20, 33):
             for array, ahead in (("north", 0), ("south", 3)):
@@ -147,15 +143,15 @@ def settled_events(outputs: Iterable[Output | FinalResults]) -> list[Event]:
     return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
-def settling(fusion: Fusion | None = None, settled: int | None = None) -> TwoPassFusion:
-    return TwoPassFusion(fusion or make_fusion(site(), live=True), ("north", "south"), settled)
+def two_passes(clocks: ClockOffsets | None = None, settled: int | None = None) -> TwoPassFusion:
+    return make_two_pass_fusion(site(), ("north", "south"), settled, live=True, clock_offsets=clocks)
 
 
 @pytest.mark.parametrize("step", [1, 7, 100])
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
 def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
     """However many messages come at a time; and none of them only from the fusion that does not wait."""
-    into = settling()
+    into = two_passes()
     outputs: list[Output | FinalResults] = []
     all_batches = batches(ahead_s)
     for at in range(0, len(all_batches), step):
@@ -174,18 +170,18 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
     kept: dict[str, list[Frame]] = {name: [] for name in arrays}
     stored: tuple[int | None, dict[str, Any] | None] = (None, None)
     events: list[Event] = []
-    into = settling()
+    clocks = make_clock_offsets(site())
+    into = two_passes(clocks)
     for k, (now_ns, batch) in enumerate(batches(ahead_s)):
         for message in batch:
             if isinstance(message, Frame):
                 kept[message.array].append(message)
         outputs = into.step(batch, now_ns)
         if k % 29 == 28:  # it is killed, and starts again with what is stored
-            fusion = make_fusion(site(), live=True)
+            clocks = make_clock_offsets(site())
             if stored[1] is not None:
-                assert fusion.clock_offsets is not None
-                fusion.clock_offsets.restore(stored[1])
-            again = settling(fusion, stored[0])
+                clocks.restore(stored[1])
+            again = two_passes(clocks, stored[0])
             for name in arrays:
                 if kept[name]:
                     again.greet(name, (kept[name][0].frame_index, kept[name][-1].frame_index + 1), now_ns)
@@ -196,8 +192,7 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
         for output in outputs:
             if isinstance(output, FinalResults):
                 events += output.events
-                assert into.live.clock_offsets is not None
-                stored = output.until, into.live.clock_offsets.state()
+                stored = output.until, clocks.state()
         for name, settled in into.settled_of.items():
             kept[name] = [frame for frame in kept[name] if frame.frame_index >= settled]
     events += settled_events(into.flush(now_ns))

@@ -99,8 +99,7 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Counts the array's frames since its node started, from 1. 0 is a frame that the server asked for, and the node
-        would not have sent.
+        Counts the array's frames since its node started, from 1; 0 where `requested`.
     frame_index : int
         Index on the grid of 50 ms: `time_ns` of the interval's start divided by 50 ms.
     time_ns : int
@@ -113,6 +112,8 @@ class Frame:
         In-band mean power over the channels, full scale squared.
     active : bool
         Whether the causal activity detection found sound in it.
+    requested : bool
+        The frame answers a `BackfillRequest`. It stands outside the count of frames that the node sends by itself.
     """
 
     array: str
@@ -123,6 +124,7 @@ class Frame:
     samples: Float32Array
     power: float
     active: bool
+    requested: bool = False
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2 or self.samples.dtype != np.float32:

@@ -13,7 +13,7 @@ from livessl import wire
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.core.locate.peak_search import warm_up
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
-from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Message, Output, Track, TrackState, Update
 from livessl.server.api.encode import JsonObject, Messages, Stages, array_status
 from livessl.server.latency import Latency
@@ -23,7 +23,7 @@ from livessl.server.receiver import Greeted, Joined, Left, Receiver
 from livessl.server.refusals import Refusals
 from livessl.server.resident import unmap_unused
 from livessl.server.store import Store, StoreError
-from livessl.site.build.fusion import make_clock_offsets, make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_two_pass_fusion
 from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
@@ -149,7 +149,7 @@ class Engine:
     @property
     def updates_left_out(self) -> int:
         """Windows that were not localized, for newer ones were due."""
-        return self._settling.live.updates_left_out
+        return self._settling.updates_left_out
 
     @property
     def malformed(self) -> int:
@@ -244,8 +244,9 @@ class Engine:
         self._clocks = make_clock_offsets(self._site)
         if clocks is not None:
             self._clocks.restore(clocks)
-        fusion = make_fusion(self._site, live=live, clock_offsets=self._clocks, each=self._helper.each)
-        self._settling = TwoPassFusion(fusion, arrays, settled)
+        self._settling = make_two_pass_fusion(
+            self._site, arrays, settled, live=live, clock_offsets=self._clocks, for_each=self._helper.each
+        )
         self._messages: Messages | None = None
         self.maps.clear()
 
@@ -323,7 +324,7 @@ class Engine:
             self._replaying = hello.replay
             self._replay_heard_ns = self._clock.monotonic_ns()
         for array, rate_hz in hello.arrays.items():
-            self._settling.live.prepare(array, rate_hz)
+            self._settling.prepare(array, rate_hz)
 
     def _leave(self, hello: wire.Hello) -> None:
         _log.info("node %r has ended", hello.node)
@@ -371,7 +372,7 @@ class Engine:
             elif isinstance(output, Track):
                 self._keep_track(self._messages.track(output), output)
             else:
-                self.maps.show(output, self._settling.live.power_maps)
+                self.maps.show(output, self._settling.power_maps)
 
     def _stages(self, answer: Update | Event, kind: str) -> Stages | None:
         """Where an answer's time went; a recording's was long ago."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +18,17 @@ from livessl.core.geometry import (
     speed_of_sound_m_s,
     tetrahedron,
 )
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, FloatArray
 from livessl.errors import UseError
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
 """Names of `livessl.core.locate.estimators.ESTIMATORS`: who checks a site file need not load what localizes."""
+
+_ACTIVITY: Final = ActivityParameters()
+_FUSION: Final = FusionParameters()
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -305,26 +311,26 @@ class StoreConfig(_Model):
 class ActivityConfig(_Model):
     """The rule that finds sound: see `livessl.core.stream.activity`."""
 
-    threshold: Annotated[float, Field(gt=0, le=1)] = 0.1
-    release_s: Positive = 1.0
-    floor_window_s: Positive = 3.0
-    floor_factor: Annotated[float, Field(ge=1, le=1e6)] = 4.0
-    min_level_dbfs: Annotated[float, Field(ge=-300, le=0)] = -90.0
-    pre_roll_s: Annotated[float, Field(ge=0, le=5)] = 0.4
-    hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = 0.3
+    threshold: Annotated[float, Field(gt=0, le=1)] = _ACTIVITY.threshold
+    release_s: Positive = _ACTIVITY.release_s
+    floor_window_s: Positive = _ACTIVITY.floor_window_s
+    floor_factor: Annotated[float, Field(ge=1, le=1e6)] = _ACTIVITY.floor_factor
+    min_level_dbfs: Annotated[float, Field(ge=-300, le=0)] = 10.0 * math.log10(_ACTIVITY.min_power)
+    pre_roll_s: Annotated[float, Field(ge=0, le=5)] = _ACTIVITY.pre_roll_s
+    hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = _ACTIVITY.hang_over_s
 
 
 class FusionConfig(_Model):
     """How arrays are joined."""
 
     method: str = "onset"
-    deadline_s: Annotated[float, Field(gt=0, le=10)] = 0.5
-    window_s: Annotated[float, Field(ge=0.05, le=2)] = 0.2
-    update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1
-    max_event_s: Annotated[float, Field(ge=0.5, le=60)] = 10.0
-    min_arrays: Annotated[int, Field(ge=1)] = 1
-    sources: Annotated[int, Field(ge=1, le=2)] = 2
-    live_sources: Annotated[int, Field(ge=1, le=2)] = 1
+    deadline_s: Annotated[float, Field(gt=0, le=10)] = _FUSION.deadline_s
+    window_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.window_s
+    update_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.update_s
+    max_event_s: Annotated[float, Field(ge=0.5, le=60)] = _FUSION.max_event_s
+    min_arrays: Annotated[int, Field(ge=1)] = _FUSION.min_arrays
+    sources: Annotated[int, Field(ge=1, le=2)] = _FUSION.sources
+    live_sources: Annotated[int, Field(ge=1, le=2)] = _FUSION.live_sources
 
 
 class Zone(_Model):

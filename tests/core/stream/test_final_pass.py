@@ -6,19 +6,19 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
-from test_fusion import HANG_OVER, START, Arrivals, frame, fusion_of, mark, node, now_ns
+from test_fusion import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, state_of
 
-from livessl.core.stream import final_pass
 from livessl.core.stream.array_health import LOST_NS
-from livessl.core.stream.final_pass import HOLD_NS, FinalResults, TwoPassFusion
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")
 SECOND = 20
 
 
-def settling_of(settled: int | None = None) -> TwoPassFusion:
-    return TwoPassFusion(fusion_of(), NAMES, settled)
+def two_passes(settled: int | None = None, *, hold_ns: int = HOLD_NS, hold_bytes: int = HOLD_BYTES) -> TwoPassFusion:
+    return TwoPassFusion(state_of(), NAMES, settled, hold_ns=hold_ns, hold_bytes=hold_bytes)
 
 
 def play(into: TwoPassFusion, arrivals: Arrivals, until: int, since: int = 0) -> list[tuple[int, Event | FinalResults]]:
@@ -44,7 +44,7 @@ def both(active: range, frame_indices: range) -> Arrivals:
 
 
 def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() -> None:
-    said = play(settling_of(), both(range(10, 16), range(40)), 40)
+    said = play(two_passes(), both(range(10, 16), range(40)), 40)
     assert provisional(said) == []
     ((when, output),) = said
     assert when == 16 + HANG_OVER
@@ -56,20 +56,20 @@ def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() ->
 
 
 def test_what_is_settled_grows_with_silence_but_for_a_run_up() -> None:
-    into = settling_of()
+    into = two_passes()
     assert into.settled is None
     play(into, both(range(0), range(100)), 100)
     assert into.settled == START + 100 - 8
 
 
 def test_sound_that_lasts_holds_what_it_needs() -> None:
-    into = settling_of()
+    into = two_passes()
     play(into, both(range(30, 90), range(60)), 60)
     assert into.settled == START + 30 - 8
 
 
 def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
-    into = settling_of()
+    into = two_passes()
     north, south = node("north", range(40, 46), range(200)), node("south", range(40, 46), range(30))
     said = play(into, north + south, 100)
     assert settled_events(said) == []
@@ -88,9 +88,8 @@ def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
     assert into.backfilled == {"north": 0, "south": len(kept)}
 
 
-def test_nobody_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(final_pass, "HOLD_NS", 5 * 1_000_000_000)
-    into = settling_of()
+def test_nobody_is_waited_for_for_ever() -> None:
+    into = two_passes(hold_ns=5 * 1_000_000_000)
     said = play(into, node("north", range(40, 46), range(300)) + node("south", (), range(30)), 300)
     (event,) = settled_events(said)
     assert (event.heard_by, event.late) == (("north",), False)
@@ -108,18 +107,17 @@ def test_hold_is_longer_than_a_restart_takes() -> None:
     assert HOLD_NS > 60 * 1_000_000_000 > LOST_NS
 
 
-def test_memory_that_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_that_waits_is_bounded() -> None:
     size = frame("north", 0).samples.nbytes
-    monkeypatch.setattr(final_pass, "HOLD_BYTES", 50 * size)
-    into = settling_of()
+    into = two_passes(hold_bytes=50 * size)
     play(into, node("south", (), range(5)), 5)
     said = play(into, node("north", range(10, 400), range(5, 420)), 420, 5)
-    assert into._bytes <= 50 * size
+    assert into.held_bytes <= 50 * size
     assert len(settled_events(said)) >= 1
 
 
 def test_good_bye_is_waited_for_by_nobody() -> None:
-    into = settling_of()
+    into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
     said = play(into, node("north", range(10, 16), range(14, 40)), 40, 15)
@@ -128,7 +126,7 @@ def test_good_bye_is_waited_for_by_nobody() -> None:
 
 
 def test_when_all_have_left_everything_is_settled() -> None:
-    into = settling_of()
+    into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
     into.leave("north")
@@ -138,10 +136,10 @@ def test_when_all_have_left_everything_is_settled() -> None:
 
 def test_what_was_settled_before_is_not_told_again() -> None:
     """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
-    into = settling_of()
+    into = two_passes()
     first = play(into, both(range(10, 16), range(30)), 30)
     (output,) = [output for _, output in first if isinstance(output, FinalResults)]
-    again = settling_of(output.until)
+    again = two_passes(output.until)
     for name in NAMES:
         again.greet(name, (START + 8, START + 31), now_ns(31))
     kept: Arrivals = [(31.0, m) for _, m in both(range(10, 16), range(30)) if isinstance(m, Frame)]
@@ -155,7 +153,7 @@ def test_what_was_settled_before_is_not_told_again() -> None:
 
 
 def test_clock_of_the_server_set_back_begins_anew() -> None:
-    into = settling_of()
+    into = two_passes()
     play(into, both(range(10, 16), range(100)), 100)
     hour = 3600 * SECOND
     said: list[tuple[int, Event | FinalResults]] = []
@@ -170,7 +168,7 @@ def test_clock_of_the_server_set_back_begins_anew() -> None:
 
 def test_no_event_lies_in_the_future() -> None:
     """A node an hour ahead is refused and told so; the other goes on."""
-    into = settling_of()
+    into = two_passes()
     ahead = [
         (w, replace(m, frame_index=m.frame_index + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))
     ]

@@ -20,8 +20,12 @@ from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
 from livessl.core.locate.estimators import Localization, PowerMaps, Sound, SrpPhat
-from livessl.core.stream.array_health import ArrayState, ArrayStatus
-from livessl.core.stream.fusion import LET_GO_FRAMES, MOST_KEPT, Fusion, FusionParameters
+from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
+from livessl.core.stream.array_stream import ArrayStream
+from livessl.core.stream.evidence import KEPT_ARRAYS, RELEASE_FRAMES
+from livessl.core.stream.fusion import EVENTS_ONLY, Fusion, Role
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.stream.site_state import SiteState
 from livessl.core.types import (
     FRAME_NS,
     GCC,
@@ -90,8 +94,12 @@ def located() -> SrpPhat:
     return SrpPhat([NORTH, SOUTH], GRID, C_M_S)
 
 
+def state_of(estimator: Any = None, arrays: Sequence[ArraySpec] = (NORTH, SOUTH), **parameters: Any) -> SiteState:
+    return SiteState("site", arrays, estimator or Scripted(), FusionParameters(**parameters))
+
+
 def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any) -> Fusion:
-    return Fusion("site", [NORTH, SOUTH], estimator or Scripted(), FusionParameters(**parameters), updates=updates)
+    return Fusion(state_of(estimator, **parameters), Role(updates=updates))
 
 
 def frame(array: str, frame_index: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
@@ -234,7 +242,7 @@ def test_sounds_apart_are_two_events_of_one_array_each() -> None:
 
 def test_one_small_array_tells_the_direction_only() -> None:
     spec = tetra("north", NORTH.centre_m, edge_m=0.06)
-    fusion = Fusion("site", [spec], SrpPhat([spec], GRID, C_M_S), updates=False)
+    fusion = Fusion(state_of(SrpPhat([spec], GRID, C_M_S), [spec]), EVENTS_ONLY)
     event = only_event(play(fusion, live(sound_frames(spec, 10, 6, noise=0.03), 30), 30))
     # Its lags change with distance by d^2 / (2 c R^2) = 1.6 us a metre; side lobes of 0.1 in the GCCs leave them
     # uncertain by s / sqrt(kappa) = 0.1 / 22 kHz = 5 us.
@@ -257,7 +265,7 @@ def test_wide_array_is_not_looked_from_its_centre() -> None:
                 return replace(super().locate(sounds), position_m=place_m, covariance_m2=spread_m**2 * np.eye(3))
 
         frames = [frame("both", k, samples=np.ones((8, 20), dtype=np.float32)) for k in (10, 11)]
-        return only_event(play(Fusion("site", [both], Uncertain(), updates=False), live(frames, 30), 30)).status
+        return only_event(play(Fusion(state_of(Uncertain(), [both]), EVENTS_ONLY), live(frames, 30), 30)).status
 
     quarter_m = 0.25 * both.aperture_m / 2.0
     assert judged(0.99 * quarter_m) is Status.LOCATED
@@ -502,11 +510,11 @@ def test_updates_come_only_while_there_is_sound() -> None:
 
 def test_a_live_fusion_that_is_behind_looks_at_the_newest_window_only() -> None:
     arrivals = node("north", range(10, 20), range(30)) + node("south", range(10, 20), range(30))
-    site = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    site = Fusion(state_of(), Role(newest_only=True))
     said = play(site, arrivals, 16)  # in step: nothing is left out
     assert len([output for _, output in said if isinstance(output, Update)]) == 3
     assert site.updates_left_out == 0
-    behind = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    behind = Fusion(state_of(), Role(newest_only=True))
     told = behind.step(
         [message for when, message in sorted(arrivals, key=lambda arrival: arrival[0]) if when <= 17], now_ns(17)
     )
@@ -724,14 +732,14 @@ class Gauged(Scripted):
         return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
 
 
-MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(MOST_KEPT + 6)]
+MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(KEPT_ARRAYS + 6)]
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) -> None:
     """What comes of the others stays: they are heard, and have part in the event."""
     gauged = Gauged()
-    fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+    fusion = Fusion(state_of(gauged, MANY), EVENTS_ONLY)
     held: dict[str, list[weakref.ref[Float32Array]]] = {spec.name: [] for spec in MANY}
     most = dict.fromkeys(held, 0)
     events: list[Output] = []
@@ -756,7 +764,7 @@ def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) ->
     for name, pieces in gauged.calls[-1].items():
         assert (sum(pieces) < 20 * 20) if name in let_go else (pieces == [80 * 20]), name
         # windows and a hang-over, and what has come since the last look; else all of it with the run-up
-        assert (most[name] <= 10 + LET_GO_FRAMES + 9) if name in let_go else (most[name] >= 88), name
+        assert (most[name] <= 10 + RELEASE_FRAMES + 9) if name in let_go else (most[name] >= 88), name
 
 
 def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
@@ -775,7 +783,7 @@ def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
         [frames + quiet],
     ):
         gauged = Gauged()
-        fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+        fusion = Fusion(state_of(gauged, MANY), EVENTS_ONLY)
         said = [output for step in steps for output in fusion.step(step, now_ns(step[-1].frame_index - START + 1))]
         assert sum(isinstance(output, Event) for output in said) == 1
         left.append(gauged.calls[-1])
@@ -848,21 +856,20 @@ def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
     assert on_time.heard.count(None) == 1
 
 
-def test_a_twin_hears_only_what_the_other_has_not() -> None:
-    """In step, all that one hears is the other's, too; from a frame that only one has on, each hears for itself."""
+def test_two_passes_correlate_each_frame_once() -> None:
+    """In step, each pass uses the correlations of the other; from a frame on that only one has, each makes its own."""
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
     alone, both = Listening(), Listening()
     play(fusion_of(alone), arrivals, 60)
-    first = fusion_of(both)
-    second = first.twin()
-    for fusion in (first, second):
+    shared = state_of(both)
+    for fusion in (Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)):
         play(fusion, arrivals, 60)
     assert both.heard == alone.heard
     assert both.sums == 2 * alone.sums
 
     partly = Listening()
-    first = fusion_of(partly)
-    second = first.twin()
+    shared = state_of(partly)
+    first, second = Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)
     play(first, [arrival for arrival in arrivals if arrival[1].frame_index != START + 16], 60)
     play(second, arrivals, 60)
     assert partly.sums[-1] == alone.sums[-1]
@@ -876,7 +883,7 @@ def test_a_live_fusion_listens_ahead_and_says_the_same(pause: int) -> None:
     told, heard_at_once = [], []
     for newest_only in (False, True):
         estimator = Listening()
-        fusion = Fusion("site", [NORTH, SOUTH], estimator, newest_only=newest_only, updates=False)
+        fusion = Fusion(state_of(estimator), Role(updates=False, newest_only=newest_only))
         until = [arrival for arrival in arrivals if arrival[1].frame_index < START + again.start]
         play(fusion, until, again.start)
         before = len(estimator.heard)
@@ -896,8 +903,25 @@ def test_a_live_fusion_listens_ahead_and_says_the_same(pause: int) -> None:
 
 def test_sound_without_end_leaves_nothing_behind() -> None:
     fusion = fusion_of(Listening(), max_event_s=1.0)
-    play(fusion, [(k + 1.0, numbered(k, k >= 12)) for k in range(4, 200)], 200)
-    assert len(fusion._streams["north"].ear.onsets) <= len(fusion._streams["north"].frames) < 60
+    held: list[weakref.ref[Float32Array]] = []
+    most = 0
+    for k in range(4, 200):
+        message = numbered(k, k >= 12)
+        held.append(weakref.ref(message.samples))
+        fusion.step([message], now_ns(k + 1))
+        del message
+        held = [reference for reference in held if reference() is not None]
+        most = max(most, len(held))
+    assert 20 <= most < 60  # a second of sound, and what windows and pre-rolls reach back to
+
+
+def test_pruned_frames_take_their_correlations_along() -> None:
+    stream = ArrayStream(NORTH, ArrayHealth(4))
+    for k in range(10):
+        stream.add(numbered(k, True))
+        stream.correlations.onsets[START + k] = OnsetGCC(np.zeros((1, 1), np.float32), np.ones(1))
+    stream.prune(START + 7)
+    assert list(stream.frames) == list(stream.correlations.onsets) == [START + k for k in (7, 8, 9)]
 
 
 @pytest.mark.parametrize("refused", [None, "too unsure"])
@@ -948,6 +972,7 @@ class Voting(Scripted):
 
 
 EAST = tetra("east", [3.9, 2.4, 1.9])
+THREE = (NORTH, SOUTH, EAST)
 
 
 def sound_at(fusion: Fusion, frame_index: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
@@ -959,7 +984,7 @@ def sound_at(fusion: Fusion, frame_index: int, arrays: Sequence[str] = ("north",
 
 def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
     estimator = Voting()
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator, updates=True)
+    fusion = Fusion(state_of(estimator, THREE))
     estimator.outliers = {"east": 29.6}
     for turn in range(4):
         (event,) = (output for output in sound_at(fusion, 20 * turn) if isinstance(output, Event))
@@ -996,7 +1021,7 @@ class Choosing(Voting):
 
 
 def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Choosing())
+    fusion = Fusion(state_of(Choosing(), THREE))
     (event,) = (output for output in sound_at(fusion, 0) if isinstance(output, Event))
     assert event.heard_by == ("north", "south", "east")
     assert event.estimate is not None
@@ -1005,15 +1030,16 @@ def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None
     assert [status_of(fusion, name, 20).agreed for name in ("north", "south", "east")] == [0, 1, 1]
 
 
-def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:
+def test_two_arrays_hold_no_vote_and_two_passes_count_a_sound_once() -> None:
     estimator = Voting()
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator)
+    shared = state_of(estimator, THREE)
+    fusion = Fusion(shared)
     sound_at(fusion, 0, ("north", "south"))
     assert (status_of(fusion, "north", 20).agreed, status_of(fusion, "north", 20).disagreed) == (0, 0)
-    twin = fusion.twin()
+    final = Fusion(shared, EVENTS_ONLY)
     estimator.outliers = {"south": 12.0}
-    sound_at(twin, 20)
-    sound_at(fusion, 20)  # told before and settled after: one sound
+    sound_at(final, 20)
+    sound_at(fusion, 20)  # the other pass's result of the same sound
     assert (status_of(fusion, "south", 40).agreed, status_of(fusion, "south", 40).disagreed) == (0, 1)
 
 
@@ -1053,7 +1079,7 @@ class Duet(Scripted):
 
 
 def test_each_of_two_sources_has_an_event() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), updates=True)
+    fusion = Fusion(state_of(Duet(), THREE))
     outputs = sound_at(fusion, 0, ("north", "south"))
     one, other = (output for output in outputs if isinstance(output, Event))
     assert (one.id, one.source) == (f"site-{(START + 5) * 50}", 1)
@@ -1064,12 +1090,12 @@ def test_each_of_two_sources_has_an_event() -> None:
     assert other.estimate.confidence == 0.7
     assert other.contributions[0].azimuth_deg != one.contributions[0].azimuth_deg
     assert all(output.others == () for output in outputs if isinstance(output, Update))  # unless it is asked for
-    alone = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(sources=1))
+    alone = Fusion(state_of(Duet(), THREE, sources=1))
     assert [event.source for event in sound_at(alone, 0, ("north", "south")) if isinstance(event, Event)] == [1]
 
 
 def test_windows_tell_of_a_second_where_the_site_asks() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(live_sources=2), updates=True)
+    fusion = Fusion(state_of(Duet(), THREE, live_sources=2))
     outputs = sound_at(fusion, 0, ("north", "south"))
     (update,) = (output for output in outputs if isinstance(output, Update))
     (other,) = update.others

@@ -202,7 +202,7 @@ def test_what_was_not_sent_is_remembered_for_a_while() -> None:
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
         if k == 30:
-            asked = frames_of(made.ask(START + 12, START + 21))
+            asked = frames_of(made.backfill(START + 12, START + 21))
             assert [frame.frame_index - START for frame in asked] == list(range(12, 22))
             assert {(frame.sequence, frame.active) for frame in asked} == {(0, False)}
             sent = {frame.frame_index: frame for frame in frames_of(messages)}
@@ -212,8 +212,8 @@ def test_what_was_not_sent_is_remembered_for_a_while() -> None:
                 )
                 assert frame.frame_index not in sent or sent[frame.frame_index].power == frame.power
     last = messages[-1].frame_index
-    assert made.ask(START, START + 40) == []
-    remembered = frames_of(made.ask(START, last))
+    assert made.backfill(START, START + 40) == []
+    remembered = frames_of(made.backfill(START, last))
     assert len(remembered) == round(RECENT_S / FRAME_S)
     assert remembered[-1].frame_index == last
     # asking takes nothing from what is sent by itself
@@ -227,4 +227,4 @@ def test_nothing_is_remembered_over_a_gap() -> None:
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         for cut in framer.push(block):
             made.push(cut, framer)
-    assert [frame.frame_index - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))
+    assert [frame.frame_index - START for frame in frames_of(made.backfill(START, START + 25))] == list(range(18, 26))

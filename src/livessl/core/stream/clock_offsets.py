@@ -139,7 +139,9 @@ class ClockOffsets:
         """Whether the arrays have different clocks."""
         return len({self._clock_of[array] for array in arrays}) > 1
 
-    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Sequence[Frame]]]) -> None:
+    def learn_from(
+        self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Sequence[Frame]]]
+    ) -> None:
         """Learn from a sound of known place: of each array the frames of it, without gaps, its run-up first."""
         travel_s = {s.name: float(np.linalg.norm(s.centre_m - position_m)) / self._c_m_s for s, _ in heard}
         late_s = lateness_s({spec.name: frames for spec, frames in heard}, travel_s)

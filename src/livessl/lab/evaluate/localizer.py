@@ -20,7 +20,7 @@ from livessl.core.geometry import angle_deg
 from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.stream.activity import exact_mask, runs
-from livessl.core.stream.fusion import judged
+from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
 from livessl.lab.evaluate.command import HALVES, LOCALIZER
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M

@@ -1,0 +1,69 @@
+"""The state that all passes over one site's messages share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from livessl.core.locate.estimators import Estimator
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
+from livessl.core.stream.outlier_votes import OutlierVotes
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.types import ArraySpec
+
+
+class SiteState:
+    """What is known of a site whichever pass looks at it.
+
+    Parameters
+    ----------
+    site : str
+        Name that event ids begin with.
+    arrays : sequence of ArraySpec
+    estimator : Estimator
+    parameters : FusionParameters
+    clock_offsets : ClockOffsets or None
+        Offsets of the arrays' clocks, learned from events; None takes all clocks to agree.
+    for_each : ForEach or None
+        Correlates several arrays, perhaps in parallel; None does one after the other.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        arrays: Sequence[ArraySpec],
+        estimator: Estimator,
+        parameters: FusionParameters | None = None,
+        *,
+        clock_offsets: ClockOffsets | None = None,
+        for_each: ForEach | None = None,
+    ) -> None:
+        self.site = site
+        self.arrays = {spec.name: spec for spec in arrays}
+        self.estimator = estimator
+        self.parameters = parameters or FusionParameters()
+        self.clock_offsets = clock_offsets
+        self.cache = CorrelationCache(estimator, for_each)
+        self.votes = OutlierVotes(self.arrays)
+        self.can_backfill: set[str] = set()
+        """Arrays whose nodes answer backfill requests."""
+        self._excluded: Collection[str] = ()
+
+    def exclude(self, arrays: Collection[str]) -> None:
+        """Exclude these arrays from now on, and include all others again.
+
+        The frames of an excluded array are neither waited for nor requested.
+        """
+        self._excluded = arrays
+
+    def is_excluded(self, array: str) -> bool:
+        """Return whether an array is excluded."""
+        return array in self._excluded
+
+    def answers_requests(self, array: str) -> bool:
+        """Return whether frames may be requested from an array."""
+        return array in self.can_backfill and array not in self._excluded
+
+    def specs(self, arrays: Sequence[str]) -> list[ArraySpec]:
+        """Return the specifications of the arrays named."""
+        return [self.arrays[name] for name in arrays]
