@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.locate.estimators import Estimator
-from livessl.core.stream.evidence import BackfilledSound, Excerpt
+from livessl.core.stream.evidence import BackfilledSound
 from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.stream.site_state import SiteState
@@ -51,29 +51,26 @@ class Backfill:
         self._verdicts = Verdicts(state)
         self._allowances: dict[str, Allowance] = {}
 
-    def choose(
-        self, event: PendingEvent, excerpt: Excerpt, results: Sequence[Event], span: range, present: Collection[str]
-    ) -> dict[str, RequestedFrames]:
+    def choose(self, event: PendingEvent, span: range, present: Collection[str]) -> dict[str, RequestedFrames]:
         """Choose the arrays that may improve the results of an event, and the frames to request from them.
 
         Parameters
         ----------
         event : PendingEvent
-        excerpt : Excerpt
-        results : sequence of Event
-            Results of the arrays that detected it, of which `excerpt` is.
+            With the results of the arrays that detected it.
         span : range
             Frame indices of the event up to its last active frame, pre-roll included.
         present : collection of str
             Arrays whose nodes have not ended.
         """
-        if is_sure(results[0]) or not excerpt.sounds.has_onsets:
+        excerpt = event.excerpt
+        if excerpt is None or is_sure(event.results[0]) or not excerpt.sounds.has_onsets:
             return {}  # without onsets the estimator gives every array the same weight, whatever it received
         silent = [name for name in present if self._state.answers_requests(name) and name not in excerpt.sounds]
         if not silent:
             return {}
         span = span[: round(MOST_REQUESTED_S / FRAME_S)]
-        nearest_ones = nearest(self._state.specs(silent), self._state.specs(results[0].heard_by))
+        nearest_ones = nearest(self._state.specs(silent), self._state.specs(list(excerpt.sounds)))
         return {
             spec.name: RequestedFrames(span)
             for spec in nearest_ones
@@ -93,9 +90,11 @@ class Backfill:
         can_backfill = self._state.can_backfill
         return all(frames.is_complete or name not in can_backfill for name, frames in event.requested.items())
 
-    def reconsidered(self, event: PendingEvent, excerpt: Excerpt, now_ns: int) -> Sequence[Event]:
+    def reconsidered(self, event: PendingEvent, now_ns: int) -> Sequence[Event]:
         """Return the best results of an event: without the requested frames, with all of them, or with one array's."""
-        estimator, best = self._state.estimator, event.results
+        estimator, best, excerpt = self._state.estimator, event.results, event.excerpt
+        if excerpt is None:
+            return best
         sounds = {name: backfilled_sound(frames, estimator, event.start) for name, frames in event.requested.items()}
         useful = {name: sound for name, sound in sounds.items() if sound is not None}
         attempts = [useful, *({name: useful[name]} for name in useful if len(useful) > 1)] if useful else []
@@ -106,7 +105,7 @@ class Backfill:
                 self._verdicts.count_votes(event, excerpt, verdict)
         return best
 
-    def clear(self) -> None:
+    def start_over(self) -> None:
         """Forget what was requested before."""
         self._allowances.clear()
 

@@ -32,8 +32,8 @@ RELEASE_FRAMES: Final = 10
 class Segments(Sequence[Float32Array]):
     """Segments of one array's samples, each (K, n), joined from frames when it is read.
 
-    The samples of many arrays are therefore never all there twice, and not joined if nobody reads them. Frames whose
-    samples were released, which are the first ones, are left out.
+    Samples are thus never copied for all arrays at once, and not at all if they are not used. Frames whose samples were
+    released, which are the first ones, are left out.
     """
 
     def __init__(self, segments: Iterable[Sequence[Frame]]) -> None:
@@ -86,7 +86,7 @@ class Sounds(Mapping[str, Sound]):
 
     @property
     def has_onsets(self) -> bool:
-        """Whether the estimator correlates every frame, and so weighs each array by what it received."""
+        """True where the estimator correlates every frame, and so weighs each array by what it received."""
         return any(self._onsets.values())
 
     def __getitem__(self, array: str) -> Sound:
@@ -204,15 +204,15 @@ class EvidenceCollector:
         self._correlate(here, [frame_index])
 
     def correlate_ahead(self, frame_index: int, begin: int | None) -> None:
-        """In quiet, correlate what a sound that begins soon will begin with.
+        """Correlate a quiet frame index, which may be in the pre-roll of the next sound.
 
         Parameters
         ----------
         frame_index : int
             The quiet frame index.
         begin : int or None
-            First frame index after the last sound. A sound that begins later than its pre-roll after it has another
-            beginning, which is not known yet.
+            First frame index after the last sound. The pre-roll of the next sound begins there if that sound comes
+            soon; later it begins at a frame index that is not known yet.
         """
         if not self._correlates_ahead or begin is None:
             return

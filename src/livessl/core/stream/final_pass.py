@@ -257,7 +257,7 @@ class TwoPassFusion:
             end = self._stride_end(self._position, frontier)
             outputs += self._close(end)
             self._position = end
-        events = tuple(self._dated(output, now_ns) for output in outputs if isinstance(output, Event))
+        events = tuple(_dated(output, now_ns, self._late) for output in outputs if isinstance(output, Event))
         self._forget()
         for contribution in (contribution for event in events for contribution in event.contributions):
             self.helped[contribution.array] += contribution.asked
@@ -280,10 +280,6 @@ class TwoPassFusion:
             stride = frontier if first is None else first - 1
         return min(frontier, stride)
 
-    def _dated(self, event: Event, now_ns: int) -> Event:
-        late = any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in self._late)
-        return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=late)
-
     def _forget(self) -> None:
         settled = self.settled
         if settled is None or settled == self._forgotten_before:
@@ -292,3 +288,9 @@ class TwoPassFusion:
         self._late = {frame_index for frame_index in self._late if frame_index >= settled}
         for name, reception in self._receptions.items():
             reception.forget(settled + self._ahead(name))
+
+
+def _dated(event: Event, now_ns: int, late: Collection[int]) -> Event:
+    """Return an event as it is reported now; `late` holds the frame indices that the early pass could not use."""
+    is_late = any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in late)
+    return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=is_late)

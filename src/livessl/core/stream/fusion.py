@@ -2,29 +2,29 @@
 
 `Fusion.step(messages, now_ns)` is the only door, live and replayed. It composes the stages: `Alignment` puts the frames
 on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, `Verdicts` locates and
-judges these, `Backfill` requests frames where a result is not sure, and `Tracker` follows the sources.
+judges these, `EventReporter` decides when an event is reported, and `Tracker` follows the sources.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from livessl.core.locate.estimators import PowerMaps
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_health import ArrayStatus
-from livessl.core.stream.backfill import Backfill
-from livessl.core.stream.evidence import RELEASE_FRAMES, EvidenceCollector, Excerpt
+from livessl.core.stream.event_reporter import EventReporter
+from livessl.core.stream.evidence import RELEASE_FRAMES, EvidenceCollector
 from livessl.core.stream.pending_event import EventState, PendingEvent
 from livessl.core.stream.site_state import SiteState
 from livessl.core.stream.tracker import SILENCE_S, Tracker
 from livessl.core.stream.verdict import Verdicts
-from livessl.core.types import FRAME_S, BackfillRequest, Event, Frame, Message, Output, Status, Window
+from livessl.core.types import FRAME_S, Frame, Message, Output, Status, Window
 
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What a pass over the messages does.
+    """The role of a pass over the messages.
 
     Parameters
     ----------
@@ -66,13 +66,11 @@ class Fusion:
         self._parameters = state.parameters
         self._alignment = Alignment(state, watches_health=self._role.watches_health)
         self._collector = EvidenceCollector(state, self._alignment, correlates_ahead=self._role.newest_only)
+        self._reporter = EventReporter(state, self._alignment, self._collector, learns_clocks=self._role.learns_clocks)
         self._verdicts = Verdicts(state)
-        self._backfill = Backfill(state)
         self._tracker = Tracker()
         self._event: PendingEvent | None = None
         self._due: int | None = None  # last frame index of the window that is to be located in this step
-        self._reported_elsewhere: int | None = None
-        self._closing_elsewhere: int | None = None
         self.updates_left_out = 0
         """Number of windows that were not located, because newer ones were due."""
         self._correct_clocks()
@@ -96,7 +94,7 @@ class Fusion:
 
     @property
     def is_in_event(self) -> bool:
-        """Whether an event has begun and has not been reported yet."""
+        """True while an event has begun and has not been reported."""
         return self._event is not None
 
     @property
@@ -123,7 +121,7 @@ class Fusion:
         """Return the estimator's maps of a window that it located. Any thread may call it."""
         return self._state.estimator.power_maps(window.evidence, separately)
 
-    # --- what it is told besides messages
+    # --- what comes in besides messages
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute what an array's sound will need, so that its first event does not wait for it."""
@@ -139,7 +137,7 @@ class Fusion:
 
     def skip_events(self, reported_until: int | None, closing_until: int | None) -> None:
         """Report no event that another pass reports: of sound before a frame index, or that ends by another."""
-        self._reported_elsewhere, self._closing_elsewhere = reported_until, closing_until
+        self._reporter.skip(reported_until, closing_until)
 
     # --- steps
 
@@ -183,7 +181,7 @@ class Fusion:
                 continue
             if isinstance(message, Frame) and message.requested:
                 if self._event is not None:
-                    self._backfill.take(self._event, message)
+                    self._reporter.take(self._event, message)
             elif self._alignment.accept(message) and self._event is not None:
                 self._event.late_frames += 1
 
@@ -192,7 +190,7 @@ class Fusion:
         outputs += self._tracker.step(self._alignment.now_ns + round(2e9 * SILENCE_S))
         self._alignment.start_over()
         self._collector.discard_ahead()
-        self._backfill.clear()
+        self._reporter.start_over()
         self._state.cache.clear()
         self._state.votes.clear()
         return outputs
@@ -206,7 +204,7 @@ class Fusion:
         while True:
             event = self._event
             if event is not None and event.state is EventState.AWAITING_BACKFILL:
-                if not self._backfill.is_over(event, self._alignment.now_ns):
+                if self._reporter.is_waiting(event):
                     break
                 outputs += self._report(event)
             frame_index = self._alignment.close_next()
@@ -274,65 +272,17 @@ class Fusion:
 
     def _end(self, event: PendingEvent, *, became_quiet: bool) -> list[Output]:
         """End an event: report it, unless frames are requested for it first."""
-        event.end(became_quiet=became_quiet)
-        excerpt, results = self._located(event)
-        if excerpt is not None:
-            span = range(self._alignment.first_of(event.start), event.last_active + 1)
-            present = [name for name, stream in self._alignment.streams.items() if not stream.has_left]
-            requested = self._backfill.choose(event, excerpt, results, span, present)
-            if requested:
-                event.await_backfill(excerpt, results, requested, self._alignment.now_ns)
-                return [self._request(name, frames.span) for name, frames in requested.items()]
-        return self._handed_over(event, results)
-
-    def _request(self, array: str, span: range) -> BackfillRequest:
-        ahead = self.frames_ahead(array)
-        return BackfillRequest(array, span[0] + ahead, span[-1] + ahead)
+        requests = self._reporter.end(event, became_quiet=became_quiet)
+        return [*requests] if requests else self._report(event)
 
     def _report(self, event: PendingEvent) -> list[Output]:
         """Report an event now, with the frames that have come."""
-        if event.state is not EventState.AWAITING_BACKFILL:
-            return self._handed_over(event, self._located(event)[1])
-        if event.excerpt is None or self._is_reported_elsewhere(event):
-            return self._handed_over(event, [])
-        return self._handed_over(event, self._backfill.reconsidered(event, event.excerpt, self._alignment.now_ns))
-
-    def _handed_over(self, event: PendingEvent, results: Sequence[Event]) -> list[Output]:
-        event.report()
+        results = self._reporter.report(event)
         self._event = None
         self._alignment.reported_until = event.last_active + 1
         if event.became_quiet:
             self._correct_clocks()
         return [*results]
-
-    def _is_reported_elsewhere(self, event: PendingEvent) -> bool:
-        reported, closing = self._reported_elsewhere, self._closing_elsewhere
-        if reported is not None and event.last_active < reported:
-            return True
-        return closing is not None and event.has_ended and event.closed <= closing
-
-    def _located(self, event: PendingEvent) -> tuple[Excerpt | None, list[Event]]:
-        """Locate an event by the arrays that detected it; return the excerpt, and one event for each source."""
-        if self._is_reported_elsewhere(event):
-            return None, []
-        span = range(self._alignment.first_of(event.start), event.closed + 1)
-        excerpt = self._collector.event(span)
-        if not excerpt.sounds:
-            return None, []
-        verdict = self._verdicts.event(event, excerpt, self._alignment.now_ns)
-        if event.became_quiet and len(verdict.events) == 1:
-            self._learn_clocks(verdict.events[0], span)
-        self._verdicts.count_votes(event, excerpt, verdict)
-        return excerpt, verdict.events
-
-    # --- clocks
-
-    def _learn_clocks(self, event: Event, span: range) -> None:
-        clocks, estimate = self._state.clock_offsets, event.estimate
-        if clocks is None or estimate is None or event.status is not Status.LOCATED:
-            return
-        if self._role.learns_clocks and clocks.tell_apart(estimate.arrays):
-            clocks.learn_from(event.end_ns, estimate.position_m, self._collector.whole_sounds(estimate.arrays, span))
 
     def _correct_clocks(self) -> None:
         if self._alignment.correct_clocks():

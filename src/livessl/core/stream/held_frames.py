@@ -19,7 +19,7 @@ HOLD_BYTES: Final = 256 * 1024 * 1024
 
 
 class HeldFrames:
-    """The frames that are held, and how far the final pass may go whoever is missing.
+    """The frames that are held, and the frame indices up to which missing arrays are passed.
 
     Parameters
     ----------

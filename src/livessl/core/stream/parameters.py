@@ -15,7 +15,7 @@ person who waits for the event."""
 
 @dataclass(frozen=True, slots=True)
 class FusionParameters:
-    """How the arrays' frames are joined into updates and events.
+    """Parameters of joining the arrays' frames into updates and events.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from livessl.core.types import Event, Frame
 
 
 class EventState(StrEnum):
-    """Where an event is in its life."""
+    """A stage in the life of an event."""
 
     OPEN = "open"
     ENDED = "ended"
@@ -53,7 +53,7 @@ class RequestedFrames:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all have come: frames come in order."""
+        """True once all have come; frames come in order."""
         return self.span[-1] in self.frames
 
 
@@ -73,17 +73,18 @@ class PendingEvent:
         self.closed = start
         """The last frame index that was closed in it; frames beyond it are no part of the event."""
         self.became_quiet = False
-        """Whether it ended with a quiet hang-over, not by its length."""
+        """True where it ended with a quiet hang-over, not by its length."""
         self.late_frames = 0
         self.excerpt: Excerpt | None = None
+        """The part of the arrays' sound that it was located from; None before, and where another pass reports it."""
         self.results: Sequence[Event] = ()
-        """What the arrays that detected it make of it, one event for each source; kept while frames are awaited."""
+        """Its results, one for each source; none before it was located, and where another pass reports it."""
         self.requested: Mapping[str, RequestedFrames] = {}
         self.requested_ns = 0
 
     @property
     def has_ended(self) -> bool:
-        """Whether the sound has ended, by a quiet hang-over or by its length; False where it was cut short."""
+        """True where the sound has ended, by a quiet hang-over or by its length; False where it was cut short."""
         return self.state in (EventState.ENDED, EventState.AWAITING_BACKFILL)
 
     @property
@@ -107,12 +108,9 @@ class PendingEvent:
         self._go_to(EventState.ENDED)
         self.became_quiet = became_quiet
 
-    def await_backfill(
-        self, excerpt: Excerpt, results: Sequence[Event], requested: Mapping[str, RequestedFrames], now_ns: int
-    ) -> None:
-        """Keep the results while frames are awaited that were requested now."""
+    def await_backfill(self, requested: Mapping[str, RequestedFrames], now_ns: int) -> None:
+        """Wait for frames that were requested now."""
         self._go_to(EventState.AWAITING_BACKFILL)
-        self.excerpt, self.results = excerpt, results
         self.requested, self.requested_ns = requested, now_ns
 
     def report(self) -> None:

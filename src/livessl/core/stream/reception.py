@@ -14,7 +14,7 @@ from livessl.core.stream.array_health import LOST_NS
 
 @dataclass(slots=True)
 class Reception:
-    """What has come of one array."""
+    """The frames of one array that have come."""
 
     live_until: int | None = None
     backlog_until: int | None = None  # None while there is no backlog

@@ -13,7 +13,7 @@ from livessl.core.types import ArraySpec
 
 
 class SiteState:
-    """What is known of a site whichever pass looks at it.
+    """State of a site that does not depend on the pass.
 
     Parameters
     ----------

@@ -89,20 +89,7 @@ class Verdicts:
         """
         backfilled = backfilled or {}
         used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
-        first = Event(
-            id=self._id(event.start),
-            start_ns=excerpt.start_ns,
-            end_ns=excerpt.end_ns,
-            status=Status.REFUSED,
-            reason=f"heard by {len(used.sounds)} of at least {least} arrays",
-            estimate=None,
-            power=excerpt.greatest_power,
-            method=self._state.estimator.name,
-            heard_by=tuple(excerpt.sounds),
-            late_frames=event.late_frames,
-            latency_s=(now_ns - excerpt.end_ns) / 1e9,
-            complete_ns=(event.closed + 1) * FRAME_NS,
-        )
+        first = self._refused(event, excerpt, now_ns, f"heard by {len(used.sounds)} of at least {least} arrays")
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
@@ -125,6 +112,22 @@ class Verdicts:
             for source, other in enumerate(self._others(found, used), 2)
         )
         return Verdict([first, *others], found)
+
+    def _refused(self, event: PendingEvent, excerpt: Excerpt, now_ns: int, reason: str) -> Event:
+        return Event(
+            id=self._id(event.start),
+            start_ns=excerpt.start_ns,
+            end_ns=excerpt.end_ns,
+            status=Status.REFUSED,
+            reason=reason,
+            estimate=None,
+            power=excerpt.greatest_power,
+            method=self._state.estimator.name,
+            heard_by=tuple(excerpt.sounds),
+            late_frames=event.late_frames,
+            latency_s=(now_ns - excerpt.end_ns) / 1e9,
+            complete_ns=(event.closed + 1) * FRAME_NS,
+        )
 
     def update(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
         """Locate a window of an event that goes on; return the update, and the location that it was made from."""
