@@ -84,7 +84,7 @@ def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
     ]
 
 
-def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
+def test_sound_that_one_array_detected_is_located_with_requested_frames_of_the_other() -> None:
     without = offline_events(ask=False)
     assert [event.heard_by for event in without] == [("north",)] * SOUNDS
     assert {event.status for event in without} == {Status.DIRECTION_ONLY}
@@ -99,7 +99,7 @@ def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
         assert error_m(event) < 0.5
 
 
-def test_methods_that_cannot_weigh_an_array_ask_nobody() -> None:
+def test_methods_without_onsets_request_nothing() -> None:
     assert told(offline_events(method="srp-phat")) == told(offline_events(method="srp-phat", ask=False))
 
 
@@ -145,7 +145,7 @@ def settled(outputs: Sequence[Output | FinalResults]) -> list[Event]:
 
 
 @pytest.mark.parametrize("way", [1, 4, 8])
-def test_live_answers_are_those_offline(way: int) -> None:
+def test_results_are_the_same_live_and_offline(way: int) -> None:
     """Blocks of 20 ms from each node: eight batches are 80 ms."""
     live = Live(way)
     outputs = live.run()
@@ -158,20 +158,20 @@ def test_live_answers_are_those_offline(way: int) -> None:
     assert all((ask.last - ask.first + 1) * FRAME_S <= 0.4 + 0.5 for ask in live.asks)  # run-up and burst
 
 
-def test_old_nodes_are_asked_nothing() -> None:
+def test_nothing_is_requested_from_old_nodes() -> None:
     live = Live(1, answers=False)
     assert told(settled(live.run())) == told(offline_events(ask=False))
     assert live.asks == []
 
 
-def test_disabled_arrays_are_asked_nothing() -> None:
+def test_nothing_is_requested_from_excluded_arrays() -> None:
     live = Live(1)
     live.settling.exclude({"south"})
     live.run()
     assert live.asks == []
 
 
-def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
+def test_requested_frames_are_awaited_for_a_limited_time() -> None:
     live = Live(1, deaf=True)
     events = settled(live.run())
     assert told(events) == told(offline_events(ask=False))
@@ -180,7 +180,7 @@ def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
         assert 0.3 + 0.3 - 0.11 < event.latency_s < 0.3 + 0.3 + 0.11  # the hang-over, and as long again
 
 
-def test_arrays_are_asked_by_their_own_clocks() -> None:
+def test_requests_use_the_frame_indices_of_the_arrays_own_clock() -> None:
     """Nobody can know the offset before three sounds that both heard; here it is known already."""
     ahead_ns = 150_000_000
     clocks = make_clock_offsets(site())
@@ -193,7 +193,7 @@ def test_arrays_are_asked_by_their_own_clocks() -> None:
         assert abs(error_m(event) - error_m(other)) < 0.02
 
 
-def test_nobody_is_asked_where_the_answer_is_sure() -> None:
+def test_nothing_is_requested_for_a_sure_event() -> None:
     loud = [
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
@@ -214,7 +214,7 @@ def recorded_loud(array: str) -> Any:
     return render(scene(SOUNDS), site().array(array).microphones_m, seed=3 + len(array))
 
 
-def test_asking_is_bounded() -> None:
+def test_number_of_requested_frames_is_bounded() -> None:
     allowance = Allowance()
     burst = round(RECENT_S / FRAME_S)
     assert allowance.take(burst, 0)
@@ -226,7 +226,7 @@ def test_asking_is_bounded() -> None:
     assert not allowance.take(burst, 10**6 + 1)
 
 
-def test_the_nearest_are_asked() -> None:
+def test_nearest_silent_arrays_come_first() -> None:
     def at(x_m: float) -> ArraySpec:
         return ArraySpec(f"{x_m:g}", np.array([[x_m, 0.0, 0.0], [x_m + 0.1, 0.0, 0.0]]), (100.0, 6000.0))
 
@@ -235,7 +235,7 @@ def test_the_nearest_are_asked() -> None:
     assert MOST_ARRAYS == 4
 
 
-def test_frames_that_nobody_asked_for_change_nothing() -> None:
+def test_frames_that_were_not_requested_change_nothing() -> None:
     fusion = make_fusion(site(), updates=False)
     samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
     frame_index = START_NS // FRAME_NS
@@ -246,7 +246,7 @@ def test_frames_that_nobody_asked_for_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("speed", [4.0, None])
-def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None) -> None:
+def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -> None:
     """At four times real time, and as fast as it goes: longer than what a node remembers, or it could not forget."""
     times = 1 if speed else 4
     played = parts(times=times)
@@ -267,7 +267,7 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
         np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)
 
 
-def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> None:
+def test_event_that_became_final_while_frames_were_awaited_is_not_reported_again() -> None:
     """A node stood still: its sound comes after the live event has asked it, and before it answers."""
     loud = [
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))

@@ -77,7 +77,7 @@ def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15, 0.15, -0.09])
-def test_answers_are_those_of_clocks_that_agree(ahead_s: float) -> None:
+def test_events_are_those_of_clocks_that_agree(ahead_s: float) -> None:
     expected, agreeing = located(0.0)
     events, south = located(ahead_s)
     assert len(events) == len(expected) == SOUNDS
@@ -149,7 +149,7 @@ def two_passes(clocks: ClockOffsets | None = None, settled: int | None = None) -
 
 @pytest.mark.parametrize("step", [1, 7, 100])
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
-def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
+def test_live_events_are_the_same_and_final_at_once(ahead_s: float, step: int) -> None:
     """However many messages come at a time; and none of them only from the fusion that does not wait."""
     into = two_passes()
     outputs: list[Output | FinalResults] = []
@@ -163,7 +163,7 @@ def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
 
 
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
-def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -> None:
+def test_each_sound_is_reported_once_however_often_the_server_restarts(ahead_s: float) -> None:
     """Nodes keep what is not settled by their own clocks, and send it again; the server knows the clocks it had."""
     expected = told(located(ahead_s)[0])
     arrays = ("north", "south")
@@ -199,7 +199,7 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
     assert told(events) == expected
 
 
-def test_offset_is_shown_to_the_reference() -> None:
+def test_status_shows_the_offset_from_the_reference_clock() -> None:
     north, south = _status_after(0.137)
     assert north.clock_offset is not None
     assert north.clock_offset.reference == "a"

@@ -48,14 +48,14 @@ def travel_s(specs: Iterable[ArraySpec]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 0.0137, -0.15, 0.31])
-def test_lateness_is_the_clocks_difference(ahead_s: float) -> None:
+def test_difference_of_arrival_is_the_offset_of_the_clocks(ahead_s: float) -> None:
     heard = {"north": frames_of(NORTH, knocks()), "south": frames_of(SOUTH, knocks(), ahead_s)}
     late = lateness_s(heard, travel_s([NORTH, SOUTH]))
     # a rise is known to the piece it falls into; three of them, interpolated, to half a piece
     assert late["south"] - late["north"] == pytest.approx(ahead_s, abs=HOP_S / 2)
 
 
-def test_travel_time_is_taken_off() -> None:
+def test_travel_time_is_subtracted() -> None:
     heard = {"north": frames_of(NORTH, knocks()), "east": frames_of(EAST, knocks())}
     true_s = travel_s([NORTH, EAST])
     assert true_s["east"] - true_s["north"] > 2 * HOP_S
@@ -64,7 +64,7 @@ def test_travel_time_is_taken_off() -> None:
     assert without["east"] == pytest.approx(true_s["east"] - true_s["north"], abs=HOP_S / 2)
 
 
-def test_a_sound_that_repeats_itself_tells_nothing() -> None:
+def test_periodic_sound_gives_no_offset() -> None:
     """Six knocks each half a second: by one of them later or earlier, five fit."""
     sound = np.zeros(round(3.0 * RATE_HZ))
     for k in range(6):
@@ -77,7 +77,7 @@ def test_a_sound_that_repeats_itself_tells_nothing() -> None:
     assert len(lateness_s(once, travel_s([NORTH, SOUTH]))) == 2
 
 
-def test_noise_tells_nothing() -> None:
+def test_noise_gives_no_offset() -> None:
     silence = np.zeros(round(2.0 * RATE_HZ))
     heard = {"north": frames_of(NORTH, silence), "south": frames_of(SOUTH, silence)}
     assert lateness_s(heard, travel_s([NORTH, SOUTH])) == {}
@@ -97,7 +97,7 @@ def learned(
     return clocks
 
 
-def test_offset_is_not_believed_before_some_sounds() -> None:
+def test_offset_is_unknown_before_three_sounds() -> None:
     assert learned([0.0, 0.15], sounds=LEAST_SOUNDS - 1).of("b") is None
     known = learned([0.0, 0.15], sounds=LEAST_SOUNDS).of("b")
     assert known is not None
@@ -105,7 +105,7 @@ def test_offset_is_not_believed_before_some_sounds() -> None:
 
 
 @pytest.mark.parametrize("wrong", [(), (0, 1, 5, 9)])
-def test_offset_and_its_uncertainty(wrong: tuple[int, ...]) -> None:
+def test_offset_lies_within_its_uncertainty(wrong: tuple[int, ...]) -> None:
     known = learned([0.0, 0.15], wrong=wrong).of("b")
     assert known is not None
     assert known.reference == "a"
@@ -121,7 +121,7 @@ def test_drift_is_followed(drift: float) -> None:
     assert known.offset_s == pytest.approx(drift * 31 * 20, abs=0.006)
 
 
-def test_a_clock_that_is_set_is_believed_after_some_sounds() -> None:
+def test_offset_of_a_clock_that_was_set_is_known_after_three_sounds() -> None:
     clocks = learned([0.0, 0.15])
     for k in range(LEAST_SOUNDS):
         clocks.learn(START_NS + (300 + k) * SECOND_NS, {"a": 0.0, "b": 0.01})
@@ -130,14 +130,14 @@ def test_a_clock_that_is_set_is_believed_after_some_sounds() -> None:
     assert known.offset_s == pytest.approx(0.01, abs=0.003)
 
 
-def test_the_middle_clock_is_the_reference() -> None:
+def test_median_clock_is_the_reference() -> None:
     clocks = learned([0.15, 0.0, 0.003])
     known = {name: clocks.of(name) for name in "abc"}
     assert all(offset is not None and offset.reference == "c" for offset in known.values())
     assert [clocks.frames_ahead(name) for name in "abc"] == [3, 0, 0]
 
 
-def test_clocks_meet_over_a_third() -> None:
+def test_clocks_without_common_sounds_are_compared_over_a_third() -> None:
     clocks = ClockOffsets({name: name for name in "abc"}, C_M_S)
     for k in range(8):
         late = {"a": 0.0, "b": 0.1} if k % 2 else {"b": 0.1, "c": -0.1}
@@ -148,7 +148,7 @@ def test_clocks_meet_over_a_third() -> None:
     assert c.offset_s - b.offset_s == pytest.approx(-0.2, abs=0.002)
 
 
-def test_arrays_of_one_node_tell_nothing_of_its_clock() -> None:
+def test_arrays_of_one_node_give_no_offset() -> None:
     clocks = ClockOffsets({"north": "pc", "south": "pc", "east": "other"}, C_M_S)
     assert not clocks.differ(["north", "south"])
     assert clocks.differ(["north", "east"])
@@ -160,7 +160,7 @@ def test_arrays_of_one_node_tell_nothing_of_its_clock() -> None:
     assert known.offset_s == pytest.approx(0.1, abs=1e-3)
 
 
-def test_corrections_do_not_come_and_go() -> None:
+def test_correction_has_a_hysteresis() -> None:
     """30 ms are left alone; 40 ms are a frame; and a frame stays one until an offset is 35 ms off it."""
     clocks = ClockOffsets({"a": "a", "b": "b"}, C_M_S)
     frames = []
@@ -171,7 +171,7 @@ def test_corrections_do_not_come_and_go() -> None:
     assert clocks.rest_s("a") == 0.0
 
 
-def test_state_goes_through_json() -> None:
+def test_state_survives_json() -> None:
     clocks = learned([0.0, 0.15])
     again = ClockOffsets({"a": "a", "b": "b"}, C_M_S)
     again.restore(json.loads(json.dumps(clocks.state())))

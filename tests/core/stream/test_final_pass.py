@@ -43,7 +43,7 @@ def both(active: range, frame_indices: range) -> Arrivals:
     return node("north", active, frame_indices) + node("south", active, frame_indices)
 
 
-def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() -> None:
+def test_without_delays_only_final_events_are_reported_and_at_once() -> None:
     said = play(two_passes(), both(range(10, 16), range(40)), 40)
     assert provisional(said) == []
     ((when, output),) = said
@@ -55,20 +55,20 @@ def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() ->
     assert output.until == START + 16  # the sound's end: what follows may be the run-up of the next
 
 
-def test_what_is_settled_grows_with_silence_but_for_a_run_up() -> None:
+def test_silence_is_settled_except_for_a_pre_roll() -> None:
     into = two_passes()
     assert into.settled is None
     play(into, both(range(0), range(100)), 100)
     assert into.settled == START + 100 - 8
 
 
-def test_sound_that_lasts_holds_what_it_needs() -> None:
+def test_sound_that_goes_on_is_not_settled() -> None:
     into = two_passes()
     play(into, both(range(30, 90), range(60)), 60)
     assert into.settled == START + 30 - 8
 
 
-def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
+def test_array_that_is_away_delays_no_early_event_and_corrects_the_final_one() -> None:
     into = two_passes()
     north, south = node("north", range(40, 46), range(200)), node("south", range(40, 46), range(30))
     said = play(into, north + south, 100)
@@ -88,7 +88,7 @@ def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
     assert into.backfilled == {"north": 0, "south": len(kept)}
 
 
-def test_nobody_is_waited_for_for_ever() -> None:
+def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:
     into = two_passes(hold_ns=5 * 1_000_000_000)
     said = play(into, node("north", range(40, 46), range(300)) + node("south", (), range(30)), 300)
     (event,) = settled_events(said)
@@ -107,7 +107,7 @@ def test_hold_is_longer_than_a_restart_takes() -> None:
     assert HOLD_NS > 60 * 1_000_000_000 > LOST_NS
 
 
-def test_memory_that_waits_is_bounded() -> None:
+def test_memory_of_held_frames_is_bounded() -> None:
     size = frame("north", 0).samples.nbytes
     into = two_passes(hold_bytes=50 * size)
     play(into, node("south", (), range(5)), 5)
@@ -116,7 +116,7 @@ def test_memory_that_waits_is_bounded() -> None:
     assert len(settled_events(said)) >= 1
 
 
-def test_good_bye_is_waited_for_by_nobody() -> None:
+def test_array_whose_node_has_ended_is_not_awaited() -> None:
     into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
@@ -125,7 +125,7 @@ def test_good_bye_is_waited_for_by_nobody() -> None:
     assert event.heard_by == NAMES
 
 
-def test_when_all_have_left_everything_is_settled() -> None:
+def test_everything_is_settled_when_all_nodes_have_ended() -> None:
     into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
@@ -134,7 +134,7 @@ def test_when_all_have_left_everything_is_settled() -> None:
     assert event.heard_by == NAMES
 
 
-def test_what_was_settled_before_is_not_told_again() -> None:
+def test_settled_events_are_not_reported_again_after_a_restart() -> None:
     """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
     into = two_passes()
     first = play(into, both(range(10, 16), range(30)), 30)
@@ -152,7 +152,7 @@ def test_what_was_settled_before_is_not_told_again() -> None:
     assert sum(again.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
 
 
-def test_clock_of_the_server_set_back_begins_anew() -> None:
+def test_final_pass_begins_anew_when_the_servers_clock_is_set_back() -> None:
     into = two_passes()
     play(into, both(range(10, 16), range(100)), 100)
     hour = 3600 * SECOND
@@ -166,7 +166,7 @@ def test_clock_of_the_server_set_back_begins_anew() -> None:
     assert event.start_ns == now_ns(-hour + 10)
 
 
-def test_no_event_lies_in_the_future() -> None:
+def test_node_an_hour_ahead_is_rejected_with_a_reason() -> None:
     """A node an hour ahead is refused and told so; the other goes on."""
     into = two_passes()
     ahead = [

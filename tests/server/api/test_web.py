@@ -147,7 +147,7 @@ def test_arrays(client: httpx.Client) -> None:
 
 def test_arrays_not_heard_from(fresh: httpx.Client) -> None:
     for array in get(fresh, "arrays")["arrays"]:
-        assert (array["state"], array["reason"], array["age_s"]) == ("starting", "not heard from yet", None)
+        assert (array["state"], array["reason"], array["age_s"]) == ("starting", "no message yet", None)
 
 
 def test_events_are_where_the_sounds_were(client: httpx.Client) -> None:

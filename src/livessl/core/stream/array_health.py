@@ -132,11 +132,11 @@ class ArrayHealth:
         """
         troubled = self.fault_ns is not None and now_ns - self.fault_ns < TROUBLE_NS
         if age_ns is None:
-            return (ArrayState.DEGRADED, self.fault) if troubled else (ArrayState.STARTING, "not heard from yet")
+            return (ArrayState.DEGRADED, self.fault) if troubled else (ArrayState.STARTING, "no message yet")
         if has_left:
             return ArrayState.LOST, "its node has ended"
         if age_ns >= LOST_NS:
-            silence = f"nothing heard from it for {age_ns / 1e9:.1f} s"
+            silence = f"no message for {age_ns / 1e9:.1f} s"
             return ArrayState.LOST, f"{silence}; before that, {self.fault}" if troubled else silence
         reason = self._channel_fault(now_ns) or (self.fault if troubled else _disagreement(votes))
         return (ArrayState.HEALTHY, None) if reason is None else (ArrayState.DEGRADED, reason)
@@ -146,7 +146,7 @@ class ArrayHealth:
             which = "all channels are" if len(self.dead) == self.microphones else f"microphone {list(self.dead)} is"
             return f"{which} dead: all-zero samples; check cable, gain and channel numbers"
         if self.weak and now_ns - self.weak_since_ns >= SILENT_NS:
-            which = f"microphone {list(self.weak)} hears nothing of what the others hear, and is left out"
+            which = f"microphone {list(self.weak)} receives next to nothing of what the others receive, and is excluded"
             return f"{which}; check cable, gain and channel numbers"
         return None
 
@@ -167,8 +167,8 @@ def _disagreement(votes: Votes) -> str | None:
     if not is_suspect(votes):
         return None
     off_deg = [off for _, off in votes if off is not None]
-    told = f"{len(off_deg)} of the last {len(votes)} sounds, by {np.median(off_deg):.0f}°"
-    return f"disagrees with the others in {told}: is its pose right, and its channels' order?"
+    events = f"{len(off_deg)} of the last {len(votes)} events, by {np.median(off_deg):.0f}°"
+    return f"an outlier in {events}; check its pose and the order of its channels"
 
 
 def _alive(samples: Float32Array) -> list[bool]:

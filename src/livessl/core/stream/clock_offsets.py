@@ -243,7 +243,7 @@ def clock_is_off(offset: ClockOffset) -> str:
     side = "ahead of" if offset.offset_s > 0 else "behind"
     return (
         f"its clock is {1e3 * abs(offset.offset_s):.0f} ms (±{1e3 * offset.std_s:.0f}) {side} that of "
-        f"{offset.reference!r}, by {offset.sounds} sounds; this is corrected for: set both by NTP"
+        f"{offset.reference!r}, estimated from {offset.sounds} sounds and corrected; set both by NTP"
     )
 
 

@@ -44,9 +44,9 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
         return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
     if found.features is not None and not found.features.tell_direction:
-        return Status.REFUSED, "nothing that was heard came from any one direction"
-    who = "one array cannot" if len(specs) == 1 else "these arrays cannot"
-    return Status.DIRECTION_ONLY, f"{who} tell how far away it is: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+        return Status.REFUSED, "no direction stands out in the sound"
+    who = "one array" if len(specs) == 1 else "these arrays"
+    return Status.DIRECTION_ONLY, f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Verdicts:
         """
         backfilled = backfilled or {}
         used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
-        first = self._refused(event, excerpt, now_ns, f"heard by {len(used.sounds)} of at least {least} arrays")
+        first = self._refused(event, excerpt, now_ns, f"detected by {len(used.sounds)} of at least {least} arrays")
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
@@ -213,4 +213,4 @@ def _dissent(found: Localization) -> str | None:
     if not found.outliers:
         return None
     each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outliers.items()))
-    return f"located without {each}: outvoted by the others"
+    return f"located without the {'outlier' if len(found.outliers) == 1 else 'outliers'} {each}"
