@@ -68,7 +68,7 @@ async def _one(socket: Any, seconds: float) -> tuple[int, int]:
 
 async def tell(server: Server, message: JsonObject, until_ns: int) -> int:
     """Tell updates as fast as the clients are sent them, a burst at a time; returns how many."""
-    hub, told = server._hub, 0
+    hub, told = server.parts.fanout, 0
     while CLOCK.monotonic_ns() < until_ns:
         for _ in range(LAGGING // 2):
             hub.publish(message, CLOCK.monotonic_ns())

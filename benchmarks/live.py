@@ -60,13 +60,13 @@ def serve(site_file: Path, profile: Path | None) -> None:
     """Be the server, with the estimator above, and perhaps profiled."""
     estimators.ESTIMATORS["onset"] = Nowhere
     if profile is not None:
-        run = Engine._run
+        turn = Engine.turn
         profiler = cProfile.Profile()
 
         def profiled(engine: Engine) -> None:
-            profiler.runcall(run, engine)
+            profiler.runcall(turn, engine)
 
-        Engine._run = profiled  # type: ignore[assignment, method-assign]
+        Engine.turn = profiled  # type: ignore[assignment, method-assign]
     livessl(["serve", "--site", str(site_file)])
     if profile is not None:
         profiler.dump_stats(profile)

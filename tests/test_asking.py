@@ -256,8 +256,8 @@ def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -
     assert [event.estimate and event.estimate.arrays for event in expected] == [("north", "south")] * SOUNDS * times
     with running_server(site_of({**NODES, "server.bind": "tcp://127.0.0.1:*"})) as server:
         pace = PacedClock(START_NS, speed) if speed else UnpacedClock(START_NS)
-        send_session(site(), server.engine.endpoint, played, pace, SystemClock(), "run-1", lambda: False)
-        server.engine.wait_idle()
+        send_session(site(), server.endpoint, played, pace, SystemClock(), "run-1", lambda: False)
+        server.wait_idle()
         with urllib.request.urlopen(f"{server.url}/api/v1/events") as answer:
             found = json.load(answer)["events"][::-1]
     assert [event["id"] for event in found] == [event.id for event in expected]

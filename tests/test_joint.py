@@ -299,13 +299,13 @@ def test_option_that_is_wrong(files: Path, capsys: pytest.CaptureFixture[str], o
 def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> None:
     clock = SystemClock()
     with running_server(site_of(JOINT)) as server:
-        endpoint = server.engine.endpoint
+        endpoint = server.endpoint
         arguments = (endpoint, scene_parts(START_NS), UnpacedClock(START_NS), clock)
         with pytest.raises(UndeliveredError, match="array 'north' is joined in 'both' at the server; give node and"):
             send_session(site_of(), *arguments, "run-1", lambda: False)
         send_session(site_of(JOINT), *arguments, "run-2", lambda: False)
-        server.engine.wait_idle()
-        wait_until(lambda: server.engine.events == 2, "both events")
+        server.wait_idle()
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         read = {name: httpx.get(f"{server.url}/api/v1/{name}").json() for name in ("events", "site", "arrays")}
         image = httpx.get(f"{server.url}/api/v1/map", params={"array": "both"})
         unknown = httpx.get(f"{server.url}/api/v1/map", params={"array": "north"})

@@ -41,8 +41,8 @@ def test_running_it_all_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     site = site_of({**PRIVATE, "server.events_db": str(tmp_path / "events.db")}, tmp_path)
     with running_server(site) as server:
-        send_session(site, server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run", lambda: False)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        send_session(site, server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run", lambda: False)
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         written = {path.name for path in tmp_path.rglob("*")}
         assert {name.partition("-")[0] for name in written} == {"events.db"}
     with closing(sqlite3.connect(tmp_path / "events.db")) as db:

@@ -110,7 +110,7 @@ def assert_same(got: WireMessage, sent: WireMessage) -> None:
     if isinstance(sent, Frame):
         assert isinstance(got, Frame)
         assert_array_equal(got.samples.view(np.uint32), sent.samples.view(np.uint32))  # to the bit: -0.0 is not 0.0
-        fields = ("array", "sequence", "frame index", "time_ns", "sample_rate_hz", "power", "active")
+        fields = ("array", "sequence", "frame_index", "time_ns", "sample_rate_hz", "power", "active")
         assert [getattr(got, name) for name in fields] == [getattr(sent, name) for name in fields]
     else:
         assert got == sent
@@ -310,8 +310,8 @@ def test_samples_must_be_such_as_a_converter_gives() -> None:
         ({"power": math.inf}, "power"),
         ({"power": math.nan}, "power"),
         ({"power": 1e300}, "power"),
-        ({"frame index": 2**62}, "frame index"),
-        ({"frame index": -(2**62)}, "frame index"),
+        ({"frame_index": 2**62}, "frame index"),
+        ({"frame_index": -(2**62)}, "frame index"),
         ({"samples": np.zeros((1, 10), dtype=np.float32)}, "2 to 16 channels, got 1"),
         ({"samples": np.zeros((17, 10), dtype=np.float32)}, "2 to 16 channels, got 17"),
         ({"samples": np.zeros((4, 0), dtype=np.float32)}, "samples, got 0"),
@@ -322,7 +322,7 @@ def test_frame_outside_the_limits_is_refused(values: dict[str, Any], expected: s
     good: dict[str, Any] = {
         "array": "north",
         "sequence": 1,
-        "frame index": 1,
+        "frame_index": 1,
         "time_ns": 1,
         "sample_rate_hz": 16000.0,
         "samples": np.zeros((4, 10), dtype=np.float32),
@@ -341,14 +341,14 @@ def test_frame_outside_the_limits_is_refused(values: dict[str, Any], expected: s
         ({"channel_power": (0.0, math.inf)}, "powers from 0"),
         ({"channel_power": (0.0,) * 17}, "at most 16 channels"),
         ({"drift_ppm": math.nan}, "finite drift"),
-        ({"frame index": 2**62}, "frame index"),
+        ({"frame_index": 2**62}, "frame index"),
     ],
 )
 def test_mark_outside_the_limits_is_refused(values: dict[str, Any], expected: str) -> None:
     good: dict[str, Any] = {
         "array": "north",
         "sequence": 1,
-        "frame index": 1,
+        "frame_index": 1,
         "power": 0.0,
         "noise_power": 0.0,
         "channel_power": (0.0,) * 4,

@@ -411,9 +411,9 @@ def test_replay_of_no_session(run: Run, tmp_path: Path) -> None:
 
 def test_replay_into_a_server_that_is_live(run: Run, recorded: Recorded) -> None:
     with running_server(site_of()) as server:
-        link = Link(server.engine.endpoint, Hello("lab-pc", "run", {"north": float(RATE_HZ)}), SystemClock())
+        link = Link(server.endpoint, Hello("lab-pc", "run", {"north": float(RATE_HZ)}), SystemClock())
         link.wait_connected(lambda: False)
-        done = run("replay", recorded.directory, "--server", server.engine.endpoint, "--speed", "max")
+        done = run("replay", recorded.directory, "--server", server.endpoint, "--speed", "max")
         link.close(bye=True)
     assert done.code == 1
     assert "refused the sound: live nodes are connected; stop them first" in done.err
@@ -525,12 +525,12 @@ def test_capture_with_no_server_says_so_at_the_end(run: Run, recorded: Recorded,
 
 def test_capture_into_a_server_is_a_success(run: Run, recorded: Recorded, tmp_path: Path) -> None:
     with running_server(site_of()) as server:
-        site = write_site(tmp_path, {"nodes.lab-pc.server": server.engine.endpoint})
+        site = write_site(tmp_path, {"nodes.lab-pc.server": server.endpoint})
         begin_ns = SystemClock().now_ns() - 10_000_000_000
         begin = utc_text(begin_ns // 50_000_000 * 50_000_000)
         done = run("capture", "--site", site, "--node", "lab-pc", *recorded.wavs(), "--start-at", begin)
         assert done.code == 0
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         live = httpx.get(f"{server.url}/api/v1/events").json()["events"][::-1]
     located = run("locate", "--site", recorded.site, *recorded.wavs(), "--json").objects
     assert [event["position_m"] for event in live] == [event["position_m"] for event in located]

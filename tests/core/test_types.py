@@ -27,7 +27,7 @@ def frame(**changes: Any) -> Frame:
     arguments: dict[str, Any] = {
         "array": "north",
         "sequence": 1,
-        "frame index": 7,
+        "frame_index": 7,
         "time_ns": 7 * FRAME_NS + 11,
         "sample_rate_hz": 16000.0,
         "samples": SAMPLES.copy(),

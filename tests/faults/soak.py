@@ -28,7 +28,7 @@ from unittest.mock import patch
 from mutation import mutated, originals
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
-from world import START, Event, HandClock, Microphones, Post, World
+from world import START, Event, Microphones, Post, World
 
 from clients import Listener, Log, open_client
 from livessl import wire
@@ -38,9 +38,7 @@ from livessl.recordings.assign import Part, pipelines_of
 from livessl.recordings.play import played_messages
 from livessl.recordings.recording import ArrayRecording, Placed
 from livessl.server.app import Server
-from livessl.server.engine import Engine
 from livessl.server.latency import Arrival
-from livessl.server.refusals import Refusals
 from livessl.simulate.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
@@ -198,32 +196,12 @@ def sound_of(slot: int, count: int) -> tuple[int, int] | None:
 class _Post(Post):
     """As the receiver, its books on arrivals included."""
 
-    endpoint = "nowhere"
-
-    def __init__(self, site: Site, clock: HandClock) -> None:
-        super().__init__(site, clock)
-        self.refusals = Refusals(clock)
-        self.enrolled: list[str] = []
-
     def receive(self, routing_id: bytes, data: bytes) -> list[tuple[bytes, wire.Ack]]:
         before = len(self.queue)
         replies = super().receive(routing_id, data)
         if len(self.queue) > before and isinstance(item := self.queue[-1], Message):
             self.arrivals.note(item.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
         return replies
-
-    def start(self) -> None:
-        """There is no thread."""
-
-    def stop(self) -> None:
-        """There is no socket."""
-
-
-class _Driven(Engine):
-    """An engine whose turns are taken from outside."""
-
-    def start(self) -> None:
-        self.maps.start()
 
 
 class Soak(World):
@@ -265,9 +243,9 @@ class Soak(World):
 
     def start_server(self) -> None:
         self.site = self._soaked
-        with patch("livessl.server.engine.Receiver", _Post), patch("livessl.server.app.Engine", _Driven):
-            self.http = Server(self.site, self.clock, on_event=self._note)
-        self.server = self.http.engine
+        self.post = _Post(self.site, self.clock)
+        self.http = Server(self.site, self.clock, on_event=self._note, receiver=self.post, stepped=True)
+        self.server = self.http.parts
 
     def _note(self, event: Event) -> None:
         self.slots.add((utc_ns(event["time_utc"]) // FRAME_NS - START) // SLOT)
@@ -322,8 +300,8 @@ class Soak(World):
 
     def _breathe(self) -> None:
         """Wait until the server's loop has told all that it was given; else it would fall behind by hours."""
-        if self.http.engine.failure is not None:
-            raise RuntimeError("the server has failed") from self.http.engine.failure
+        if self.http.parts.failure is not None:
+            raise RuntimeError("the server has failed") from self.http.parts.failure
         assert self.http._loop is not None
         asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result()
 
@@ -552,7 +530,7 @@ def soak(
         return Outcome(
             hours=hours,
             sounds=len(sounds),
-            events=world.http.engine.events,
+            events=world.http.parts.event_log.published,
             unheard=len(sounds - world.slots),
             messages=dict(world.sent),
             begin_mb=round(begin_mb, 1),
@@ -562,7 +540,7 @@ def soak(
             end_mb=round(resting[-1], 1),
             peak_mb=round(max(sample.resident_mb for sample in world.memory), 1),
             resting=len(resting) / len(after),
-            stored=world.http._store.count(),
+            stored=world.http.parts.store.count(),
             faults=dict(world.faults),
             clients=dict(crowd.heard),
             seconds=round(time.monotonic() - began_s, 1),

@@ -64,7 +64,7 @@ def test_a_narrow_link_carries_nothing_twice() -> None:
     links_narrow(world)
     world.recover()
     assert world.server is not None
-    arrays = world.server.arrays()
+    arrays = world.server.array_states.describe()
     assert sum(array["counters"]["backfilled"] for array in arrays) > 200
     assert [array["counters"][what] for array in arrays for what in ("sequence_gaps", "duplicates")] == [0] * 4
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any, ClassVar
-from unittest.mock import patch
 
 import numpy as np
 
@@ -22,11 +21,15 @@ from livessl.capture.link import Dealer, Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
 from livessl.core.locate.estimators import ESTIMATORS, Localization, PowerMaps, Sound
-from livessl.core.types import FRAME_NS, Evidence, Frame, Mark, Message
-from livessl.server.engine import Engine
+from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
+from livessl.server.app import assemble
+from livessl.server.fanout import Fanout
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrivals
+from livessl.server.parts import Parts
 from livessl.server.receiver import Greeted, Item, Joined, Left
+from livessl.server.refusals import Refusals
+from livessl.server.sinks import Sinks
 from livessl.server.store import Query, Store, StoreError
 from livessl.site.models import Site
 from small_site import RATE_HZ, site_of
@@ -179,12 +182,25 @@ class Microphones:
 class Post:
     """The receiver without its socket and thread."""
 
+    endpoint = "nowhere"
+
     def __init__(self, site: Site, clock: HandClock) -> None:
         self.ingest = Ingest(site)
         self.arrivals = Arrivals()
-        self.failure = None
+        self.refusals = Refusals(clock)
+        self.enrolled: list[str] = []
+        self.failure: BaseException | None = None
         self.queue: deque[Item] = deque()
         self._clock = clock
+
+    def start(self) -> None:
+        """There is no thread."""
+
+    def stop(self) -> None:
+        """There is no socket."""
+
+    def request(self, request: BackfillRequest) -> None:
+        raise AssertionError("no node here answers requests for missing frames")
 
     def take(self, most: int, wait_s: float) -> list[Item]:
         return [self.queue.popleft() for _ in range(min(most, len(self.queue)))]
@@ -217,17 +233,17 @@ class FragileStore(Store):
         self.dies: str | None = None
         self.full = False
 
-    def add(self, event: Event, time_ns: int, *, provisional: bool = False) -> None:
+    def add(self, event: Event, time_ns: int, *, early: bool = False) -> None:
         if self.full:
             raise StoreError("disk full")
-        super().add(event, time_ns, provisional=provisional)
+        super().add(event, time_ns, early=early)
 
-    def settle(self, *arguments: Any) -> None:
+    def finalize(self, *arguments: Any) -> None:
         if self.full:
             raise StoreError("disk full")
         if self.dies == "before":
             raise DiedError
-        super().settle(*arguments)
+        super().finalize(*arguments)
         if self.dies == "after":
             raise DiedError
 
@@ -276,7 +292,7 @@ class World:
         self._connections = self._runs = 0
         self.frame_index = START
         self.sounds = self._make_sounds(sounds)
-        self.server: Engine | None = None
+        self.server: Parts | None = None
         self.nodes: dict[str, Node] = {}
         self.down: dict[str, list[tuple[int, int]]] = {name: [] for name in self.array_of}
         self.start_server()
@@ -304,8 +320,10 @@ class World:
     def start_server(self) -> None:
         fusion = self.site.fusion.model_copy(update={"method": "fingerprint"})
         site = self.site.model_copy(update={"fusion": fusion})
-        with patch("livessl.server.engine.Receiver", Post):
-            self.server = Engine(site, self.clock, self.store, self.published.append)
+        self.post = Post(site, self.clock)
+        self.server = assemble(
+            site, self.clock, self.store, Sinks(()), Fanout(), self.published.append, receiver=self.post
+        )
 
     def kill_server(self) -> None:
         self.server = None
@@ -396,7 +414,7 @@ class World:
     def _serve(self) -> None:
         if self.server is None:
             return
-        post: Post = self.server._receiver  # type: ignore[assignment]
+        post = self.post
         replies: list[tuple[bytes, wire.Ack]] = []
         for name, connection in self.wires.items():
             while name not in self.cut and connection.up and connection.up[0][0] <= self.clock.time_ns:
@@ -410,7 +428,7 @@ class World:
                 down.append((self._arrival(down), wire.encode(ack)))
         try:
             while True:
-                self.server._turn()
+                self.server.engine.turn()
                 if not post.queue:
                     break
         except DiedError:

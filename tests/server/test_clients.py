@@ -29,20 +29,20 @@ def test_client_that_leaves_with_much_on_its_way_is_no_news(caplog: pytest.LogCa
     """Its queue is not written to a connection that is gone, line by line of complaint in the log."""
     with running_server(site_of()) as server:
         client = open_client("127.0.0.1", int(server.url.rpartition(":")[2]), None)
-        wait_until(lambda: server._hub.clients == 1, "its place")
+        wait_until(lambda: server.parts.fanout.clients == 1, "its place")
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closing cuts at once
         done = Event()
 
         def leave() -> None:
             client.close()
             for number in range(BACKLOG):
-                server._hub.publish({"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": []})
+                server.parts.fanout.publish({"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": []})
             done.set()
 
         assert server._loop is not None
         server._loop.call_soon_threadsafe(leave)
         assert done.wait(5)
-        wait_until(lambda: server._hub.clients == 0, "its place to be free")
+        wait_until(lambda: server.parts.fanout.clients == 0, "its place to be free")
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
 
 
@@ -50,15 +50,15 @@ def test_server_ends_while_a_client_says_good_bye() -> None:
     """A client that does not read what it was sent, but has said that it goes, is closing until the last byte."""
     with running_server(site_of()) as server:
         client = open_client("127.0.0.1", int(server.url.rpartition(":")[2]), 4096)
-        wait_until(lambda: server._hub.clients == 1, "its place")
+        wait_until(lambda: server.parts.fanout.clients == 1, "its place")
         assert server._loop is not None
         text = "x" * 100_000  # more than the two sockets' buffers hold
         for number in range(8):
             message = {"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": [], "text": text}
-            server._loop.call_soon_threadsafe(server._hub.publish, message)
+            server._loop.call_soon_threadsafe(server.parts.fanout.publish, message)
         wait_until(lambda: any(c.transport.get_write_buffer_size() for c in connections(server)), "the unread")
         client.sendall(bytes([0x88, 0x80, 0, 0, 0, 0]))  # a closing frame, masked with zeros
-        wait_until(lambda: server._hub.clients == 0, "its leaving to be noticed")
+        wait_until(lambda: server.parts.fanout.clients == 0, "its leaving to be noticed")
         assert connections(server)
     client.close()
 

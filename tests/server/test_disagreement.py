@@ -32,7 +32,7 @@ def play(server: Server, true_site: Site, sounding: Scene) -> None:
         parts.append(
             Part(spec.name, Placed(ArrayRecording(spec.name, float(RATE_HZ), samples), start_ns), (1, 2, 3, 4))
         )
-    node = site_of({**THREE, "nodes.lab-pc.server": server.engine.endpoint})
+    node = site_of({**THREE, "nodes.lab-pc.server": server.endpoint})
     capture_recordings(node, "lab-pc", parts, CLOCK, "run-1", lambda: False)
 
 
@@ -40,7 +40,7 @@ def test_a_turned_array_is_named_by_events_state_and_metrics() -> None:
     wrong = {**EAST, "orientation_deg": {"yaw": 40}}
     with running_server(site_of({**THREE, "arrays.east": wrong})) as server:
         play(server, site_of(THREE), scene(3))
-        wait_until(lambda: server.engine.events == 3, "the events")
+        wait_until(lambda: server.parts.event_log.published == 3, "the events")
         events = httpx.get(f"{server.url}/api/v1/events").json()["events"]
         metrics = httpx.get(f"{server.url}/metrics").text
     for event, source in zip(reversed(events), scene(3).sources, strict=True):
@@ -55,7 +55,7 @@ def test_a_turned_array_is_named_by_events_state_and_metrics() -> None:
         assert 15 < told["east"][1] < 45
     assert 'livessl_array_sounds{array="east",verdict="disagreed"} 3.0' in metrics
     assert 'livessl_array_sounds{array="north",verdict="agreed"} 3.0' in metrics
-    (east,) = (array for array in server.engine.arrays() if array["name"] == "east")
+    (east,) = (array for array in server.parts.array_states.describe() if array["name"] == "east")
     assert east["agreement"] == {"agreed": 0, "disagreed": 3}
 
 
@@ -67,7 +67,7 @@ def test_two_sources_at_once_are_two_events_and_stay_two() -> None:
     sounding = replace(scene(), sources=sources, duration_s=2.5)
     with running_server(site_of(THREE)) as server:
         play(server, site_of(THREE), sounding)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         second, first = sorted(httpx.get(f"{server.url}/api/v1/events").json()["events"], key=lambda e: -e["source"])
     assert second["id"] == f"{first['id']}-2"
     assert (first["source"], second["source"]) == (1, 2)

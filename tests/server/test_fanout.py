@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from livessl.server.api.encode import API_VERSION, JsonObject
-from livessl.server.fanout import BACKLOG, LAGGING, PAST, Filter, Hub, Subscription
+from livessl.server.fanout import BACKLOG, LAGGING, PAST, Fanout, Filter, Subscription
 
 
 def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = (), sound: int | None = None) -> JsonObject:
@@ -39,27 +39,27 @@ def drained(subscription: Subscription) -> list[JsonObject]:
 
 
 def test_messages_are_numbered_without_holes() -> None:
-    hub = Hub()
-    hub.publish(update())  # before anyone listens
-    one, two = hub.subscribe(Filter()), hub.subscribe(Filter())
+    fanout = Fanout()
+    fanout.publish(update())  # before anyone listens
+    one, two = fanout.subscribe(Filter()), fanout.subscribe(Filter())
     for k in range(5):
-        hub.publish(update(k))
+        fanout.publish(update(k))
     for subscription in (one, two):
         got = drained(subscription)
         assert [message["seq"] for message in got] == [2, 3, 4, 5, 6]
         assert [message["n"] for message in got] == [0, 1, 2, 3, 4]
         assert {message["v"] for message in got} == {API_VERSION}
-    assert hub.last_seq == 6
+    assert fanout.last_seq == 6
 
 
 def test_nothing_comes_after_unsubscribing() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
-    assert hub.clients == 1
-    hub.unsubscribe(subscription)
-    hub.unsubscribe(subscription)
-    assert hub.clients == 0
-    hub.publish(update())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
+    assert fanout.clients == 1
+    fanout.unsubscribe(subscription)
+    fanout.unsubscribe(subscription)
+    assert fanout.clients == 0
+    fanout.publish(update())
     assert drained(subscription) == []
 
 
@@ -93,24 +93,24 @@ def test_filters(wanted: dict[str, Any], passing: str) -> None:
 
 
 def test_filtered_messages_keep_their_numbers() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter(kinds=frozenset({"event"})))
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter(kinds=frozenset({"event"})))
     for k in range(6):
-        hub.publish(event(k) if k % 3 == 0 else update(k))
+        fanout.publish(event(k) if k % 3 == 0 else update(k))
     assert [message["seq"] for message in drained(subscription)] == [1, 4]
 
 
 def test_slow_reader_loses_the_oldest_that_are_no_events_and_is_told() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
     events = [3, 50, 100]
     total = BACKLOG + 120
     for k in range(total):
-        hub.publish(event(k) if k in events else update(k))
+        fanout.publish(event(k) if k in events else update(k))
 
     async def read_twice() -> tuple[list[JsonObject], list[JsonObject]]:
         first = await waiting(subscription)
-        hub.publish(update(total))
+        fanout.publish(update(total))
         return first, await waiting(subscription)
 
     (gap, *rest), later = asyncio.run(read_twice())
@@ -125,32 +125,32 @@ def test_slow_reader_loses_the_oldest_that_are_no_events_and_is_told() -> None:
 
 
 def test_backlog_of_events_alone_is_bounded_too() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
     for k in range(BACKLOG + 10):
-        hub.publish(event(k))
+        fanout.publish(event(k))
     gap, *rest = drained(subscription)
     assert gap["missed"] == 10
     assert [message["n"] for message in rest] == list(range(10, BACKLOG + 10))
 
 
 def test_full_backlog_without_loss_is_no_gap() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
     for k in range(BACKLOG):
-        hub.publish(update(k))
+        fanout.publish(update(k))
     assert [message["n"] for message in drained(subscription)] == list(range(BACKLOG))
 
 
 def test_slow_reader_hinders_nobody() -> None:
-    hub = Hub()
-    hub.subscribe(Filter())
-    quick = hub.subscribe(Filter())
+    fanout = Fanout()
+    fanout.subscribe(Filter())
+    quick = fanout.subscribe(Filter())
 
     async def both() -> list[int]:
         got = []
         for k in range(3 * BACKLOG):
-            hub.publish(update(k))
+            fanout.publish(update(k))
             got.append((await quick.next()).message["n"])
         return got
 
@@ -158,28 +158,28 @@ def test_slow_reader_hinders_nobody() -> None:
 
 
 def test_next_waits_for_news() -> None:
-    hub = Hub()
+    fanout = Fanout()
 
     async def wait() -> JsonObject:
-        subscription = hub.subscribe(Filter())
+        subscription = fanout.subscribe(Filter())
         reading = asyncio.create_task(subscription.next())
         await asyncio.sleep(0)
         assert not reading.done()
-        hub.publish(update(7))
+        fanout.publish(update(7))
         return (await asyncio.wait_for(reading, 1.0)).message
 
     assert asyncio.run(wait())["n"] == 7
 
 
 def test_slow_reader_gets_every_event_and_the_newest_of_everything_else() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
     events = [5, 700, 701, 2000]
     for k in range(3000):
-        hub.publish(event(k) if k in events else update(k, sound=k % 3))
+        fanout.publish(event(k) if k in events else update(k, sound=k % 3))
         if k % 10 == 0:
-            hub.publish({"kind": "track", "id": 1, "n": k})
-            hub.publish({"kind": "arrays", "n": k})
+            fanout.publish({"kind": "track", "id": 1, "n": k})
+            fanout.publish({"kind": "arrays", "n": k})
     got = drained(subscription)
     assert len(got) < BACKLOG
     assert [message["n"] for message in got if message["kind"] == "event"] == events
@@ -189,25 +189,25 @@ def test_slow_reader_gets_every_event_and_the_newest_of_everything_else() -> Non
     assert by_sound == {"lab-0": 2997, "lab-1": 2998, "lab-2": 2999}
     assert [message["n"] for message in got if message["kind"] in ("track", "arrays")][-2:] == [2990, 2990]
     assert "gap" not in {message["kind"] for message in got}  # nothing is missing that is not told again
-    assert hub.superseded == 3000 + 600 - len(got)
+    assert fanout.superseded == 3000 + 600 - len(got)
 
 
 def test_reader_who_keeps_up_gets_everything() -> None:
-    hub = Hub()
-    subscription = hub.subscribe(Filter())
+    fanout = Fanout()
+    subscription = fanout.subscribe(Filter())
     for k in range(LAGGING):
-        hub.publish(update(k, sound=0))
+        fanout.publish(update(k, sound=0))
     assert [message["n"] for message in drained(subscription)] == list(range(LAGGING))
-    late = hub.subscribe(Filter())
+    late = fanout.subscribe(Filter())
     for k in range(LAGGING + 1):
-        hub.publish(update(k, sound=0))
+        fanout.publish(update(k, sound=0))
     assert [message["n"] for message in drained(late)] == [*range(LAGGING - 1), LAGGING]
 
 
 def test_text_is_made_once_for_all() -> None:
-    hub = Hub()
-    one, two = hub.subscribe(Filter()), hub.subscribe(Filter())
-    hub.publish(event(1))
+    fanout = Fanout()
+    one, two = fanout.subscribe(Filter()), fanout.subscribe(Filter())
+    fanout.publish(event(1))
 
     async def texts() -> list[str]:
         return [(await subscription.next()).text for subscription in (one, two)]
@@ -221,42 +221,42 @@ def numbers(subscription: Subscription) -> list[Any]:
 
 
 def test_client_that_comes_back_gets_what_it_missed_in_order() -> None:
-    hub = Hub(first_seq=100)
+    fanout = Fanout(first_seq=100)
     for k in range(10):
-        hub.publish(update(k) if k % 2 else event(k))
-    back = hub.subscribe(Filter(), since_seq=104)
-    events_only = hub.subscribe(Filter(frozenset({"event"})), since_seq=104)
-    hub.publish(event(11))
+        fanout.publish(update(k) if k % 2 else event(k))
+    back = fanout.subscribe(Filter(), since_seq=104)
+    events_only = fanout.subscribe(Filter(frozenset({"event"})), since_seq=104)
+    fanout.publish(event(11))
     assert numbers(back) == [105, 106, 107, 108, 109, 110, 111]
     assert numbers(events_only) == [105, 107, 109, 111]
-    assert numbers(hub.subscribe(Filter(), since_seq=111)) == []
-    assert numbers(hub.subscribe(Filter())) == []
+    assert numbers(fanout.subscribe(Filter(), since_seq=111)) == []
+    assert numbers(fanout.subscribe(Filter())) == []
 
 
 def test_client_that_comes_back_is_told_what_is_gone() -> None:
-    hub = Hub(first_seq=100)
+    fanout = Fanout(first_seq=100)
     for k in range(PAST + 50):
-        hub.publish(event(k))
-    gap, *rest = drained(hub.subscribe(Filter(), since_seq=110))
+        fanout.publish(event(k))
+    gap, *rest = drained(fanout.subscribe(Filter(), since_seq=110))
     assert (gap["kind"], gap["missed"]) == ("gap", 40)
     assert "after number 110 are gone, up to 150; GET events" in gap["reason"]
     assert [message["seq"] for message in rest] == list(range(151, 101 + PAST + 50))
-    gap, *rest = drained(hub.subscribe(Filter(), since_seq=7))  # of the server's life before
+    gap, *rest = drained(fanout.subscribe(Filter(), since_seq=7))  # of the server's life before
     assert (gap["kind"], gap["missed"], len(rest)) == ("gap", None, PAST)
-    (gap,) = drained(hub.subscribe(Filter(), since_seq=10**6))
+    (gap,) = drained(fanout.subscribe(Filter(), since_seq=10**6))
     assert gap["missed"] is None
     assert "number 1000000 has not been told" in gap["reason"]
 
 
 def test_the_past_of_many_arrays_is_small_and_told_word_for_word() -> None:
-    hub = Hub()
-    live = hub.subscribe(Filter())
+    fanout = Fanout()
+    live = fanout.subscribe(Filter())
     texts = []
     tracemalloc.start()
     try:
         for n in range(PAST):
             contributions = [{"array": f"a{k}", "power_dbfs": -0.1 * k * n, "agrees": None} for k in range(64)]
-            hub.publish({**update(n), "contributions": contributions})
+            fanout.publish({**update(n), "contributions": contributions})
             if n >= PAST - 5:
                 texts += asyncio.run(_texts(live))
             else:
@@ -265,7 +265,7 @@ def test_the_past_of_many_arrays_is_small_and_told_word_for_word() -> None:
     finally:
         tracemalloc.stop()
     assert held < 6e6  # as objects more than 30 MB
-    assert asyncio.run(_texts(hub.subscribe(Filter(), since_seq=PAST - 5))) == texts
+    assert asyncio.run(_texts(fanout.subscribe(Filter(), since_seq=PAST - 5))) == texts
 
 
 async def _texts(subscription: Subscription) -> list[str]:

@@ -330,14 +330,14 @@ def test_server_whose_keys_are_missing_does_not_start(tmp_path: Path) -> None:
 def test_scene_is_heard_by_key_live_and_replayed(folder: Path) -> None:
     """The whole path, and what is told of it."""
     with running_server(keyed(folder)) as server:
-        site = keyed(folder, {"nodes.lab-pc.server": server.engine.endpoint})
+        site = keyed(folder, {"nodes.lab-pc.server": server.endpoint})
         start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
         capture_recordings(site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
-        wait_until(lambda: server.engine.events == 2, "both events, live")
-        send_session(site, server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
-        wait_until(lambda: server.engine.events == 4, "both events, replayed")
-        with linked(server.engine.endpoint, keys_of(folder, "stranger")) as link:
-            until(link, lambda: server.engine.refusals.count("nodes"), "the refusal")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events, live")
+        send_session(site, server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
+        wait_until(lambda: server.parts.event_log.published == 4, "both events, replayed")
+        with linked(server.endpoint, keys_of(folder, "stranger")) as link:
+            until(link, lambda: server.parts.refusals.count("nodes"), "the refusal")
         health = httpx.get(f"{server.url}/api/v1/health").json()
         assert health["secured"]["nodes"] is True
         assert health["refused"]["nodes"] >= 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
+from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS, Estimate, Event, Status, Update
 from livessl.server.api.encode import Messages, Stages
 from livessl.server.latency import KEPT, Arrival, Arrivals, Latency
@@ -60,12 +61,14 @@ def test_old_intervals_are_forgotten() -> None:
 
 
 def test_histograms_hold_each_stage_and_the_sum() -> None:
-    latency = Latency()
-    stages = Stages(waited=0.3, sent=0.010, received=0.001, located=0.004)
-    latency.located("event", stages)
-    told = Messages(site_of(), 0, utc=True).event(EVENT, stages)
+    arrivals = Arrivals()
+    arrivals.note(RASTER, Arrival(END_NS + 10 * MS, END_NS + 11 * MS))
+    latency = Latency(UnpacedClock(END_NS + 15 * MS), arrivals)
+    stages = latency.located(EVENT)
+    assert stages == Stages(waited=0.3, sent=0.010, received=0.001, located=0.004)
+    message = Messages(site_of(), 0, utc=True).event(EVENT, stages)
     for seconds in (0.005, 0.002):  # to two clients
-        latency.delivered(told, seconds)
+        latency.delivered(message, seconds)
     registry = CollectorRegistry()
     registry.register(latency.histogram)
 

@@ -7,39 +7,39 @@ from collections.abc import Iterator
 
 import pytest
 
-from livessl.server.parallel import FEW, Helper
+from livessl.server.parallel import FEW, Parallel
 
 
 @pytest.fixture
-def helper() -> Iterator[Helper]:
-    helper = Helper()
-    yield helper
-    helper.stop()
+def parallel() -> Iterator[Parallel]:
+    parallel = Parallel()
+    yield parallel
+    parallel.stop()
 
 
 @pytest.mark.parametrize("count", [0, 1, FEW, FEW + 1, 500])
-def test_everything_is_done_once(helper: Helper, count: int) -> None:
+def test_everything_is_done_once(parallel: Parallel, count: int) -> None:
     done: list[int] = []
-    helper.each(done.append, range(count))
+    parallel.for_each(done.append, range(count))
     assert sorted(done) == list(range(count))
 
 
-def test_two_threads_work(helper: Helper) -> None:
+def test_two_threads_work(parallel: Parallel) -> None:
     both = threading.Barrier(2, timeout=10.0)  # nobody passes alone
 
     def meet(number: int) -> None:
         if number < 2:
             both.wait()
 
-    helper.each(meet, range(FEW + 1))
+    parallel.for_each(meet, range(FEW + 1))
 
 
 @pytest.mark.parametrize("wrong", [0, 40])
-def test_what_goes_wrong_is_raised(helper: Helper, wrong: int) -> None:
+def test_what_goes_wrong_is_raised(parallel: Parallel, wrong: int) -> None:
     def work(number: int) -> None:
         if number == wrong:
             raise ValueError(f"number {number}")
 
     with pytest.raises(ValueError, match=f"number {wrong}"):
-        helper.each(work, range(80))
-    helper.each(lambda _: None, range(80))  # it works on
+        parallel.for_each(work, range(80))
+    parallel.for_each(lambda _: None, range(80))  # it works on

@@ -24,7 +24,7 @@ from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
 from livessl.recordings.recording import Placed, Spliced
-from livessl.server import engine
+from livessl.server import app, site_time
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
@@ -70,18 +70,16 @@ class Subscriber:
 def play(server: Server, speed: float | None = None) -> None:
     """Send the scene as a replay, as fast as it goes or at a speed."""
     pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
-    send_session(
-        site_of(), server.engine.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
-    )
-    server.engine.wait_idle()
+    send_session(site_of(), server.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False)
+    server.wait_idle()
 
 
 def offline_events() -> list[dict[str, Any]]:
     """The events of the scene without any server."""
     site = site_of()
-    told = Messages(site, START_NS, utc=True)
+    encoder = Messages(site, START_NS, utc=True)
     outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
-    return [told.event(output) for output in outputs if isinstance(output, Event)]
+    return [encoder.event(output) for output in outputs if isinstance(output, Event)]
 
 
 def without_delays(event: dict[str, Any]) -> dict[str, Any]:
@@ -154,15 +152,15 @@ def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> Non
 
 def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nine seconds without sound at six times the speed, and a server that soon loses its patience."""
-    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
     twice = [
         replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
         for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
     ]
     with running_server(site_of()) as server:
-        send_session(site_of(), server.engine.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
-        server.engine.wait_idle()
+        send_session(site_of(), server.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
+        server.wait_idle()
         stored = httpx.get(f"{server.url}/api/v1/events").json()["events"][::-1]
     assert len(stored) == 4
     assert stored[0]["position_m"] == stored[2]["position_m"]
@@ -170,16 +168,16 @@ def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPa
 
 
 def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "REPLAY_SILENT_NS", 200_000_000)
+    monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     with running_server(site_of()) as server:
         link = connected(server, REPLAY)
-        wait_until(lambda: server.engine.mode == "replay", "the replay")
+        wait_until(lambda: server.parts.site_time.mode == "replay", "the replay")
         link.close(bye=False)
-        server.engine.wait_idle()
-        assert server.engine.mode == "replay"
+        server.wait_idle()
+        assert server.parts.site_time.mode == "replay"
         live = connected(server, LIVE)
         assert live.connected
-        wait_until(lambda: server.engine.mode == "live", "live again")
+        wait_until(lambda: server.parts.site_time.mode == "live", "live again")
         live.close(bye=True)
 
 
@@ -189,13 +187,13 @@ def test_start_that_waits_for_the_compiler_says_so(
 ) -> None:
     def compile_slowly() -> None:
         if said:
-            wait_until(lambda: "preparing the search" in caplog.text, "the message")
+            wait_until(lambda: "compiling kernels" in caplog.text, "the message")
 
-    monkeypatch.setattr(engine, "SAY_S", say_s)
-    monkeypatch.setattr(engine, "warm_up", compile_slowly)
+    monkeypatch.setattr(app, "NOTICE_S", say_s)
+    monkeypatch.setattr(app, "warm_up", compile_slowly)
     with caplog.at_level("INFO"), running_server(site_of()):
         pass
-    assert ("preparing the search" in caplog.text) == said
+    assert ("compiling kernels" in caplog.text) == said
 
 
 def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
@@ -205,7 +203,7 @@ def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:
         "server.events_db": str(tmp_path / "events.db"),
     }
     with running_server(site_of()) as server:
-        refused(changes | {"server.bind": server.engine.endpoint})
+        refused(changes | {"server.bind": server.endpoint})
     with pytest.raises(StoreError):
         Server(site_of(changes | {"server.events_db": str(tmp_path)}), CLOCK)
 
@@ -219,7 +217,7 @@ def test_events_are_written_as_lines(tmp_path: Path) -> None:
 
 
 def connected(server: Server, hello: wire.Hello) -> Link:
-    link = Link(server.engine.endpoint, hello, CLOCK)
+    link = Link(server.endpoint, hello, CLOCK)
     link.wait_connected(lambda: False)
     return link
 
@@ -246,7 +244,7 @@ def test_live_and_replay_do_not_mix(first: wire.Hello, second: wire.Hello, reaso
 
         wait_until(let_in, "the place that has become free")
         other.close(bye=True)
-        server.engine.wait_idle()
+        server.wait_idle()
 
 
 def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
@@ -309,8 +307,8 @@ def test_addresses_that_are_taken() -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             free = int(probe.getsockname()[1])
-        said = refused({"server.bind": server.engine.endpoint, "server.http.port": free})
-        assert said.startswith(f"server.bind: cannot listen on {server.engine.endpoint}: Address already in use")
+        said = refused({"server.bind": server.endpoint, "server.http.port": free})
+        assert said.startswith(f"server.bind: cannot listen on {server.endpoint}: Address already in use")
     with running_server(site_of({"server.http.port": free})):
         pass  # the failed start has given its port back
 
@@ -319,7 +317,7 @@ def test_method_of_the_command_line_is_the_sites() -> None:
     with running_server(site_of(), method="averaged") as server:
         assert httpx.get(f"{server.url}/api/v1/site").json()["method"] == "averaged"
         play(server)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         told = httpx.get(f"{server.url}/api/v1/events").json()["events"]
     assert {event["method"] for event in told} == {"averaged"}
 
@@ -341,11 +339,11 @@ def test_database_outlives_the_server(tmp_path: Path) -> None:
     site = site_of({"server.events_db": str(tmp_path / "events.db")})
     with running_server(site) as server:
         play(server)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
     with running_server(site) as server:
         stored = httpx.get(f"{server.url}/api/v1/events").json()["events"]
         assert len(stored) == 2
-        assert server.engine.events == 0
+        assert server.parts.event_log.published == 0
 
 
 def test_database_that_cannot_be_used(tmp_path: Path) -> None:

@@ -234,19 +234,19 @@ def test_quotes_in_a_zone_are_only_quotes() -> None:
 def test_settled_events_take_the_place_of_provisional_ones(tmp_path: Path) -> None:
     path = tmp_path / "events.db"
     store = Store(path)
-    assert store.settled("lab") == (None, None)
+    assert store.finalized("lab") == (None, None)
     for n in range(3):
-        store.add(event(n), START_NS + n * NS, provisional=True)
+        store.add(event(n), START_NS + n * NS, early=True)
     frame_index = (START_NS + 2 * NS) // FRAME_NS
-    assert [old["id"] for old in store.provisional(frame_index)] == ["e-0", "e-1"]
-    store.settle("lab", [(event(7), START_NS)], ["e-0"], frame_index, {"heard": {"b": [[1, 0.15]]}})
+    assert store.early_events() == [(START_NS + n * NS, event(n)) for n in range(3)]
+    store.finalize("lab", [(event(7), START_NS)], ["e-0"], frame_index, {"heard": {"b": [[1, 0.15]]}})
     assert ids(store) == [2, 1, 7]
-    assert store.provisional(frame_index + 100) == [event(2)]  # e-1 has come to stay
+    assert store.early_events() == [(START_NS + 2 * NS, event(2))]  # e-1 is final now
     store.close()
     again = Store(path)
-    assert again.settled("lab") == (frame_index, {"heard": {"b": [[1, 0.15]]}})
-    assert again.settled("elsewhere") == (None, None)
-    assert again.provisional(frame_index + 100) == [event(2)]
+    assert again.finalized("lab") == (frame_index, {"heard": {"b": [[1, 0.15]]}})
+    assert again.finalized("elsewhere") == (None, None)
+    assert again.early_events() == [(START_NS + 2 * NS, event(2))]
     again.close()
 
 
@@ -257,7 +257,7 @@ def test_a_file_of_before_there_were_clocks_is_read(tmp_path: Path) -> None:
     store._writing.db.commit()
     store.close()
     again = Store(tmp_path / "events.db")
-    assert again.settled("lab") == (1000, None)
+    assert again.finalized("lab") == (1000, None)
     again.close()
 
 
@@ -267,10 +267,10 @@ def test_settling_is_all_or_nothing(tmp_path: Path) -> None:
     pages = store._writing.rows("PRAGMA page_count")[0][0]
     store._writing.rows(f"PRAGMA max_page_count = {pages + 3}")  # the disk is as good as full
     with pytest.raises(StoreError, match="2 events were not kept: database or disk is full; free space"):
-        store.settle("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
+        store.finalize("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
     assert ids(store) == [0]
-    assert store.settled("lab") == (None, None)
+    assert store.finalized("lab") == (None, None)
     store._writing.rows("PRAGMA max_page_count = 1000000")
-    store.settle("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
+    store.finalize("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
     assert ids(store) == [6, 5]
     store.close()

@@ -64,7 +64,7 @@ def test_a_file_remembers_it(tmp_path: Path, kept: bool) -> None:
 
 def test_what_the_store_does_not_take_is_not_done() -> None:
     with running_server(site_of()) as server:
-        with patch.object(server._store, "enable", side_effect=StoreError("server.events_db: disk full")):
+        with patch.object(server.parts.store, "enable", side_effect=StoreError("server.events_db: disk full")):
             answer = put(server.url, "north", {"enabled": False})
         assert (answer.status_code, answer.json()["detail"]) == (503, "server.events_db: disk full")
         assert array(server.url, "north")["enabled"]
@@ -77,7 +77,7 @@ def heard(world: World) -> set[str]:
 def test_disabled_sound_is_acknowledged_and_not_used() -> None:
     world, as_ever = World(1), World(1)
     assert world.server is not None
-    world.server.enable("north", False)
+    world.server.array_states.enable("north", False)
     world.recover()
     as_ever.recover()
     assert (heard(world), heard(as_ever)) == ({"south"}, {"north", "south"})
@@ -92,7 +92,7 @@ def test_nobody_waits_for_a_disabled_array() -> None:
         world.kill_node("a")
         assert world.server is not None
         if disabled:
-            world.server.enable(ARRAY_OF["a"], False)
+            world.server.array_states.enable(ARRAY_OF["a"], False)
         world.run(world.end - world.frame_index + 50)
         assert heard(world) == {"south"}
         assert (world.nodes["b"].link.kept <= 60) is disabled
@@ -101,10 +101,10 @@ def test_nobody_waits_for_a_disabled_array() -> None:
 def test_enabled_again_it_is_used_again() -> None:
     world = World(1)
     assert world.server is not None
-    world.server.enable("north", False)
+    world.server.array_states.enable("north", False)
     sounds = world.groups()
     world.run(min(sounds[4]) - world.frame_index - 20)
     assert heard(world) == {"south"}
-    world.server.enable("north", True)
+    world.server.array_states.enable("north", True)
     world.recover()
     assert heard(world) == {"north", "south"}

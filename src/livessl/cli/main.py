@@ -443,7 +443,7 @@ def _serve(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site, _once_each(arguments.joint, "--joint"))
     _tell_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)
-    logging.info("listening for nodes on %s, dashboard on %s", server.engine.endpoint, server.url)
+    logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
     _run_server(server)
     return OK
 
@@ -588,8 +588,8 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     def send() -> None:
         try:
-            _send(site, server.engine.endpoint, parts, arguments.speed, stop)
-            server.engine.wait_idle()
+            _send(site, server.endpoint, parts, arguments.speed, stop)
+            server.wait_idle()
         except Exception as error:  # noqa: BLE001 - raised again below
             failures.append(error)
         if arguments.once or failures:

@@ -9,6 +9,7 @@ import logging
 import socket
 import ssl
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,20 +20,32 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import InvalidState
 
 from livessl.clock import Clock
+from livessl.core.locate.peak_search import warm_up
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
+from livessl.server.array_states import ArrayStates
 from livessl.server.engine import Engine
-from livessl.server.fanout import Hub
-from livessl.server.receiver import BindError
+from livessl.server.event_log import EventLog
+from livessl.server.fanout import Fanout
+from livessl.server.latency import Latency
+from livessl.server.maps import Maps
+from livessl.server.parts import Parts
+from livessl.server.publisher import Publisher
+from livessl.server.receiver import BindError, Receiver, Source
 from livessl.server.sinks import Sinks
+from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
+from livessl.server.tracks import Tracks
 from livessl.site.keys import file_stamp, read_tokens
 from livessl.site.models import ConfigError, Fault, HttpConfig, Site, open_doors
 
 SWITCH_S: Final = 0.0005
 """How long a thread may keep the interpreter from another one. What listens and searches leaves it for moments,
 thousands of times a second, and would wait for it 5 ms each time if somebody else had work."""
+
+NOTICE_S: Final = 2.0
+"""Time, in seconds, that the kernels may take to load before the log says that they are being compiled."""
 
 SHUTDOWN_S: Final = 2
 """Open connections get this long to end."""
@@ -63,6 +76,70 @@ DAY_NS: Final = 86_400_000_000_000
 _log = logging.getLogger(__name__)
 
 
+def assemble(
+    site: Site,
+    clock: Clock,
+    store: Store,
+    sinks: Sinks,
+    fanout: Fanout,
+    publish: Callable[[JsonObject], None],
+    receiver: Source | None = None,
+) -> Parts:
+    """Make everything that runs in a server; nothing runs yet.
+
+    Parameters
+    ----------
+    publish : callable
+        Gets every message for subscribers; called on the fusion thread.
+    receiver : Source or None
+        Stands in for the nodes' socket.
+
+    Raises
+    ------
+    BindError
+        If the address for the nodes is taken.
+    ConfigError
+        If the site uses keys that cannot be read.
+    """
+    with ExitStack() as undo:
+        if receiver is None:
+            receiver = Receiver(site, clock)
+            undo.callback(receiver.stop)
+        site_time = SiteTime(clock)
+        latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
+        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, publish)
+        event_log = EventLog(site.site, clock, store, latency, publish)
+        publisher = Publisher(publish, receiver.request, site_time, event_log, tracks, maps, latency)
+        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher)
+        undo.pop_all()
+    return Parts(
+        site=site,
+        clock=clock,
+        receiver=receiver,
+        refusals=receiver.refusals,
+        engine=engine,
+        site_time=site_time,
+        array_states=array_states,
+        event_log=event_log,
+        tracks=tracks,
+        maps=maps,
+        latency=latency,
+        store=store,
+        sinks=sinks,
+        fanout=fanout,
+    )
+
+
+def _compile_kernels() -> None:
+    """Compile the kernels before anybody waits for a result; reading them from numba's cache takes a moment only."""
+    notice = threading.Timer(NOTICE_S, _log.info, ["First start: compiling kernels. This can take a minute."])
+    notice.start()
+    try:
+        warm_up()
+    finally:
+        notice.cancel()
+
+
 class _Socket(WebSocketsSansIOProtocol):
     """A WebSocket whose end is no trouble where its client is just closing it: uvicorn's would stop the server's."""
 
@@ -83,7 +160,11 @@ class Server:
     method : str or None
         Estimator, instead of the site's.
     on_event : callable or None
-        Gets every event besides the subscribers; called on the engine's thread.
+        Gets every event besides the subscribers; called on the fusion thread.
+    receiver : Source or None
+        Stands in for the nodes' socket.
+    stepped : bool
+        Whether the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
 
     Raises
     ------
@@ -102,6 +183,8 @@ class Server:
         *,
         method: str | None = None,
         on_event: Callable[[JsonObject], None] | None = None,
+        receiver: Source | None = None,
+        stepped: bool = False,
     ) -> None:
         faults = open_doors(site)
         if faults:
@@ -115,19 +198,20 @@ class Server:
         certificate = _certificate(site)
         self._on_event = on_event
         self._clock = clock
-        self._retention_days = site.store.retention_days
-        self._hub = Hub(clock.now_ns() // 1_000_000)  # fewer than a message a millisecond: no number comes twice
+        self._stepped = stepped
+        first_seq = clock.now_ns() // 1_000_000  # fewer than a message a millisecond, so no number comes twice
         self._loop: asyncio.AbstractEventLoop | None = None
         with ExitStack() as undo:  # what is open when a later step fails
             self._http = _listen(http.host, http.port)
             undo.callback(self._http.close)
-            self._sinks = Sinks(site.server.sinks)
-            undo.callback(self._sinks.close)
-            self._store = Store(Path(site.server.events_db) if site.server.events_db else None)
-            undo.callback(self._store.close)
-            self.engine = Engine(site, clock, self._store, self._publish)
+            sinks = Sinks(site.server.sinks)
+            undo.callback(sinks.close)
+            store = Store(Path(site.server.events_db) if site.server.events_db else None)
+            undo.callback(store.close)
+            _compile_kernels()
+            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver)
             undo.pop_all()
-        app = create_app(site, clock, self.engine, self._hub, self._store, self._sinks, self._access)
+        app = create_app(self.parts, self._access)
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -144,8 +228,11 @@ class Server:
                 timeout_graceful_shutdown=SHUTDOWN_S,
             )
         )
+        self.endpoint = self.parts.receiver.endpoint
+        """The address that nodes connect to."""
         host, port = self._http.getsockname()[:2]
         self.url = f"{'http' if certificate is None else 'https'}://{f'[{host}]' if ':' in host else host}:{port}"
+        """The address of API and dashboard."""
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raises what made the engine fail, if it did."""
@@ -157,20 +244,29 @@ class Server:
             asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
-            self.engine.stop()
-            self._store.close()
-            self._sinks.close()
+            self.parts.engine.stop()
+            self.parts.maps.stop()
+            self.parts.receiver.stop()
+            self.parts.store.close()
+            self.parts.sinks.close()
             self._http.close()
-        if self.engine.failure is not None:
-            raise self.engine.failure
+        if self.parts.failure is not None:
+            raise self.parts.failure
 
     def stop(self) -> None:
         """End `run`; from any thread."""
         self._uvicorn.should_exit = True
 
+    def wait_idle(self) -> None:
+        """Return when the running replay has ended and its last event is published."""
+        self.parts.engine.wait_idle()
+
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
-        self.engine.start()
+        self.parts.receiver.start()
+        self.parts.maps.start()
+        if not self._stepped:
+            self.parts.engine.start()
         tasks = [asyncio.create_task(work) for work in (self._watch(), self._expire(), self._refresh())]
         try:
             await self._uvicorn.serve(sockets=[self._http])
@@ -182,7 +278,7 @@ class Server:
 
     async def _watch(self) -> None:
         """Without its engine the server is of no use: better to end and be restarted than to look alive."""
-        while self.engine.failure is None:
+        while self.parts.failure is None:
             await asyncio.sleep(0.2)
         self.stop()
 
@@ -202,26 +298,27 @@ class Server:
 
     async def _expire(self) -> None:
         """Forget events that are older than they may become."""
-        while self._retention_days is not None:
-            before_ns = self._clock.now_ns() - round(self._retention_days * DAY_NS)
+        days, store = self.parts.site.store.retention_days, self.parts.store
+        while days is not None:
+            before_ns = self._clock.now_ns() - round(days * DAY_NS)
             try:
-                if gone := await asyncio.to_thread(self._store.expire, before_ns):
-                    _log.info("%d events older than %g days were deleted", gone, self._retention_days)
+                if gone := await asyncio.to_thread(store.expire, before_ns):
+                    _log.info("%d events older than %g days were deleted", gone, days)
             except StoreError as error:
                 _log.error("%s", error)
             await asyncio.sleep(EXPIRE_S)
 
     def _publish(self, message: JsonObject) -> None:
-        told_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
+        published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
         if message["kind"] == "event":
-            self._sinks.take(message)
+            self.parts.sinks.take(message)
             if self._on_event is not None:
                 self._on_event(message)
         loop = self._loop
         if loop is None:
             return
         try:
-            loop.call_soon_threadsafe(self._hub.publish, message, told_ns)
+            loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed: nobody is left to tell
             _log.debug("a message came after the end")
 

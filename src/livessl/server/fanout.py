@@ -53,24 +53,24 @@ class Filter:
         return self.zone is None or "zones" not in message or self.zone in message["zones"]
 
 
-class Told:
+class Numbered:
     """A numbered message on its way to the subscribers: one object for all of them, one text.
 
     Parameters
     ----------
     message : JsonObject
         With its version and number.
-    told_ns : int or None
+    published_ns : int or None
         When it was told, by the clock that nobody sets, where its way to the clients is to be measured.
     packed : bytes or None
         Its text, compressed; the message then holds only what it is chosen by.
     """
 
-    __slots__ = ("_packed", "_text", "message", "told_ns")
+    __slots__ = ("_packed", "_text", "message", "published_ns")
 
-    def __init__(self, message: JsonObject, told_ns: int | None = None, packed: bytes | None = None) -> None:
+    def __init__(self, message: JsonObject, published_ns: int | None = None, packed: bytes | None = None) -> None:
         self.message = message
-        self.told_ns = told_ns
+        self.published_ns = published_ns
         self._packed = packed
         self._text: str | None = None
 
@@ -83,10 +83,10 @@ class Told:
             self._text = json_text(self.message)
         return self._text
 
-    def packed(self) -> Told:
+    def packed(self) -> Numbered:
         """The same for those who come back, small; its delay is not that of the way to a client."""
         chosen_by: JsonObject = {name: self.message[name] for name in _LOOKED_AT if name in self.message}
-        return Told(chosen_by, packed=zlib.compress(self.text.encode(), 1))
+        return Numbered(chosen_by, packed=zlib.compress(self.text.encode(), 1))
 
     @property
     def subject(self) -> Hashable | None:
@@ -100,13 +100,13 @@ class Subscription:
     """One client's queue: everything, in order, as long as the client keeps up; then states only as they are now."""
 
     wanted: Filter
-    past: deque[Told] = field(default_factory=deque)
-    _waiting: OrderedDict[int, Told] = field(default_factory=OrderedDict)
+    past: deque[Numbered] = field(default_factory=deque)
+    _waiting: OrderedDict[int, Numbered] = field(default_factory=OrderedDict)
     _newest: dict[Hashable, int] = field(default_factory=dict)
     _news: asyncio.Event = field(default_factory=asyncio.Event)
     _missed: int = 0
 
-    def offer(self, seq: int, told: Told) -> bool:
+    def offer(self, seq: int, told: Numbered) -> bool:
         """Queue a message; whether another one had to go for it."""
         if not self.wanted.passes(told.message):
             return False
@@ -136,7 +136,7 @@ class Subscription:
         """Whether there is more to send."""
         return bool(self._waiting)
 
-    async def next(self) -> Told:
+    async def next(self) -> Numbered:
         """The next message, waiting for one; first of all the past that was asked for, then how many were missed."""
         if self.past:
             return self.past.popleft()
@@ -151,12 +151,12 @@ class Subscription:
         self._forget(told, seq)
         return told
 
-    def _forget(self, told: Told, seq: int) -> None:
+    def _forget(self, told: Numbered, seq: int) -> None:
         if told.subject is not None and self._newest.get(told.subject) == seq:
             del self._newest[told.subject]
 
 
-class Hub:
+class Fanout:
     """Numbers messages and hands them to every subscriber. All calls on the event loop's thread.
 
     Parameters
@@ -167,7 +167,7 @@ class Hub:
 
     def __init__(self, first_seq: int = 0) -> None:
         self._subscriptions: set[Subscription] = set()
-        self._past: deque[Told] = deque(maxlen=PAST)
+        self._past: deque[Numbered] = deque(maxlen=PAST)
         self._first_seq = first_seq
         self.last_seq = first_seq
         self.superseded = 0
@@ -186,7 +186,7 @@ class Hub:
         self._subscriptions.add(subscription)
         return subscription
 
-    def _after(self, since_seq: int, wanted: Filter) -> Iterator[Told]:
+    def _after(self, since_seq: int, wanted: Filter) -> Iterator[Numbered]:
         """What was told after a number, and before it what is gone, if anything is."""
         oldest = self.last_seq - len(self._past) + 1
         if since_seq > self.last_seq:
@@ -203,14 +203,14 @@ class Hub:
         """Receive no more."""
         self._subscriptions.discard(subscription)
 
-    def publish(self, message: JsonObject, told_ns: int | None = None) -> None:
+    def publish(self, message: JsonObject, published_ns: int | None = None) -> None:
         """Number a message and offer it to everyone."""
         self.last_seq += 1
-        told = Told({"v": API_VERSION, "seq": self.last_seq, **message}, told_ns)
+        told = Numbered({"v": API_VERSION, "seq": self.last_seq, **message}, published_ns)
         self._past.append(told.packed())
         for subscription in self._subscriptions:
             self.superseded += subscription.offer(self.last_seq, told)
 
 
-def _gap(missed: int | None, reason: str) -> Told:
-    return Told({"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason})
+def _gap(missed: int | None, reason: str) -> Numbered:
+    return Numbered({"kind": "gap", "v": API_VERSION, "missed": missed, "reason": reason})

@@ -1,7 +1,7 @@
-"""How long sound takes to become an answer on a client's socket: by stages, in histograms.
+"""Latency from the sound to a client's socket, by stages, in histograms.
 
-The reference is the moment at which all had happened that an answer needs: the window's end; of an event, the end of
-the quiet that ends it. What lies before is no delay of ours.
+It counts from the moment at which all had happened that an answer needs: the end of the window; for an event, the end
+of the quiet that ends it. Whatever lies before is not a delay of this system.
 """
 
 from __future__ import annotations
@@ -11,37 +11,39 @@ from typing import Final, NamedTuple
 
 from prometheus_client import Histogram
 
+from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Event, Update
 from livessl.server.api.encode import JsonObject, Stages
 
 KEPT: Final = 1200
-"""Raster intervals whose arrival is remembered: a minute."""
+"""Frame indices whose arrival is remembered: one minute."""
 
 BUCKETS_S: Final = (
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08,
     0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0, 5.0, 10.0,
 )  # fmt: skip
+"""Upper bounds of the histograms' buckets, seconds: finest around 20 ms, which a live answer takes."""
 
 DELIVERED: Final = "delivered"
 TOTAL: Final = "total"
 
 
 class Arrival(NamedTuple):
-    """When a message was sent, by its node's clock, and received."""
+    """Site times at which a message was sent, by its node's clock, and received, by the server's."""
 
     sent_ns: int
     received_ns: int
 
 
 class Arrivals:
-    """Of each frame index the message that came last. Noted on one thread, looked up on another."""
+    """The last arrival of each frame index. The receiver's thread writes, the fusion thread reads."""
 
     def __init__(self) -> None:
         self._last: dict[int, Arrival] = {}
         self._order: deque[int] = deque()
 
     def note(self, frame_index: int, arrival: Arrival) -> None:
-        """A message of that interval has come."""
+        """Note that a message of that frame index has arrived."""
         if frame_index not in self._last:
             self._order.append(frame_index)
             if len(self._order) > KEPT:
@@ -49,7 +51,10 @@ class Arrivals:
         self._last[frame_index] = arrival
 
     def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
-        """Where the time of an answer that was there at `located_ns` went; None where nobody sent its last interval."""
+        """Return where the time went of an answer that was there at site time `located_ns`.
+
+        None if no arrival is known of the last frame index that the answer needs.
+        """
         arrival = self._last.get(answer.complete_ns // FRAME_NS - 1)
         if arrival is None or not arrival.sent_ns:
             return None
@@ -63,9 +68,17 @@ class Arrivals:
 
 
 class Latency:
-    """The histograms. Safe to call from any thread."""
+    """The histograms. Every thread may call it.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    clock : Clock
+    arrivals : Arrivals
+    """
+
+    def __init__(self, clock: Clock, arrivals: Arrivals) -> None:
+        self._clock = clock
+        self._arrivals = arrivals
         self.histogram = Histogram(
             "livessl_latency_seconds",
             "From the end of a window (an event's: of the quiet that ends it) until sent by the node, from there until "
@@ -80,13 +93,17 @@ class Latency:
             for stage in ("sent", "received", "located", DELIVERED, TOTAL)
         }
 
-    def located(self, kind: str, stages: Stages) -> None:
-        """An answer is there."""
-        for stage in ("sent", "received", "located"):
-            self._stages[kind, stage].observe(getattr(stages, stage))
+    def located(self, answer: Update | Event) -> Stages | None:
+        """Count an answer that is there now; return where its time went, None if that is not known."""
+        stages = self._arrivals.stages(answer, self._clock.now_ns())
+        if stages is not None:
+            kind = "event" if isinstance(answer, Event) else "update"
+            for stage in ("sent", "received", "located"):
+                self._stages[kind, stage].observe(getattr(stages, stage))
+        return stages
 
     def delivered(self, message: JsonObject, seconds: float) -> None:
-        """A client's socket took an answer so long after it was there."""
+        """Count an answer that a client's socket took `seconds` after it was published."""
         stages = message["latency_stages_s"]
         self._stages[message["kind"], DELIVERED].observe(seconds)
         self._stages[message["kind"], TOTAL].observe(stages["sent"] + stages["received"] + stages["located"] + seconds)

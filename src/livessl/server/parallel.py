@@ -1,4 +1,4 @@
-"""A second thread for work that mostly leaves the interpreter alone: transforms, kernels, products of matrices."""
+"""A parallel `for_each` on two threads, for work that releases the interpreter: FFTs, kernels, matrix products."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
 FEW: Final = 4
-"""So many items are done sooner than somebody is called."""
+"""Up to this many items, waking the second thread costs more than it saves."""
 
 
-class Helper:
-    """Shares work with the thread that asks."""
+class Parallel:
+    """A second thread that shares the work of the calling one."""
 
     def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, "helper")
+        self._pool = ThreadPoolExecutor(1, "parallel")
 
-    def each(self, work: Callable[[Any], None], items: Iterable[Any]) -> None:
-        """Call `work` with each item, on this thread and the other one; return when all is done.
+    def for_each(self, function: Callable[[Any], None], items: Iterable[Any]) -> None:
+        """Apply `function` to every item, in any order and on both threads; return when all are done.
 
-        Raises what `work` raises.
+        Raises what `function` raises.
         """
         waiting = deque(items)
 
-        def do() -> None:
+        def work() -> None:
             while waiting:
                 try:
                     item = waiting.popleft()
-                except IndexError:  # the other one was quicker
+                except IndexError:  # the other thread took the last one
                     return
-                work(item)
+                function(item)
 
         if len(waiting) <= FEW:
-            do()
+            work()
             return
-        helped = self._pool.submit(do)
+        shared = self._pool.submit(work)
         try:
-            do()
+            work()
         finally:
-            if not helped.cancel():
-                helped.result()
+            if not shared.cancel():
+                shared.result()
 
     def stop(self) -> None:
-        """End the thread."""
+        """End the second thread."""
         self._pool.shutdown()

@@ -6,9 +6,10 @@ import errno
 import logging
 import threading
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from queue import Empty, Full, Queue
-from typing import Final
+from typing import Final, Protocol
 
 import zmq
 
@@ -70,6 +71,56 @@ class Left:
 Item = Message | Joined | Greeted | Left
 
 
+class Source(Protocol):
+    """What a server needs of its nodes' side: the receiver, or in a simulation whatever stands in for it."""
+
+    @property
+    def ingest(self) -> Ingest:
+        """What is known of the connected nodes."""
+        ...
+
+    @property
+    def arrivals(self) -> Arrivals:
+        """When messages were sent and received."""
+        ...
+
+    @property
+    def refusals(self) -> Refusals:
+        """Who was turned away."""
+        ...
+
+    @property
+    def enrolled(self) -> Sequence[str]:
+        """Names of the nodes whose keys are accepted; empty if the site uses no keys."""
+        ...
+
+    @property
+    def endpoint(self) -> str:
+        """The address that nodes connect to."""
+        ...
+
+    @property
+    def failure(self) -> BaseException | None:
+        """The error that has ended its thread, if it has ended."""
+        ...
+
+    def start(self) -> None:
+        """Begin to receive."""
+        ...
+
+    def stop(self) -> None:
+        """Stop to receive, and release the address."""
+        ...
+
+    def take(self, most: int, wait_s: float) -> list[Item]:
+        """Return what has arrived, in order; wait up to `wait_s` for the first item."""
+        ...
+
+    def request(self, request: BackfillRequest) -> None:
+        """Send a request for missing frames to the node of an array."""
+        ...
+
+
 class Receiver:
     """ROUTER socket, greetings, acknowledgements.
 
@@ -95,7 +146,7 @@ class Receiver:
         self._guarded = keys is not None
         self._clock = clock
         self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
-        self._asks: deque[BackfillRequest] = deque()
+        self._requests: deque[BackfillRequest] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
         self.failure: BaseException | None = None
@@ -128,9 +179,9 @@ class Receiver:
         self._socket.close()
         self._context.term()
 
-    def ask(self, ask: BackfillRequest) -> None:
-        """Ask an array's node for frames; from any thread."""
-        self._asks.append(ask)
+    def request(self, request: BackfillRequest) -> None:
+        """Send a request for missing frames to the node of an array; from any thread."""
+        self._requests.append(request)
 
     def take(self, most: int, wait_s: float) -> list[Item]:
         """What has arrived, in order: waits for the first item, then takes what is there."""
@@ -149,7 +200,7 @@ class Receiver:
                 if self._socket.poll(POLL_MS):
                     self._drain()
                 self._acknowledge()
-                self._ask()
+                self._send_requests()
         except BaseException as error:
             self._fail(error)
             _log.exception("the receiving thread has failed")
@@ -195,9 +246,9 @@ class Receiver:
         for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
             self._reply(routing_id, ack)
 
-    def _ask(self) -> None:
-        asks = [self._asks.popleft() for _ in range(len(self._asks))]
-        for routing_id, request in self.ingest.requests(asks):
+    def _send_requests(self) -> None:
+        due = [self._requests.popleft() for _ in range(len(self._requests))]
+        for routing_id, request in self.ingest.requests(due):
             self._reply(routing_id, request)
 
     def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request) -> None:

@@ -60,6 +60,21 @@ class Query:
     before: Cursor | None = None
 
 
+class Finalized(NamedTuple):
+    """How far the final pass has come.
+
+    Parameters
+    ----------
+    until : int or None
+        Frame index before which all events are final; None if there are none yet.
+    clocks : JsonObject or None
+        What was known of the arrays' clocks then.
+    """
+
+    until: int | None
+    clocks: JsonObject | None
+
+
 class StoreError(RunError):
     """The file cannot be used, or takes no more."""
 
@@ -88,7 +103,7 @@ class Store:
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
-                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, frame index INTEGER)")
+                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
                 db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
                 db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
             if path is not None:
@@ -98,8 +113,8 @@ class Store:
                 f"server.events_db: cannot use {path}: {error}; name a file in a writable folder"
             ) from error
 
-    def add(self, event: JsonObject, time_ns: int, *, provisional: bool = False) -> None:
-        """Keep an event; one of the same id is replaced. A provisional one stays until its time is settled.
+    def add(self, event: JsonObject, time_ns: int, *, early: bool = False) -> None:
+        """Keep an event in place of one of the same id; an early one stays early until its time is final.
 
         Raises
         ------
@@ -108,10 +123,10 @@ class Store:
         """
         with self._kept(f"event {event['id']!r} was") as db:
             self._insert(db, event, time_ns)
-            if provisional:
+            if early:
                 db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
 
-    def settle(
+    def finalize(
         self,
         site: str,
         events: Sequence[tuple[JsonObject, int]],
@@ -140,14 +155,14 @@ class Store:
             db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, frame_index))
             db.execute("INSERT OR REPLACE INTO clocks VALUES (?, ?)", (site, json.dumps(clocks)))
 
-    def settled(self, site: str) -> tuple[int | None, JsonObject | None]:
-        """The frame index before which all sound of the site has become events that stay; what clocks were then."""
-        sql = "SELECT frame index, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
+    def finalized(self, site: str) -> Finalized:
+        """Return how far the final pass of the site has come."""
+        sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
         rows = self._reading.rows(sql, (site,))
         if not rows:
-            return None, None
+            return Finalized(None, None)
         frame_index, clocks = rows[0]
-        return int(frame_index), None if clocks is None else json.loads(clocks)
+        return Finalized(int(frame_index), None if clocks is None else json.loads(clocks))
 
     def disabled(self, site: str) -> frozenset[str]:
         """The arrays of the site that are not to be used."""
@@ -170,17 +185,17 @@ class Store:
         with self._kept(f"that array {array!r} is {'enabled' if enabled else 'disabled'} was") as db:
             db.execute(sql, (site, array))
 
-    def provisional(self, frame_index: int) -> list[JsonObject]:
-        """Events before a frame index that may still be replaced.
+    def early_events(self) -> list[tuple[int, JsonObject]]:
+        """Return the events that are still early, oldest first, each with its start in nanoseconds of site time.
 
         Raises
         ------
         StoreError
-            Where the file cannot be read.
+            If the file cannot be read.
         """
-        sql = "SELECT json FROM events JOIN provisional USING (id) WHERE time_ns < ? ORDER BY time_ns"
+        sql = "SELECT time_ns, json FROM events JOIN provisional USING (id) ORDER BY time_ns"
         try:
-            return [json.loads(text) for (text,) in self._writing.rows(sql, (frame_index * FRAME_NS,))]
+            return [(time_ns, json.loads(text)) for time_ns, text in self._writing.rows(sql)]
         except sqlite3.Error as error:
             raise StoreError(f"server.events_db: cannot read: {error}; release the file") from error
 

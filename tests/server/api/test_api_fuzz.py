@@ -39,12 +39,10 @@ def headers(token: tuple[str, Path]) -> dict[str, str]:
 def api(token: tuple[str, Path], headers: dict[str, str]) -> Iterator[Any]:
     """What a server that has heard something says of itself."""
     with running_server(site_of({"server.http.tokens": "tokens.yaml"}, token[1])) as server:
-        send_session(
-            site_of(), server.engine.endpoint, scene_parts(0), UnpacedClock(), SystemClock(), "run", lambda: False
-        )
-        server.engine.wait_idle()
+        send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), SystemClock(), "run", lambda: False)
+        server.wait_idle()
         yield schemathesis.openapi.from_url(f"{server.url}/api/v1/openapi.json", headers=headers)
-        assert server.engine.failure is None
+        assert server.parts.failure is None
 
 
 def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:

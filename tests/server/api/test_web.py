@@ -53,19 +53,17 @@ ROUTES = {
 def server() -> Iterator[Server]:
     """A server that has just heard the scene, live."""
     with running_server(site_of({"zones.room": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})) as server:
-        node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
+        node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         yield server
 
 
 def play(server: Server) -> None:
     """Let the server hear the scene as a replay."""
-    send_session(
-        site_of(), server.engine.endpoint, scene_parts(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False
-    )
-    server.engine.wait_idle()
+    send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False)
+    server.wait_idle()
 
 
 @pytest.fixture
@@ -516,10 +514,10 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_answers_say_where_their_time_went() -> None:
     """One machine, one clock: every stage is positive, and they add up to what the client sees at least."""
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
-        node_site = site_of({"nodes.lab-pc.server": server.engine.endpoint})
+        node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
         capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
-        wait_until(lambda: server.engine.events == 2, "both events")
+        wait_until(lambda: server.parts.event_log.published == 2, "both events")
         told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
         now_ns = CLOCK.now_ns()
         metrics = httpx.get(f"{server.url}/metrics").text

@@ -19,22 +19,20 @@ from pydantic import BaseModel, ConfigDict
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from livessl import __version__
-from livessl.clock import Clock, utc_ns, utc_text
+from livessl.clock import utc_ns, utc_text
 from livessl.core.types import FRAME_S
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
-from livessl.server.engine import Engine
-from livessl.server.fanout import Filter, Hub, Subscription, Told
-from livessl.server.latency import Latency
+from livessl.server.fanout import Filter, Numbered, Subscription
 from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
-from livessl.server.sinks import Sinks
-from livessl.server.store import Cursor, Store, StoreError
+from livessl.server.parts import Parts
+from livessl.server.store import Cursor, StoreError
 from livessl.server.store import Query as EventQuery
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site, is_loopback
 
-STATIC: Final = Path(__file__).parent / "static"
+STATIC: Final = Path(__file__).parents[1] / "static"
 
 SEND_TIMEOUT_S: Final = 30.0
 """A client that takes no byte for so long is gone."""
@@ -53,10 +51,9 @@ _log = logging.getLogger(__name__)
 _CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
 
 
-def create_app(
-    site: Site, clock: Clock, engine: Engine, hub: Hub, store: Store, sinks: Sinks, access: Access
-) -> FastAPI:
-    """The application around a running engine, open to anyone or to those who have a token."""
+def create_app(parts: Parts, access: Access) -> FastAPI:
+    """The application around a running server's parts, open to anyone or to those who have a token."""
+    site = parts.site
     app = FastAPI(
         title="livessl",
         version=__version__,
@@ -67,7 +64,7 @@ def create_app(
         responses=_REFUSALS if access.wanted else {},
     )
 
-    app.add_middleware(Gate, access=access, refusals=engine.refusals)
+    app.add_middleware(Gate, access=access, refusals=parts.refusals)
     if not access.wanted and is_loopback(site.server.http.host):
         # else a page from anywhere could have its own name point here, and read as if it were ours
         app.add_middleware(
@@ -83,12 +80,12 @@ def create_app(
         response.headers.setdefault("Cache-Control", "no-cache")
         return response
 
-    _add_state_routes(app, site, engine, hub, store, sinks)
-    _add_switch_route(app, site, engine)
-    _add_access_route(app, engine, access)
-    _add_event_routes(app, site, store)
-    _add_map_route(app, site, engine)
-    _add_live_route(app, site, clock, engine, hub)
+    _add_state_routes(app, parts)
+    _add_switch_route(app, parts)
+    _add_access_route(app, parts, access)
+    _add_event_routes(app, parts)
+    _add_map_route(app, parts)
+    _add_live_route(app, parts)
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
@@ -140,37 +137,40 @@ def _privacy(site: Site) -> JsonObject:
     return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
-def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
+def _add_state_routes(app: FastAPI, parts: Parts) -> None:
+    site, event_log = parts.site, parts.event_log
+
     @app.get("/api/v1/site", tags=["state"])
     def get_site() -> JsonObject:
         """Room, grid, arrays and settings."""
-        return describe_site(site, engine.mode)
+        return describe_site(site, parts.site_time.mode)
 
     @app.get("/api/v1/arrays", tags=["state"])
     def get_arrays() -> JsonObject:
         """State, age of the last message, levels, drift and counters of every array."""
-        return {"v": API_VERSION, "now_utc": utc_text(engine.now_ns()), "arrays": engine.arrays()}
+        now_utc = utc_text(parts.site_time.now_ns())
+        return {"v": API_VERSION, "now_utc": now_utc, "arrays": parts.array_states.describe()}
 
     @app.get("/api/v1/tracks", tags=["estimates"])
     def get_tracks() -> JsonObject:
         """The tracks that live now."""
-        return {"v": API_VERSION, "tracks": engine.tracks()}
+        return {"v": API_VERSION, "tracks": parts.tracks.all()}
 
     @app.get("/api/v1/health", tags=["state"], responses={503: {"description": "the server has failed"}})
     def get_health(request: Request, response: Response) -> JsonObject:
         """Whether the server works (503 where it does not) and how the arrays are; without a token the status only."""
-        arrays = engine.arrays()
+        arrays = parts.array_states.describe()
         reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
         states = {a["state"] for a in arrays if a["enabled"]}  # what is disabled is so on purpose
         status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
-        if engine.unkept:
-            reasons.append(f"server.events_db: {engine.unkept} events were not kept; free space or release the file")
+        if event_log.unkept:
+            reasons.append(f"server.events_db: {event_log.unkept} events were not kept; free space or release the file")
             status = "degraded" if status == "ok" else status
-        if engine.unsaved:
-            reasons.append(f"server.events_db: {engine.unsaved} events wait for it; free space or release the file")
+        if event_log.unsaved:
+            reasons.append(f"server.events_db: {event_log.unsaved} events wait for it; free space or release the file")
             status = "degraded" if status == "ok" else status
-        if engine.failure is not None:
-            status, reasons = "failed", [f"fusion: {engine.failure!r}", *reasons]
+        if parts.failure is not None:
+            status, reasons = "failed", [f"fusion: {parts.failure!r}", *reasons]
             response.status_code = 503
         if request.scope["client_role"] is None:
             return {"v": API_VERSION, "status": status}
@@ -178,8 +178,8 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
             "v": API_VERSION,
             "status": status,
             "version": __version__,
-            "mode": engine.mode,
-            "uptime_s": round(engine.uptime_s(), 3),
+            "mode": parts.site_time.mode,
+            "uptime_s": round(parts.site_time.uptime_s(), 3),
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
             "privacy": _privacy(site),
@@ -188,12 +188,12 @@ def _add_state_routes(app: FastAPI, site: Site, engine: Engine, hub: Hub, store:
                 "tokens": site.server.http.tokens is not None,
                 "tls": site.server.http.certificate is not None,
             },
-            "refused": {door: engine.refusals.count(door) for door in ("nodes", "http")},
+            "refused": {door: parts.refusals.count(door) for door in ("nodes", "http")},
         }
 
     registry = CollectorRegistry()
-    registry.register(_Metrics(engine, hub, store, sinks))
-    registry.register(engine.latency.histogram)
+    registry.register(_Metrics(parts))
+    registry.register(parts.latency.histogram)
 
     @app.get("/metrics", tags=["state"], response_class=PlainTextResponse)
     def get_metrics() -> PlainTextResponse:
@@ -209,7 +209,9 @@ class Switch(BaseModel):
     enabled: bool
 
 
-def _add_switch_route(app: FastAPI, site: Site, engine: Engine) -> None:
+def _add_switch_route(app: FastAPI, parts: Parts) -> None:
+    site = parts.site
+
     @app.put(
         "/api/v1/arrays/{name}/enabled",
         tags=["state"],
@@ -224,7 +226,7 @@ def _add_switch_route(app: FastAPI, site: Site, engine: Engine) -> None:
         if name not in _names(site):
             raise HTTPException(404, f"no array {name!r}; there are {', '.join(_names(site))}")
         try:
-            engine.enable(name, switch.enabled)
+            parts.array_states.enable(name, switch.enabled)
         except StoreError as error:
             raise HTTPException(503, str(error)) from error
         done = "enabled" if switch.enabled else "disabled"
@@ -232,22 +234,24 @@ def _add_switch_route(app: FastAPI, site: Site, engine: Engine) -> None:
         return {"v": API_VERSION, "name": name, "enabled": switch.enabled}
 
 
-def _add_access_route(app: FastAPI, engine: Engine, access: Access) -> None:
+def _add_access_route(app: FastAPI, parts: Parts, access: Access) -> None:
     @app.get("/api/v1/access", tags=["state"])
     def get_access() -> JsonObject:
         """Who may ask, which nodes are enrolled, and who was refused; for admins."""
         return {
             "v": API_VERSION,
             "clients": [{"name": c.name, "role": str(c.role)} for c in access.clients],
-            "nodes": engine.enrolled,
+            "nodes": list(parts.receiver.enrolled),
             "refused": [
                 {"door": r.door, "who": r.who, "reason": r.reason, "count": r.count, "last_utc": utc_text(r.last_ns)}
-                for r in engine.refusals.known()
+                for r in parts.refusals.known()
             ],
         }
 
 
-def _add_event_routes(app: FastAPI, site: Site, store: Store) -> None:
+def _add_event_routes(app: FastAPI, parts: Parts) -> None:
+    site, store = parts.site, parts.store
+
     @app.get("/api/v1/events", tags=["estimates"], responses={404: {"description": "no such zone"}})
     def get_events(
         since: Annotated[str | None, Query(description="RFC 3339; events that began then or later")] = None,
@@ -306,7 +310,9 @@ def _mapped(site: Site) -> list[str]:
     return [FUSED, *_names(site)]
 
 
-def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
+def _add_map_route(app: FastAPI, parts: Parts) -> None:
+    site = parts.site
+
     @app.get(
         "/api/v1/map",
         tags=["estimates"],
@@ -326,7 +332,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
             raise HTTPException(404, f"no array {array!r}; there are {', '.join(_mapped(site))}")
         if view == "volume" and format == "png":
             raise _unprocessable("view", "view=volume has no picture; use format=float32")
-        drawn = engine.maps.newest(array)
+        drawn = parts.maps.newest(array)
         if drawn is None:
             return Response(status_code=204)
         power = drawn.power(array)
@@ -341,7 +347,7 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
             "X-Map-Shape": ",".join(str(n) for n in image.shape),
             "X-Map-Bounds-M": ",".join(f"{edge:g}" for edge in bounds_m),
             "X-Map-Time-Utc": utc_text(time_ns),
-            "X-Map-Age-S": f"{(engine.now_ns() - time_ns) / 1e9:.3f}",
+            "X-Map-Age-S": f"{(parts.site_time.now_ns() - time_ns) / 1e9:.3f}",
             "X-Map-Min": f"{image.min():.6g}",
             "X-Map-Max": f"{image.max():.6g}",
         }
@@ -351,7 +357,9 @@ def _add_map_route(app: FastAPI, site: Site, engine: Engine) -> None:
         return Response(body, media_type="application/octet-stream", headers=headers)
 
 
-def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub: Hub) -> None:
+def _add_live_route(app: FastAPI, parts: Parts) -> None:
+    site, fanout = parts.site, parts.fanout
+
     @app.websocket("/api/v1/live")
     async def live(
         socket: WebSocket,
@@ -368,23 +376,23 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
         except ValueError as error:
             await socket.close(1008, str(error)[:MAX_REASON])
             return
-        arrays = await asyncio.to_thread(engine.arrays)
-        subscription = hub.subscribe(wanted, since)
+        arrays = await asyncio.to_thread(parts.array_states.describe)
+        subscription = fanout.subscribe(wanted, since)
         hello = {
             "v": API_VERSION,
-            "seq": hub.last_seq,
+            "seq": fanout.last_seq,
             "kind": "hello",
-            "now_utc": utc_text(engine.now_ns()),
+            "now_utc": utc_text(parts.site_time.now_ns()),
             "site": site.site,
-            "mode": engine.mode,
-            "last_seq": hub.last_seq,
+            "mode": parts.site_time.mode,
+            "last_seq": fanout.last_seq,
             "role": str(socket.scope["client_role"]),
             "arrays": arrays,
         }
         try:
-            await _while_connected(socket, _send_all(socket, subscription, Told(hello), clock, engine.latency))
+            await _while_connected(socket, _send_all(socket, subscription, Numbered(hello), parts))
         finally:
-            hub.unsubscribe(subscription)
+            fanout.unsubscribe(subscription)
 
     @app.websocket("/api/v1/map")
     async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
@@ -400,8 +408,8 @@ def _add_live_route(app: FastAPI, site: Site, clock: Clock, engine: Engine, hub:
         def drawn() -> None:
             loop.call_soon_threadsafe(news.set)
 
-        with engine.maps.watching(array, chosen, drawn):
-            await _while_connected(socket, _send_pictures(socket, engine, array, chosen, news))
+        with parts.maps.watching(array, chosen, drawn):
+            await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
 
 
 def _chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
@@ -454,29 +462,29 @@ def _filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None
     return Filter(chosen, least, zone)
 
 
-async def _send_all(socket: WebSocket, subscription: Subscription, first: Told, clock: Clock, latency: Latency) -> None:
-    told = first
-    while await _sent(socket.send_text(told.text)):
-        if told.told_ns is not None:
-            latency.delivered(told.message, (clock.monotonic_ns() - told.told_ns) / 1e9)
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Numbered, parts: Parts) -> None:
+    message = first
+    while await _sent(socket.send_text(message.text)):
+        if message.published_ns is not None:
+            parts.latency.delivered(message.message, (parts.clock.monotonic_ns() - message.published_ns) / 1e9)
         if subscription.lags:  # else all of it goes out in one turn, even to a client that has left meanwhile
             await asyncio.sleep(0)
-        told = await subscription.next()
+        message = await subscription.next()
 
 
 async def _send_pictures(
-    socket: WebSocket, engine: Engine, array: str, views: tuple[str, ...], news: asyncio.Event
+    socket: WebSocket, parts: Parts, array: str, views: tuple[str, ...], news: asyncio.Event
 ) -> None:
     """Send each window's pictures as they are drawn; what a slow client has no time for is left out."""
     shown = None
     while True:
         news.clear()
-        drawn = engine.maps.drawn
+        drawn = parts.maps.drawn
         pictures = [] if drawn is None else [drawn.pictures.get((array, view)) for view in views]
         if drawn is not None and drawn.window is not shown and all(pictures):
             shown = drawn.window
             for picture in pictures:
-                if picture is not None and not await _sent(socket.send_bytes(picture.packed(engine.now_ns()))):
+                if picture is not None and not await _sent(socket.send_bytes(picture.packed(parts.site_time.now_ns()))):
                     return
         await news.wait()
 
@@ -500,33 +508,32 @@ async def _until_gone(socket: WebSocket) -> None:
 class _Metrics(Collector):
     """Everything countable, read when it is asked for."""
 
-    def __init__(self, engine: Engine, hub: Hub, store: Store, sinks: Sinks) -> None:
-        self._engine = engine
-        self._hub = hub
-        self._store = store
-        self._sinks = sinks
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
 
     def collect(self) -> Iterator[Metric]:
-        yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", self._engine.uptime_s())
-        yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", self._hub.clients)
-        yield GaugeMetricFamily("livessl_map_watchers", "Subscribers to maps.", self._engine.maps.watchers)
-        yield CounterMetricFamily("livessl_maps_drawn", "Drawings of maps.", self._engine.maps.drawings)
+        parts = self._parts
+        yield GaugeMetricFamily("livessl_uptime_seconds", "Time since start.", parts.site_time.uptime_s())
+        yield GaugeMetricFamily("livessl_websocket_clients", "Subscribers.", parts.fanout.clients)
+        yield GaugeMetricFamily("livessl_map_watchers", "Subscribers to maps.", parts.maps.watchers)
+        yield CounterMetricFamily("livessl_maps_drawn", "Drawings of maps.", parts.maps.drawings)
         yield CounterMetricFamily(
-            "livessl_messages_superseded", "Messages that slow subscribers never got.", self._hub.superseded
+            "livessl_messages_superseded", "Messages that slow subscribers never got.", parts.fanout.superseded
         )
         yield GaugeMetricFamily(
             "livessl_updates_left_out",
             "Windows since the server began this live run that gave way to newer ones.",
-            self._engine.updates_left_out,
+            parts.engine.updates_left_out,
         )
-        yield CounterMetricFamily("livessl_events", "Events since start.", self._engine.events)
-        yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", self._engine.unkept)
-        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", self._engine.unsaved)
-        yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", self._store.count())
-        yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", self._sinks.failures)
-        yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", self._engine.malformed)
+        events = parts.event_log
+        yield CounterMetricFamily("livessl_events", "Events since start.", events.published)
+        yield CounterMetricFamily("livessl_events_unkept", "Events that the store did not take.", events.unkept)
+        yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait for the store.", events.unsaved)
+        yield GaugeMetricFamily("livessl_events_stored", "Events in the store.", parts.store.count())
+        yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not take.", parts.sinks.failures)
+        yield CounterMetricFamily("livessl_messages_refused", "Malformed messages.", parts.receiver.ingest.malformed)
         refused = CounterMetricFamily("livessl_refused", "Peers and requests turned away.", labels=["door", "reason"])
-        for (door, reason), count in self._engine.refusals.counts().items():
+        for (door, reason), count in parts.refusals.counts().items():
             refused.add_metric([door, reason], count)
         yield refused
         up = GaugeMetricFamily("livessl_array_up", "1 where the array is healthy.", labels=["array"])
@@ -547,7 +554,7 @@ class _Metrics(Collector):
             "livessl_array_clock_offset_std_seconds", "Standard deviation of that.", labels=["array", "reference"]
         )
         counts = CounterMetricFamily("livessl_array", "Counts of an array.", labels=["array", "what"])
-        for array in self._engine.arrays():
+        for array in parts.array_states.describe():
             up.add_metric([array["name"]], float(array["state"] == "healthy"))
             enabled.add_metric([array["name"]], float(array["enabled"]))
             if array["age_s"] is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -68,9 +69,9 @@ class Messages:
         self._origin_ns = origin_ns
         self._utc = utc
 
-    def event(self, event: Event, stages: Stages | None = None) -> JsonObject:
-        """An event: the contract's fields first."""
-        position, covariance, confidence, arrays = self._where(event.estimate)
+    def event(self, event: Event, stages: Stages | None = None, replaces: Sequence[str] = ()) -> JsonObject:
+        """An event, and the ids of the early ones that it replaces: the contract's fields first."""
+        position, covariance, confidence, arrays = where(event.estimate)
         return {
             "kind": "event",
             "id": event.id,
@@ -91,13 +92,13 @@ class Messages:
             "latency_s": round(event.latency_s if stages is None else stages.total, 4),
             "latency_stages_s": _stages(stages),
             "late": event.late,
-            "replaces": [],
+            "replaces": list(replaces),
             "source": event.source,
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
         """Where a sound that still lasts seems to be."""
-        position, covariance, confidence, arrays = self._where(update.estimate)
+        position, covariance, confidence, arrays = where(update.estimate)
         return {
             "kind": "update",
             "event_id": update.event_id,
@@ -117,7 +118,7 @@ class Messages:
         }
 
     def _other(self, estimate: Estimate) -> JsonObject:
-        position, covariance, confidence, _ = self._where(estimate)
+        position, covariance, confidence, _ = where(estimate)
         return {
             "position_m": position,
             "covariance_m2": covariance,
@@ -145,13 +146,15 @@ class Messages:
             "start_s": round((time_ns - self._origin_ns) / 1e9, 6),
         }
 
-    def _where(
-        self, estimate: Estimate | None
-    ) -> tuple[list[float] | None, list[list[float]] | None, float, list[str]]:
-        if estimate is None:
-            return None, None, 0.0, []
-        covariance = [_square_metres(row) for row in estimate.covariance_m2]
-        return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
+
+def where(
+    estimate: Estimate | None,
+) -> tuple[list[float] | None, list[list[float]] | None, float, list[str]]:
+    """Position, covariance, confidence and arrays of an estimate, rounded as they are published."""
+    if estimate is None:
+        return None, None, 0.0, []
+    covariance = [_square_metres(row) for row in estimate.covariance_m2]
+    return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
 
 
 def array_status(status: ArrayStatus, node: str | None) -> JsonObject:

@@ -1,0 +1,164 @@
+"""States of the arrays: what the API and the log report of each, and which of them an operator has disabled."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from livessl.clock import Clock, utc_text
+from livessl.core.stream.array_health import ArrayState, ArrayStatus
+from livessl.core.stream.final_pass import TwoPassFusion
+from livessl.core.types import Frame, Message
+from livessl.server.api.encode import JsonObject, array_status
+from livessl.server.ingest import Ingest
+from livessl.server.site_time import SiteTime
+from livessl.server.store import Store
+from livessl.site.models import Site
+
+REPORT_NS: Final = 500_000_000
+"""Interval between two reports on the arrays, nanoseconds."""
+
+WATCH_NS: Final = 100_000_000
+"""Interval at which the states are compared, nanoseconds; a change is reported at once."""
+
+DISABLED: Final = "disabled"
+"""State of an array that an operator has disabled; it hides the state that the array would have otherwise."""
+
+_log = logging.getLogger(__name__)
+
+
+class ArrayStates:
+    """Reports the states of the arrays, and decides which of them are disabled.
+
+    Every thread may call `describe`, `disabled` and `enable`; the rest is for the fusion thread.
+
+    Parameters
+    ----------
+    site : Site
+    clock : Clock
+    store : Store
+        Remembers which arrays are disabled.
+    site_time : SiteTime
+    ingest : Ingest
+        Counts what the nodes sent.
+    publish : callable
+        Gets the message `arrays` for subscribers.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        clock: Clock,
+        store: Store,
+        site_time: SiteTime,
+        ingest: Ingest,
+        publish: Callable[[JsonObject], None],
+    ) -> None:
+        self._site = site
+        self._clock = clock
+        self._store = store
+        self._site_time = site_time
+        self._ingest = ingest
+        self._publish = publish
+        self._fusion: TwoPassFusion | None = None
+        self._disabled = store.disabled(site.site)  # replaced as a whole, never changed, so that readers need no lock
+        self._switching = threading.Lock()
+        self._reported: dict[str, str] = {}
+        self._reported_ns = self._watched_ns = 0
+
+    def follow(self, fusion: TwoPassFusion) -> None:
+        """Describe the arrays as this fusion sees them, from now on."""
+        self._fusion = fusion
+
+    @property
+    def disabled(self) -> frozenset[str]:
+        """Names of the disabled arrays."""
+        return self._disabled
+
+    def enable(self, array: str, enabled: bool) -> None:
+        """Enable or disable an array, and have the store remember it.
+
+        The frames of a disabled array are received and acknowledged and its levels are shown, but no event is made of
+        them, and no result waits for them.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot write it; the array then stays as it was.
+        """
+        with self._switching:
+            self._store.enable(self._site.site, array, enabled)
+            self._disabled = self._disabled - {array} if enabled else self._disabled | {array}
+
+    def for_fusion(self, message: Message) -> Message:
+        """Return the message as the fusion shall get it: no frame of a disabled array is active."""
+        if message.array in self._disabled and isinstance(message, Frame) and message.active:
+            return replace(message, active=False)
+        return message
+
+    def describe(self, *, levels: bool = True) -> list[JsonObject]:
+        """Return the state of every array as JSON objects, without waiting for a localization in progress.
+
+        Without `levels` the levels of the channels are left out; they cost an FFT for each array.
+        """
+        if self._fusion is None:
+            return []
+        statuses = self._fusion.status(self._site_time.now_ns(), levels=levels)
+        return [self._described(status, self._fusion) for status in statuses]
+
+    def watch(self) -> None:
+        """Publish and log the states if one has changed, and publish them at least every `REPORT_NS`."""
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - self._watched_ns < WATCH_NS:
+            return
+        self._watched_ns = now_ns
+        if now_ns - self._reported_ns < REPORT_NS:
+            states = {array["name"]: array["state"] for array in self.describe(levels=False)}
+            if all(state == self._reported.get(name) for name, state in states.items()):
+                return
+        self._reported_ns = now_ns
+        arrays = self.describe()
+        for array in arrays:
+            before = self._reported.get(array["name"])
+            if before not in (None, array["state"]):
+                why = f": {array['reason']}" if array["reason"] else ""
+                _log.info("array %r is %s%s", array["name"], array["state"], why)
+            self._reported[array["name"]] = array["state"]
+        now_utc = utc_text(self._site_time.now_ns())
+        self._publish({"kind": "arrays", "now_utc": now_utc, "mode": self._site_time.mode, "arrays": arrays})
+
+    def _described(self, status: ArrayStatus, fusion: TwoPassFusion) -> JsonObject:
+        state, reason = self._state(status)
+        enabled = status.name not in self._disabled
+        if not enabled:
+            otherwise = f"{state}: {reason}" if reason else state
+            reason = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
+        status = replace(status, state=state, reason=reason, counters=self._counters(status, fusion))
+        described = {**array_status(status, self._site.node_of(status.name)), "enabled": enabled}
+        return described if enabled else {**described, "state": DISABLED}
+
+    def _state(self, status: ArrayStatus) -> tuple[ArrayState, str | None]:
+        """Return state and reason, in view of what the array's node reports of its device."""
+        state, problem = status.state, self._ingest.problem_of(status.name)
+        reason = status.reason if problem is None else problem
+        if problem is not None and state is ArrayState.HEALTHY:
+            state = ArrayState.DEGRADED
+        if state is ArrayState.LOST and self._ingest.is_live(status.name, self._clock.monotonic_ns()):
+            state = ArrayState.QUIET
+            reason = problem or "its node is there, but no sound comes from its device"
+        return state, reason
+
+    def _counters(self, status: ArrayStatus, fusion: TwoPassFusion) -> dict[str, int]:
+        name = status.name
+        return {
+            **status.counters,
+            "duplicates": self._ingest.duplicates[name] + fusion.duplicates.get(name, 0),
+            "sequence_gaps": self._ingest.sequence_gaps[name],
+            "backfilled": fusion.backfilled.get(name, 0),
+            "asked": fusion.asked.get(name, 0),
+            "helped": fusion.helped.get(name, 0),
+            "too_late": fusion.too_late.get(name, 0),
+        }

@@ -1,0 +1,248 @@
+"""Events from their early to their final result: what was published, what replaces what, and what waits for the store.
+
+It works on values. The JSON of an event is made once, by `server.api.encode`, when the event is published and stored.
+It is read again only from the store, at the beginning of a live run.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+from livessl.clock import Clock
+from livessl.core.stream.final_pass import FinalResults
+from livessl.core.types import FRAME_NS, Event
+from livessl.server.api.encode import JsonObject, Messages, Stages, where
+from livessl.server.latency import Latency
+from livessl.server.store import Finalized, Store, StoreError
+
+RETRY_NS: Final = 1_000_000_000
+"""Interval, in nanoseconds, at which the store is offered again what it did not take."""
+
+MAX_UNSAVED: Final = 10_000
+"""Most final events that wait for the store, about 10 MB; beyond it the oldest are given up, and counted."""
+
+_log = logging.getLogger(__name__)
+
+
+class Answer(NamedTuple):
+    """What an event answers, at the precision at which it is published; an event that repeats it is no news."""
+
+    start_us: int
+    duration_s: float
+    position_m: list[float] | None
+    covariance_m2: list[list[float]] | None
+    confidence: float
+    arrays: list[str]
+    status: str
+
+    @classmethod
+    def of(cls, event: Event) -> Self:
+        """Return the answer of an event."""
+        return cls(event.start_ns // 1000, round(event.duration_s, 6), *where(event.estimate), str(event.status))
+
+    @classmethod
+    def restored(cls, start_ns: int, message: JsonObject) -> Self:
+        """Return the answer of an event that was published before the server's restart."""
+        return cls(start_ns // 1000, *(message[name] for name in cls._fields[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class EarlyEvent:
+    """An event that was published and stored before all of its sound was there; a final one may replace it.
+
+    Parameters
+    ----------
+    id : str
+    start_ns, end_ns : int
+        Site time.
+    source : int
+        1; or 2 for the second of two simultaneous sources.
+    answer : Answer
+    message : JsonObject
+        The event as it was published and stored.
+    """
+
+    id: str
+    start_ns: int
+    end_ns: int
+    source: int
+    answer: Answer
+    message: JsonObject
+
+    @classmethod
+    def of(cls, event: Event, message: JsonObject) -> Self:
+        """Return the early event that was published by this message."""
+        return cls(event.id, event.start_ns, event.end_ns, event.source, Answer.of(event), message)
+
+    @classmethod
+    def restored(cls, start_ns: int, message: JsonObject) -> Self:
+        """Return an early event of before the server's restart, from its row in the store."""
+        end_ns = start_ns + round(message["duration_s"] * 1e9)
+        answer = Answer.restored(start_ns, message)
+        return cls(message["id"], start_ns, end_ns, message.get("source", 1), answer, message)
+
+    def successor(self, events: Sequence[Event]) -> Event | None:
+        """Return the event that overlaps this one in time; of two simultaneous sources, the one of the same number."""
+        overlapping = [event for event in events if event.start_ns < self.end_ns and self.start_ns < event.end_ns]
+        same_source = (event for event in overlapping if event.source == self.source)
+        return next(same_source, overlapping[0] if overlapping else None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Unsaved:
+    """What one final pass found and the store has not taken yet: see `Store.finalize`."""
+
+    events: Sequence[tuple[JsonObject, int]]
+    replaced: Sequence[str]
+    until: int
+    clocks: JsonObject
+
+
+class EventLog:
+    """Publishes and stores early and final events. For the fusion thread; every thread may read the counters.
+
+    Parameters
+    ----------
+    site : str
+        Name of the site.
+    clock : Clock
+    store : Store
+    latency : Latency
+        Measures how long events took.
+    publish : callable
+        Gets the message of every event.
+    """
+
+    def __init__(
+        self, site: str, clock: Clock, store: Store, latency: Latency, publish: Callable[[JsonObject], None]
+    ) -> None:
+        self._site = site
+        self._clock = clock
+        self._store = store
+        self._latency = latency
+        self._publish = publish
+        self._is_replay = False
+        self._early: list[EarlyEvent] = []
+        self._waiting: deque[_Unsaved] = deque()
+        self._tried_ns = 0
+        self.published = 0
+        """Events published since the start."""
+        self.unkept = 0
+        """Events given up because the store did not take them."""
+        self.unsaved = 0
+        """Final events that wait for the store to take them."""
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether the store has taken all final events; until then no node may forget their frames."""
+        return not self._waiting
+
+    def begin_live(self) -> Finalized:
+        """Begin a live run where the last one stopped: restore its early events, and return how far it came."""
+        self._is_replay = False
+        try:
+            self._early = [EarlyEvent.restored(start_ns, row) for start_ns, row in self._store.early_events()]
+        except StoreError as error:  # early events are then published anew instead of replaced
+            _log.error("%s", error)
+            self._early = []
+        return self._store.finalized(self._site)
+
+    def begin_replay(self) -> None:
+        """Begin a replay: its events replace nothing, and are stored without retries."""
+        self._is_replay = True
+        self._early = []
+
+    def add_early(self, event: Event, messages: Messages) -> None:
+        """Publish an event that cannot wait for an array that is late or away."""
+        message = messages.event(event, self._stages(event))
+        try:
+            self._store.add(message, event.start_ns, early=True)
+        except StoreError as error:  # the final event is kept until the store takes it
+            _log.error("%s", error)
+        else:
+            if not self._is_replay:
+                self._remember(EarlyEvent.of(event, message))
+        self._publish_event(message)
+
+    def add_final(self, results: FinalResults, messages: Messages, clocks: JsonObject) -> None:
+        """Store final events in place of the early ones, then publish those that are news.
+
+        Parameters
+        ----------
+        results : FinalResults
+        messages : Messages
+        clocks : JsonObject
+            What is known of the arrays' clocks: without it, a frame index means another time to each array.
+        """
+        if self._is_replay:
+            self._add_replayed(results.events, messages)
+            return
+        before = [early for early in self._early if early.start_ns < results.until * FRAME_NS]
+        successors = [(early, early.successor(results.events)) for early in before]
+        known = {early.id: early for early in before}
+        rows: list[tuple[JsonObject, int]] = []
+        news: list[JsonObject] = []
+        for event in results.events:
+            replaces = [early.id for early, successor in successors if successor is event and early.id != event.id]
+            same = known.get(event.id)
+            if same is not None and not replaces and same.answer == Answer.of(event):
+                rows.append((same.message, event.start_ns))
+                continue
+            stages = None if event.late or before else self._stages(event)
+            message = messages.event(event, stages, replaces)
+            rows.append((message, event.start_ns))
+            news.append(message)
+        replaced = [early.id for early, successor in successors if successor is not None]
+        done = {event.id for event in results.events} | {early.id for early in before}
+        self._early = [early for early in self._early if early.id not in done]
+        self._waiting.append(_Unsaved(rows, replaced, results.until, clocks))
+        self._save()
+        for message in news:
+            self._publish_event(message)
+
+    def retry(self) -> None:
+        """Offer the store what it has not taken yet, if it is time to."""
+        if self._waiting and self._clock.monotonic_ns() - self._tried_ns >= RETRY_NS:
+            self._save()
+
+    def _remember(self, early: EarlyEvent) -> None:
+        others = [other for other in self._early if other.id != early.id]
+        self._early = sorted([*others, early], key=lambda each: each.start_ns)
+
+    def _add_replayed(self, events: Sequence[Event], messages: Messages) -> None:
+        for event in events:
+            message = messages.event(event)
+            try:
+                self._store.add(message, event.start_ns)
+            except StoreError as error:  # a full disk must not delay what is published
+                self.unkept += 1
+                _log.error("%s", error)
+            self._publish_event(message)
+
+    def _save(self) -> None:
+        self._tried_ns = self._clock.monotonic_ns()
+        while self._waiting:
+            first = self._waiting[0]
+            try:
+                self._store.finalize(self._site, first.events, first.replaced, first.until, first.clocks)
+            except StoreError as error:
+                _log.error("%s", error)
+                break
+            self._waiting.popleft()
+        count = sum(len(unsaved.events) for unsaved in self._waiting)
+        while count > MAX_UNSAVED:
+            lost = len(self._waiting.popleft().events)
+            self.unkept, count = self.unkept + lost, count - lost
+        self.unsaved = count
+
+    def _publish_event(self, message: JsonObject) -> None:
+        self.published += 1
+        self._publish(message)
+
+    def _stages(self, event: Event) -> Stages | None:
+        """Return where the time went that the event took; nothing of a recording's, which is long past."""
+        return None if self._is_replay else self._latency.located(event)

@@ -1,0 +1,45 @@
+"""The parts of a running server, by name: `app` makes them, the API reads them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from livessl.clock import Clock
+from livessl.server.array_states import ArrayStates
+from livessl.server.engine import Engine
+from livessl.server.event_log import EventLog
+from livessl.server.fanout import Fanout
+from livessl.server.latency import Latency
+from livessl.server.maps import Maps
+from livessl.server.receiver import Source
+from livessl.server.refusals import Refusals
+from livessl.server.sinks import Sinks
+from livessl.server.site_time import SiteTime
+from livessl.server.store import Store
+from livessl.server.tracks import Tracks
+from livessl.site.models import Site
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What runs in a server, and what it shares."""
+
+    site: Site
+    clock: Clock
+    receiver: Source
+    refusals: Refusals
+    engine: Engine
+    site_time: SiteTime
+    array_states: ArrayStates
+    event_log: EventLog
+    tracks: Tracks
+    maps: Maps
+    latency: Latency
+    store: Store
+    sinks: Sinks
+    fanout: Fanout
+
+    @property
+    def failure(self) -> BaseException | None:
+        """The error that has ended one of the threads, if any has ended."""
+        return self.engine.failure or self.receiver.failure or self.maps.failure

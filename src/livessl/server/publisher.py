@@ -1,0 +1,81 @@
+"""Hands each result of the fusion to whoever publishes, keeps or draws it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import assert_never
+
+from livessl.core.stream.final_pass import FinalResults
+from livessl.core.types import BackfillRequest, Event, Output, Track, Update, Window
+from livessl.server.api.encode import JsonObject
+from livessl.server.event_log import EventLog
+from livessl.server.latency import Latency
+from livessl.server.maps import Maps
+from livessl.server.run import Run
+from livessl.server.site_time import SiteTime
+from livessl.server.tracks import Tracks
+
+
+class Publisher:
+    """Publishes what a run finds, on the fusion thread.
+
+    Parameters
+    ----------
+    publish : callable
+        Gets every message for subscribers.
+    request : callable
+        Sends a request for missing frames to an array's node.
+    site_time : SiteTime
+    event_log : EventLog
+    tracks : Tracks
+    maps : Maps
+    latency : Latency
+    """
+
+    def __init__(
+        self,
+        publish: Callable[[JsonObject], None],
+        request: Callable[[BackfillRequest], None],
+        site_time: SiteTime,
+        event_log: EventLog,
+        tracks: Tracks,
+        maps: Maps,
+        latency: Latency,
+    ) -> None:
+        self._publish = publish
+        self._request = request
+        self._site_time = site_time
+        self._event_log = event_log
+        self._tracks = tracks
+        self._maps = maps
+        self._latency = latency
+
+    def publish(self, outputs: Iterable[Output | FinalResults], run: Run) -> None:
+        """Publish what one step of a run has found; a run that has not received anything finds nothing."""
+        messages = run.messages
+        if messages is None:
+            return
+        for output in outputs:
+            match output:
+                case FinalResults():
+                    self._event_log.add_final(output, messages, run.clock_offsets.state())
+                case Event():
+                    self._event_log.add_early(output, messages)
+                case Update():
+                    stages = None if self._site_time.is_replay else self._latency.located(output)
+                    self._publish(messages.update(output, stages))
+                case Track():
+                    message = messages.track(output)
+                    self._tracks.note(output, message)
+                    self._publish(message)
+                case Window():
+                    self._maps.show(output, run.fusion.power_maps)
+                case BackfillRequest():
+                    self._request(output)
+                case _:
+                    assert_never(output)
+
+    def end_tracks(self) -> None:
+        """Publish the end of all tracks."""
+        for message in self._tracks.end_all():
+            self._publish(message)
