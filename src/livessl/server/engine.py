@@ -104,7 +104,7 @@ class Engine:
                 batch = []
                 self._meet(item)
             else:
-                batch.append(self._array_states.for_fusion(item))
+                batch.append(item)
         self._step(batch)
         if batch:
             self._site_time.note_sound()

@@ -179,3 +179,13 @@ def test_node_an_hour_ahead_is_rejected_with_a_reason() -> None:
     assert south.counters["rejected"] == len(ahead)
     assert south.reason is not None
     assert "ahead of the server's; set both by NTP" in south.reason
+
+
+def test_excluded_array_is_neither_used_nor_awaited() -> None:
+    into = two_passes()
+    into.exclude({"south"})
+    said = play(into, node("north", range(10, 16), range(40)) + node("south", range(8, 18), range(20)), 40)
+    ((when, output),) = said
+    assert isinstance(output, FinalResults)
+    assert [event.heard_by for event in output.events] == [("north",)]
+    assert when == 16 + HANG_OVER

@@ -80,8 +80,7 @@ class TwoPassFusion:
     @property
     def settled(self) -> int | None:
         """Frame index before which all results are final; None at the beginning."""
-        needed_from = self._final.needed_from
-        return self._settled if needed_from is None else needed_from
+        return self._settled if (needed_from := self._final.needed_from) is None else needed_from
 
     @property
     def settled_of(self) -> dict[str, int]:
@@ -148,7 +147,7 @@ class TwoPassFusion:
             self._early.skip_events(None, None)
         live: list[Message] = []
         requested: list[Message] = []
-        for message in messages:
+        for message in map(self._state.without_excluded, messages):
             if isinstance(message, Frame) and message.requested:
                 requested.append(message)
             elif self._take(message, now_ns):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from livessl.core.locate.estimators import Estimator
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
 from livessl.core.stream.outlier_votes import OutlierVotes
 from livessl.core.stream.parameters import FusionParameters
-from livessl.core.types import ArraySpec
+from livessl.core.types import ArraySpec, Frame, Message
 
 
 class SiteState:
@@ -52,13 +53,19 @@ class SiteState:
     def exclude(self, arrays: Collection[str]) -> None:
         """Exclude these arrays from now on, and include all others again.
 
-        The frames of an excluded array are neither waited for nor requested.
+        No frame of an excluded array is active, awaited or requested.
         """
         self._excluded = arrays
 
     def is_excluded(self, array: str) -> bool:
         """Return whether an array is excluded."""
         return array in self._excluded
+
+    def without_excluded(self, message: Message) -> Message:
+        """Return a message as it is used: no frame of an excluded array is active."""
+        if message.array in self._excluded and isinstance(message, Frame) and message.active:
+            return replace(message, active=False)
+        return message
 
     def answers_requests(self, array: str) -> bool:
         """Return whether frames may be requested from an array."""
