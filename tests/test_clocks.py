@@ -41,7 +41,7 @@ def site() -> Site:
 
 @cache
 def batches(ahead_s: float) -> Batches:
-    """What the two nodes send of the scene, the second one with its clock ahead, and when."""
+    """The messages of two nodes, the second with its clock ahead, and when they come."""
     ahead_ns = round(ahead_s * 1e9)
     parts = [
         replace(part, placed=Placed(part.placed.recording, START_NS + ahead_ns * (part.array == "south")))
@@ -107,7 +107,7 @@ def test_events_are_those_of_clocks_that_agree(ahead_s: float) -> None:
 def test_sounds_close_to_one_another_stay_apart() -> None:
     """Pauses of 0.4 s are longer than the hang-over of 0.3 s, but not by as much as the clocks differ.
 
-    Joined by their own times the arrays would hear on without a pause, and two sounds be one.
+    By the times of the arrays' own clocks there would be no pause, and both sounds would be one event.
     """
 
     def told_of(*, corrected: bool) -> list[Event]:
@@ -150,7 +150,7 @@ def two_passes(clocks: ClockOffsets | None = None, settled: int | None = None) -
 @pytest.mark.parametrize("step", [1, 7, 100])
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
 def test_live_events_are_the_same_and_final_at_once(ahead_s: float, step: int) -> None:
-    """However many messages come at a time; and none of them only from the fusion that does not wait."""
+    """This does not depend on how many messages come at a time, and the early pass reports none by itself."""
     into = two_passes()
     outputs: list[Output | FinalResults] = []
     all_batches = batches(ahead_s)

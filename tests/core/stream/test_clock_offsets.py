@@ -1,4 +1,4 @@
-"""Clocks that differ, told by sounds: how far, how surely, and what the fusion makes of it."""
+"""Offsets of clocks from sounds: their size, their uncertainty, and the corrections made of them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_NS = 1_700_000_000 * SECOND_NS
 
 
 def frames_of(spec: ArraySpec, sound: FloatArray, ahead_s: float = 0.0, noise: float = 1e-4) -> list[Frame]:
-    """A sound from the source as an array hears it after its travel, cut by a clock that is ahead."""
+    """A sound from the source as an array receives it after its travel, in frames of a clock that is ahead."""
     travel_s = np.linalg.norm(spec.microphones_m - SOURCE_M, axis=1) / C_M_S
     samples = delayed(sound, travel_s)
     samples += (noise * np.random.default_rng(len(spec.name)).standard_normal(samples.shape)).astype(np.float32)
@@ -86,7 +86,7 @@ def test_noise_gives_no_offset() -> None:
 def learned(
     ahead_s: Sequence[float], sounds: int = 12, drift: float = 0.0, wrong: Iterable[int] = (), every_s: float = 20.0
 ) -> ClockOffsets:
-    """Offsets learned from sounds that each clock of `a`, `b`, … hears so late, to 3 ms; the last one drifts."""
+    """Offsets learned from sounds that are so late at the clocks `a`, `b`, …, to 3 ms; the last one drifts."""
     names = "abcdef"[: len(ahead_s)]
     clocks = ClockOffsets({name: name for name in names}, C_M_S)
     rng = np.random.default_rng(1)
@@ -115,7 +115,7 @@ def test_offset_lies_within_its_uncertainty(wrong: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("drift", [100e-6, -100e-6])
 def test_drift_is_followed(drift: float) -> None:
-    """After 31 sounds in ten minutes a clock of 100 ppm is 62 ms off; without the line's slope half of it is missed."""
+    """A clock of 100 ppm is 62 ms off after 31 sounds in ten minutes; without the line's slope half of it is missed."""
     known = learned([0.0, 0.0], sounds=32, drift=drift).of("b")
     assert known is not None
     assert known.offset_s == pytest.approx(drift * 31 * 20, abs=0.006)

@@ -1,4 +1,4 @@
-"""Live and settled: what is told at once, what stays, and for how long an array is waited for."""
+"""Early and final results: what is reported at once, what is final, and how long an array is awaited."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_array_that_is_away_delays_no_early_event_and_corrects_the_final_one() -
     assert settled_events(said) == []
     (event,) = provisional(said)
     assert event.heard_by == ("north",)
-    # it comes back, and has kept what it heard
+    # it comes back, and has kept its frames
     into.greet("south", (START + 38, START + 50), now_ns(100))
     kept: Arrivals = [(101.0, m) for _, m in node("south", range(40, 46), range(35, 50)) if isinstance(m, Frame)]
     said = play(into, north + kept + [(101.0, mark("south", 100))], 110, 101)
@@ -97,7 +97,7 @@ def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:
     assert (event.id, event.start_ns, event.end_ns) == (told.id, told.start_ns, told.end_ns)
     # the last frame of its hang-over came at 52
     assert next(when for when, output in said if isinstance(output, FinalResults)) == 52 + 5 * SECOND + 1
-    # what the other kept of that time comes too late, and is counted
+    # the frames that the other has kept come too late, and are counted
     into.greet("south", (START + 38, START + 52), now_ns(300))
     play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
     assert into.too_late == {"north": 0, "south": 6}
@@ -135,7 +135,7 @@ def test_everything_is_settled_when_all_nodes_have_ended() -> None:
 
 
 def test_settled_events_are_not_reported_again_after_a_restart() -> None:
-    """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
+    """A server that starts again knows up to where all results are final; frames of that time are dropped."""
     into = two_passes()
     first = play(into, both(range(10, 16), range(30)), 30)
     (output,) = [output for _, output in first if isinstance(output, FinalResults)]
@@ -167,7 +167,7 @@ def test_final_pass_begins_anew_when_the_servers_clock_is_set_back() -> None:
 
 
 def test_node_an_hour_ahead_is_rejected_with_a_reason() -> None:
-    """A node an hour ahead is refused and told so; the other goes on."""
+    """The messages of a node an hour ahead are rejected; the other node goes on."""
     into = two_passes()
     ahead = [
         (w, replace(m, frame_index=m.frame_index + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))

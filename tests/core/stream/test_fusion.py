@@ -66,7 +66,7 @@ Arrivals = list[tuple[float, Message]]
 
 
 class Scripted:
-    """An estimator that says one place and remembers what it was given."""
+    """An estimator that returns one position and remembers what it was given."""
 
     name = "scripted"
 
@@ -121,7 +121,7 @@ def mark(array: str, frame_index: int, **changes: Any) -> Mark:
 
 
 def node(array: str, active: Collection[int], frame_indices: Iterable[int], delay: float = 0.0) -> Arrivals:
-    """What a node sends, each as its interval ends: frames while active and for a hang-over after, else marks."""
+    """The messages of a node, each as its frame index ends: frames while active and in a hang-over, else marks."""
     sent: Arrivals = []
     for frame_index in frame_indices:
         lately = any(frame_index - k in active for k in range(HANG_OVER + 1))
@@ -173,7 +173,7 @@ def status_of(fusion: Fusion, array: str, now: float) -> ArrayStatus:
 def sound_frames(
     spec: ArraySpec, first: int, count: int, rate_hz: float = RATE_HZ, *, noise: float = 0.0
 ) -> list[Frame]:
-    """A burst of noise from the source as an array hears it, in frames: real samples, power and activity."""
+    """A burst of noise from the source as an array receives it, in frames: real samples, power and activity."""
     n = round(0.05 * rate_hz)
     samples = heard(spec, SOURCE_M, burst(n * count), rate_hz)
     samples += (noise * np.random.default_rng(1).standard_normal(samples.shape)).astype(np.float32)
@@ -360,7 +360,7 @@ def test_result_is_the_same_live_and_all_at_once() -> None:
 
 @pytest.mark.parametrize("stops", [0, 5, 12, 18])
 def test_silent_array_delays_an_event_by_at_most_the_deadline(stops: int) -> None:
-    """It stops sending before, in or after a sound of the other's; a frame index later nobody waits for it."""
+    """It stops sending before, in or after a sound of the other array; one deadline later it is not awaited."""
     prompt = 16 + HANG_OVER
     arrivals = node("north", range(10, 16), range(60)) + node("south", range(10, 16), range(stops))
     ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
@@ -737,7 +737,7 @@ MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(KEPT_ARRAYS + 6)]
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_many_arrays_only_those_with_strong_onsets_keep_samples(order: int) -> None:
-    """What comes of the others stays: they are heard, and have part in the event."""
+    """The correlations of the other arrays stay: these arrays detect the event and contribute to it."""
     gauged = Gauged()
     fusion = Fusion(state_of(gauged, MANY), EVENTS_ONLY)
     held: dict[str, list[weakref.ref[Float32Array]]] = {spec.name: [] for spec in MANY}
@@ -791,8 +791,8 @@ def test_released_samples_do_not_depend_on_the_order_of_arrival() -> None:
     assert len({sum(pieces) for pieces in left[0].values()}) > 2  # some went early, some late, some not at all
 
 
-class Ear:
-    """Stands for a front end: it remembers what it heard, and says of each frame its number."""
+class FrontEnd:
+    """A front end that remembers what was pushed, and returns for each frame its number."""
 
     sample_rate_hz = RATE_HZ
 
@@ -807,8 +807,8 @@ class Ear:
         self.heard.append(None)
 
 
-class Listening(Scripted):
-    """An estimator that hears every frame."""
+class Correlating(Scripted):
+    """An estimator with a front end for every frame."""
 
     def __init__(self, refused: str | None = None) -> None:
         super().__init__()
@@ -819,7 +819,7 @@ class Listening(Scripted):
     def listener(self, array: str, sample_rate_hz: float) -> Any:
         assert (array, sample_rate_hz) == ("north", RATE_HZ)
         self.heard.append(None)  # a new one, that has heard nothing
-        return Ear(self.heard)
+        return FrontEnd(self.heard)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         onsets = summed(sounds["north"].onsets)
@@ -834,7 +834,7 @@ def numbered(frame_index: int, active: bool) -> Frame:
 
 
 def test_each_frame_of_an_event_is_correlated_once_and_in_order() -> None:
-    estimator = Listening()
+    estimator = Correlating()
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 15)) for k in range(4, 40) if k != 13]
     events = events_of(play(fusion_of(estimator, updates=True), arrivals, 60))
     before = [(k, True) for k in range(4, 12)]  # 0.4 s of pre-roll
@@ -845,7 +845,7 @@ def test_each_frame_of_an_event_is_correlated_once_and_in_order() -> None:
 
 
 def test_late_frames_are_correlated_in_their_place() -> None:
-    on_time, late = Listening(), Listening()
+    on_time, late = Correlating(), Correlating()
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
     events_of(play(fusion_of(on_time), arrivals, 60))
     held = [(21.0 if frame.frame_index == START + 13 else when, frame) for when, frame in arrivals]
@@ -857,9 +857,9 @@ def test_late_frames_are_correlated_in_their_place() -> None:
 
 
 def test_two_passes_correlate_each_frame_once() -> None:
-    """In step, each pass uses the correlations of the other; from a frame on that only one has, each makes its own."""
+    """Each pass uses the correlations of the other while both have the same frames, and then makes its own."""
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
-    alone, both = Listening(), Listening()
+    alone, both = Correlating(), Correlating()
     play(fusion_of(alone), arrivals, 60)
     shared = state_of(both)
     for fusion in (Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)):
@@ -867,7 +867,7 @@ def test_two_passes_correlate_each_frame_once() -> None:
     assert both.heard == alone.heard
     assert both.sums == 2 * alone.sums
 
-    partly = Listening()
+    partly = Correlating()
     shared = state_of(partly)
     first, second = Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)
     play(first, [arrival for arrival in arrivals if arrival[1].frame_index != START + 16], 60)
@@ -877,12 +877,12 @@ def test_two_passes_correlate_each_frame_once() -> None:
 
 @pytest.mark.parametrize("pause", [5, 7, 9])
 def test_correlating_ahead_changes_no_result(pause: int) -> None:
-    """A sound's run-up has been heard when it comes, where it is known to begin where the last one ended."""
+    """A pre-roll that is known to begin at the end of the last sound has been correlated when the next one comes."""
     again = range(18 + pause, 24 + pause)
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18 or k in again)) for k in range(4, 50)]
     told, heard_at_once = [], []
     for newest_only in (False, True):
-        estimator = Listening()
+        estimator = Correlating()
         fusion = Fusion(state_of(estimator), Role(updates=False, newest_only=newest_only))
         until = [arrival for arrival in arrivals if arrival[1].frame_index < START + again.start]
         play(fusion, until, again.start)
@@ -902,7 +902,7 @@ def test_correlating_ahead_changes_no_result(pause: int) -> None:
 
 
 def test_memory_of_a_sound_without_end_is_bounded() -> None:
-    fusion = fusion_of(Listening(), max_event_s=1.0)
+    fusion = fusion_of(Correlating(), max_event_s=1.0)
     held: list[weakref.ref[Float32Array]] = []
     most = 0
     for k in range(4, 200):
@@ -939,7 +939,7 @@ def test_refused_location_gives_no_position_and_no_track(refused: str | None) ->
 
 
 def test_microphone_that_dies_during_a_sound_is_reported() -> None:
-    """While there is sound no mark comes; a frame's samples tell the same."""
+    """No mark comes during a sound, but the samples of its frames show the same."""
     fusion = fusion_of()
     samples = np.full((4, 20), 0.1, np.float32)
     samples[2] = 0.0
@@ -952,11 +952,11 @@ def test_microphone_that_dies_during_a_sound_is_reported() -> None:
     assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"
 
 
-# --- who agrees
+# --- consensus and outliers
 
 
 class Voting(Scripted):
-    """An estimator that is told who is outvoted."""
+    """An estimator that finds the outliers that the test names."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -976,7 +976,7 @@ THREE = (NORTH, SOUTH, EAST)
 
 
 def sound_at(fusion: Fusion, frame_index: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
-    """One short sound that these arrays hear."""
+    """One short sound that these arrays detect."""
     span = range(frame_index, frame_index + 20)
     arrivals = [message for name in arrays for message in node(name, {frame_index + 5, frame_index + 6}, span)]
     return [output for _, output in play(fusion, arrivals, frame_index + 21, frame_index)]
@@ -1002,7 +1002,7 @@ def test_repeated_outlier_is_named_becomes_suspect_and_is_cleared() -> None:
     assert "an outlier in 4 of the last 4 events, by 30°; check its pose" in status.reason
     assert status_of(fusion, "north", 80).state is ArrayState.HEALTHY
     assert estimator.suspect[-1] == {"east"}  # the fourth event
-    assert "east" not in estimator.calls[-2]  # its windows go without who is doubted, its answer does not
+    assert "east" not in estimator.calls[-2]  # updates leave out suspect arrays, events do not
     assert "east" in estimator.calls[-1]
     estimator.outliers = {}
     for turn in range(4, 7):
@@ -1014,7 +1014,7 @@ def test_repeated_outlier_is_named_becomes_suspect_and_is_cleared() -> None:
 
 
 class Choosing(Voting):
-    """An estimator that needs no more than two arrays, and asks all of these."""
+    """An estimator that needs no more than two arrays, which agree."""
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         return replace(super().locate(sounds), unneeded={"north"}, outliers={})
@@ -1075,7 +1075,7 @@ class Duet(Scripted):
         return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
 
     def listener(self, array: str, sample_rate_hz: float) -> Any:
-        return Ear([])
+        return FrontEnd([])
 
 
 def test_each_of_two_sources_gives_an_event() -> None:

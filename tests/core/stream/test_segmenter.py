@@ -1,4 +1,4 @@
-"""From sample to message: one for every frame index, in order, and no sound lost at its beginning or its end."""
+"""Samples become messages: one for every frame index, in order, and no sound is lost at its beginning or end."""
 
 from __future__ import annotations
 

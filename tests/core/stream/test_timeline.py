@@ -25,7 +25,7 @@ def ideal_ns(index: int, rate_hz: float = RATE_HZ, start_ns: int = START_NS, ppm
 
 
 def numbered(first: int, count: int) -> Float32Array:
-    """Two channels that tell which sample is which: float32 counts exactly to 16 million."""
+    """Two channels that number the samples; float32 counts exactly to 16 million."""
     index = np.arange(first, first + count, dtype=np.float32)
     return np.stack([index, -index])
 

@@ -215,7 +215,7 @@ def direction(time_s: float, position_m: ArrayLike) -> Estimate:
 
 @pytest.mark.parametrize("back_m", [0.6, 1.6])
 def test_source_that_turns_round_in_a_pause_keeps_its_track(back_m: float) -> None:
-    """After 0.7 s the prediction has gone 0.7 m on: 0.6 m back it is 1.3 m off, and who walked is found again."""
+    """The prediction has moved on by 0.7 m after 0.7 s; 0.6 m back it is 1.3 m off, and the source is found again."""
     tracker = Tracker()
     path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
     follow(tracker, [path])

@@ -1,4 +1,4 @@
-"""Arrays that did not find a sound are asked for it, offline and live alike; and old nodes work as ever."""
+"""Frames are requested from arrays that did not detect a sound, offline and live alike; old nodes work as before."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from small_site import RATE_HZ, running_server, scene, site_of
 START_NS = 1_767_225_600_000_000_000
 SOUNDS = 4
 WEAKER_DB = 39.0
-"""So much lower, a burst of noise lies a little above the microphones' noise, and below what is taken for sound."""
+"""Attenuation in dB at which a burst is a little above the microphones' noise, and below the level of sound."""
 
 NODES: dict[str, Any] = {
     "nodes": {
@@ -55,7 +55,7 @@ def recorded(array: str) -> Any:
 
 
 def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[Part]:
-    """North hears the scene, so many times, well; south, whose clock may be ahead, faintly."""
+    """The scene, `times` in a row, strong at north and faint at south, whose clock may be ahead."""
     begin = {"north": start_ns, "south": start_ns + ahead_ns}
     heard = {name: np.tile(recorded(name), (1, times)) for name in begin}
     return [
@@ -104,7 +104,7 @@ def test_methods_without_onsets_request_nothing() -> None:
 
 
 class Live:
-    """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
+    """Two nodes and the two passes of a server; requested frames arrive `way` batches after the request."""
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ def test_requested_frames_are_awaited_for_a_limited_time() -> None:
 
 
 def test_requests_use_the_frame_indices_of_the_arrays_own_clock() -> None:
-    """Nobody can know the offset before three sounds that both heard; here it is known already."""
+    """The offset is usually known only after three sounds that both arrays detect; here it is known from the start."""
     ahead_ns = 150_000_000
     clocks = make_clock_offsets(site())
     for k in range(3):
@@ -268,7 +268,7 @@ def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -
 
 
 def test_event_that_became_final_while_frames_were_awaited_is_not_reported_again() -> None:
-    """A node stood still: its sound comes after the live event has asked it, and before it answers."""
+    """A node stood still: its sound comes after the early pass has requested frames, and before they come."""
     loud = [
         replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
         for part in parts()
