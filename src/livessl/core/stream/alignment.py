@@ -65,6 +65,10 @@ class Alignment:
 
     # --- messages
 
+    def begin_step(self, now_ns: int) -> None:
+        """Begin a step at a site time."""
+        self.now_ns = now_ns
+
     def on_joint_index(self, message: Message) -> Message | None:
         """Return a message with the joint frame index instead of its array's own; None where the array is unknown."""
         stream = self.streams.get(message.array)
@@ -115,7 +119,7 @@ class Alignment:
         if not self._reached or frame_index > self._reached[-1][0]:
             self._reached.append((frame_index, self.now_ns))
         if (self._reached[-1][0] - frame_index) * FRAME_S < self._deadline_s:
-            stream.keeps_up = True
+            stream.catch_up()
         if self.next is None:
             self.next = frame_index
 
@@ -127,6 +131,10 @@ class Alignment:
             return None
         newest = self._newest()
         return newest if newest - self.next > JUMP_FRAMES else None
+
+    def note_reported(self, until: int) -> None:
+        """Take it that all sound before a frame index has been reported."""
+        self.reported_until = until
 
     def skip_to(self, frame_index: int) -> None:
         """Go on with a frame index, without closing those before it."""
@@ -143,7 +151,7 @@ class Alignment:
     def await_nobody(self) -> None:
         """Take it that no array catches up: at the end of a recording."""
         for stream in self.streams.values():
-            stream.keeps_up = False
+            stream.fall_behind()
 
     def is_everyone_silent(self) -> bool:
         """Return whether no array has sent anything for a deadline and a hang-over."""
@@ -169,7 +177,7 @@ class Alignment:
         if self.now_ns - first_ns < self._deadline_s * 1e9:
             return False
         for stream in late:
-            stream.keeps_up = False
+            stream.fall_behind()
             stream.health.note_late(self.now_ns)
         return True
 
@@ -214,7 +222,7 @@ class Alignment:
     def leave(self, array: str) -> None:
         """Wait no longer for an array whose node has ended on purpose."""
         if array in self.streams:
-            self.streams[array].has_left = True
+            self.streams[array].leave()
 
     def status(self, now_ns: int, *, levels: bool) -> list[ArrayStatus]:
         """Return the status of every array; without `levels` it has no channel powers. Any thread may call it."""

@@ -44,6 +44,18 @@ class ArrayStream:
         self.last_message_ns, self.has_left = now_ns, False
         self.watermark = frame_index if self.watermark is None else max(self.watermark, frame_index)
 
+    def catch_up(self) -> None:
+        """Take it that the array keeps up with the others, and can be awaited."""
+        self.keeps_up = True
+
+    def fall_behind(self) -> None:
+        """Take it that the array does not keep up, and await it no longer."""
+        self.keeps_up = False
+
+    def leave(self) -> None:
+        """Take it that the array's node has ended on purpose."""
+        self.has_left = True
+
     def add(self, frame: Frame) -> None:
         """Add a frame. If its sampling rate is new, it comes from another device, and what came before is discarded."""
         if frame.sample_rate_hz != self.sample_rate_hz:
@@ -92,6 +104,14 @@ class ArrayStream:
                 self.watermark -= more
             self.discard_correlations()
         return more
+
+    def begin_correlations(self, *, from_upcoming: bool = False) -> None:
+        """Begin the correlations of a sound anew, or with those that were made ahead for it."""
+        self.correlations = self.upcoming if from_upcoming else Correlations()
+
+    def begin_upcoming(self) -> None:
+        """Begin the correlations for the next sound anew."""
+        self.upcoming = Correlations()
 
     def discard_correlations(self) -> None:
         """Discard all correlations of the frames."""

@@ -72,9 +72,9 @@ class EventReporter:
         if event.state is EventState.OPEN:
             self._locate(event)  # it was cut short
         elif event.state is EventState.AWAITING_BACKFILL:
-            event.results = (
-                () if self._is_skipped(event) else self._backfill.reconsidered(event, self._alignment.now_ns)
-            )
+            is_skipped = self._is_skipped(event)
+            results = () if is_skipped else self._backfill.reconsidered(event, self._alignment.now_ns)
+            event.set_results(results, event.excerpt)
         event.report()
         return event.results
 
@@ -97,7 +97,7 @@ class EventReporter:
         if not excerpt.sounds:
             return
         verdict = self._verdicts.event(event, excerpt, self._alignment.now_ns)
-        event.excerpt, event.results = excerpt, verdict.events
+        event.set_results(verdict.events, excerpt)
         if event.became_quiet and len(verdict.events) == 1:
             self._learn(verdict.events[0], span)
         self._verdicts.count_votes(event, excerpt, verdict)

@@ -17,7 +17,6 @@ from livessl.core.locate.estimators import Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_stream import ArrayStream
-from livessl.core.stream.correlation_cache import Correlations
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, FloatArray, Frame
 
@@ -188,7 +187,7 @@ class EvidenceCollector:
                 stream.upcoming.has(k for k in span if k in stream.frames) for stream in streams
             )
             for stream in streams:
-                stream.correlations = stream.upcoming if is_ready else Correlations()
+                stream.begin_correlations(from_upcoming=is_ready)
             if not is_ready:
                 self._correlate(streams, span)
         self._ahead = None
@@ -221,7 +220,7 @@ class EvidenceCollector:
         streams = self._alignment.streams.values()
         if frame_index == begin:
             for stream in streams:
-                stream.upcoming = Correlations()
+                stream.begin_upcoming()
         elif self._ahead != range(begin, frame_index):
             return
         self._cache.extend(((stream.spec.name, stream.upcoming, stream.frames) for stream in streams), [frame_index])
@@ -294,7 +293,7 @@ class EvidenceCollector:
         if not segments:
             return
         if not stream.correlations.has(there) and stream.has_samples(there):  # some frames came late
-            stream.correlations = Correlations()
+            stream.begin_correlations()
             self._correlate([stream], span)
         name, end = stream.spec.name, frame_indices[-1] + 1
         excerpt.sounds.add(name, segments, stream.correlations.at(range(span.start, end)))

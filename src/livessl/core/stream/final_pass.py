@@ -133,7 +133,7 @@ class TwoPassFusion:
         self._early.leave(array)
         self._state.can_backfill.discard(array)
         if array in self._receptions:
-            self._receptions[array].has_left = True
+            self._receptions[array].leave()
 
     def exclude(self, arrays: Collection[str]) -> None:
         """Exclude these arrays from now on, and include all others again: see `SiteState.exclude`."""

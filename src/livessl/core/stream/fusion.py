@@ -129,7 +129,7 @@ class Fusion:
 
     def begin(self, frame_index: int) -> None:
         """Take it that all sound before a frame index has been reported."""
-        self._alignment.reported_until = frame_index
+        self._alignment.note_reported(frame_index)
 
     def leave(self, array: str) -> None:
         """Wait no longer for an array whose node has ended on purpose."""
@@ -155,7 +155,7 @@ class Fusion:
         outputs = self._start_over() if self._alignment.is_set_back(now_ns) else []
         if not self._role.learns_clocks and self._event is None:
             self._correct_clocks()
-        self._alignment.now_ns = now_ns
+        self._alignment.begin_step(now_ns)
         self._take(messages)
         if complete_until is not None:
             self._alignment.advance(complete_until)
@@ -169,7 +169,7 @@ class Fusion:
 
     def flush(self, now_ns: int) -> list[Output]:
         """Report everything without waiting for any array, at the end of a recording."""
-        self._alignment.now_ns = now_ns
+        self._alignment.begin_step(now_ns)
         self._alignment.await_nobody()
         outputs = self._close_ready()
         return outputs if self._event is None else outputs + self._report(self._event)
@@ -183,7 +183,7 @@ class Fusion:
                 if self._event is not None:
                     self._reporter.take(self._event, message)
             elif self._alignment.accept(message) and self._event is not None:
-                self._event.late_frames += 1
+                self._event.note_late_frame()
 
     def _start_over(self) -> list[Output]:
         outputs = [] if self._event is None else self._report(self._event)
@@ -279,7 +279,7 @@ class Fusion:
         """Report an event now, with the frames that have come."""
         results = self._reporter.report(event)
         self._event = None
-        self._alignment.reported_until = event.last_active + 1
+        self._alignment.note_reported(event.last_active + 1)
         if event.became_quiet:
             self._correct_clocks()
         return [*results]

@@ -103,10 +103,18 @@ class PendingEvent:
         if active:
             self.last_active = frame_index
 
+    def note_late_frame(self) -> None:
+        """Count an active frame that came after its frame index had closed."""
+        self.late_frames += 1
+
     def end(self, *, became_quiet: bool) -> None:
         """End the sound."""
         self._go_to(EventState.ENDED)
         self.became_quiet = became_quiet
+
+    def set_results(self, results: Sequence[Event], excerpt: Excerpt | None) -> None:
+        """Set its results and the excerpt that they were located from."""
+        self.results, self.excerpt = results, excerpt
 
     def await_backfill(self, requested: Mapping[str, RequestedFrames], now_ns: int) -> None:
         """Wait for frames that were requested now."""

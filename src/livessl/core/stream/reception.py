@@ -54,6 +54,10 @@ class Reception:
             self.live_until = later(self.live_until, self.live_from - 1)
             self.backlog_until = None
 
+    def leave(self) -> None:
+        """Note that its node has ended on purpose."""
+        self.has_left = True
+
     def touch(self, now_ns: int) -> None:
         """Note that its node has sent something."""
         self.last_message_ns, self.has_left = now_ns, False
