@@ -7,7 +7,7 @@ import sys
 import numpy as np
 
 import recordings as r
-from livessl.simulate.scene import NamedSound, read_sounds, synthesised_sounds
+from livessl.simulation.scene import NamedSound, read_sounds, synthesised_sounds
 
 SEEDS = range(100, 110)
 COUNT = 16

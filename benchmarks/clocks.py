@@ -21,10 +21,10 @@ from livessl.clock import UnpacedClock
 from livessl.core.stream.clock_offsets import ClockOffset
 from livessl.core.types import Block, Event, Output, Status
 from livessl.lab.demo import SITE_FILE
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import Placed, WavRecording
-from livessl.simulate.scene import Scene, make_scene, read_sounds, render
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import FileRecording
+from livessl.simulation.scene import Scene, make_scene, read_sounds, render
 from livessl.site.build.fusion import make_fusion
 from livessl.site.load import load_site
 from livessl.site.models import Site
@@ -41,7 +41,7 @@ NEAR_M: Final = 0.5
 class Drifting:
     """A recording by a node whose clock gains: its blocks are stamped by it."""
 
-    once: WavRecording
+    once: FileRecording
     drift_ppm: float
 
     def __getattr__(self, name: str) -> Any:
@@ -90,16 +90,16 @@ def heard_with(
     late = list(paths)[-1]
     parts = []
     for array, path in paths.items():
-        recording = WavRecording(path)
+        recording = FileRecording(path)
         start_ns = START_NS
         if array == late:
             start_ns += round(offset_s * 1e9)
-        placed = Placed(Drifting(recording, drift_ppm if array == late else 0.0), start_ns)
-        parts.append(Part(array, placed, tuple(range(1, 5))))
+        drifting = Drifting(recording, drift_ppm if array == late else 0.0)
+        parts.append(AssignedRecording(array, drifting, start_ns, tuple(range(1, 5))))
     fusion = make_fusion(site, updates=False, corrects_clocks=corrected)
     outputs: list[Output] = []
     now_ns = 0
-    for now_ns, batch in played_messages(*pipelines_of(site, parts), UnpacedClock()):
+    for now_ns, batch in paced_messages(*make_pipelines(site, parts), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     outputs += fusion.flush(now_ns)
     known = {status.name: status.clock_offset for status in fusion.status(now_ns)}

@@ -20,11 +20,11 @@ from livessl.core.correlate.spectra import Spectra
 from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
 from livessl.lab.evaluate.campaign import read_clips
-from livessl.lab.evaluate.command import HALVES
 from livessl.lab.evaluate.localizer import LEAD_S, PRE_ROLL_FRAMES, _active
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M, pair
+from livessl.lab.evaluate.scenarios import HALVES
 from livessl.lab.evaluate.unit import PEAK, convolved
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 RATE_HZ: Final = 16000.0
 FRAME: Final = 800

@@ -4,7 +4,7 @@
 
 prints the error and the time of an answer for each number of arrays that may have a part in it
 (`livessl.core.locate.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
-docs/decisions/0027-sixteen-clearest-arrays.md.
+docs/performance/experiments.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from livessl.core.locate.estimators import ESTIMATORS
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
 from livessl.lab.bench import load
 from livessl.lab.evaluate.localizer import heard
-from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
+from livessl.simulation.scene import Scene, Source, render, synthesised_sounds
 from livessl.site.build.grid import search_grid
 from livessl.site.load import parse_site
 from livessl.site.models import Site

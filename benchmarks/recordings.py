@@ -22,9 +22,9 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event, Float32Array, FloatArray
 from livessl.lab.demo import SITE_FILE
-from livessl.recordings.assign import Part, parts_from_wavs
-from livessl.recordings.recording import ArrayRecording, Placed
-from livessl.simulate.scene import NamedSound, make_scene, read_sounds, render
+from livessl.recordings.assign import AssignedRecording, assign_files
+from livessl.recordings.recording import MemoryRecording
+from livessl.simulation.scene import NamedSound, make_scene, read_sounds, render
 from livessl.site.load import load_site, parse_site
 from livessl.site.models import Site
 
@@ -56,7 +56,7 @@ class Found:
     mahalanobis2: float | None
 
 
-def events_in(site: Site, parts: Sequence[Part], method: str | None = None) -> list[Event]:
+def events_in(site: Site, parts: Sequence[AssignedRecording], method: str | None = None) -> list[Event]:
     """Everything that the pipeline finds, by the site's method or another."""
     outputs = offline.run(site, parts, UnpacedClock(), method=method)
     return [output for output in outputs if isinstance(output, Event)]
@@ -77,7 +77,7 @@ def field_errors_m(method: str | None = None) -> dict[str, list[float]]:
     site = parse_site(yaml.safe_dump(FIELD))
     errors: dict[str, list[float]] = {}
     for file in sorted((DATA / "epo4_room_5mic").glob("*.wav")):
-        parts = parts_from_wavs(site, {"field": file}, {"field": FIELD_CHANNELS})
+        parts = assign_files(site, {"field": file}, {"field": FIELD_CHANNELS})
         events = events_in(site, parts, method)
         places = [event.estimate.position_m[:2] for event in events if event.estimate is not None]
         errors[file.name] = [float(np.linalg.norm(place - field_truth_m(file))) for place in places]
@@ -135,7 +135,7 @@ def simulated(sounds: Sequence[NamedSound], rt60_s: float, seeds: Sequence[int],
         parts = []
         for number, spec in enumerate(site.specs):
             samples = render(scene, spec.microphones_m, seed=seed + 1 + number)
-            parts.append(Part(spec.name, Placed(ArrayRecording("scene", 44100.0, samples), 0), (1, 2, 3, 4)))
+            parts.append(AssignedRecording(spec.name, MemoryRecording("scene", 44100.0, samples), 0, (1, 2, 3, 4)))
         events = events_in(site, parts)
         used = set()
         for source in scene.sources:
@@ -176,6 +176,6 @@ def _played_in(responses: Float32Array, sounds: Sequence[Float32Array], rate_hz:
 
 def _azimuths_deg(site: Site, samples: Float32Array, rate_hz: float, method: str | None) -> list[float]:
     """Azimuth of every event, as the array sees it."""
-    recording = ArrayRecording("recorded", rate_hz, samples)
-    part = Part("array", Placed(recording, 0), tuple(range(1, len(samples) + 1)))
+    recording = MemoryRecording("recorded", rate_hz, samples)
+    part = AssignedRecording("array", recording, 0, tuple(range(1, len(samples) + 1)))
     return [event.contributions[0].azimuth_deg for event in events_in(site, [part], method)]

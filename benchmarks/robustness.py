@@ -25,8 +25,8 @@ from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BoolArray, Float32A
 from livessl.lab.evaluate.campaign import read_clips
 from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
 from livessl.lab.evaluate.unit import convolved
-from livessl.simulate.moving import place_on_way, render_moving
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.moving import place_on_way, render_moving
+from livessl.simulation.room import impulse_responses
 
 RATE_HZ: Final = 16000.0
 FRAME: Final = round(FRAME_S * RATE_HZ)

@@ -22,16 +22,16 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event, Status
 from livessl.lab.demo import SITE_FILE
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import Placed, WavRecording
-from livessl.simulate.scene import Scene, render
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import FileRecording
+from livessl.simulation.scene import Scene, render
 from livessl.site.load import load_site
 from livessl.site.models import Site
 
 LOWER_DB: Final = (0.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
-def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) -> list[Part]:
+def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) -> list[AssignedRecording]:
     """The arrays' recordings, the last one's sounds so much lower."""
     cache.mkdir(parents=True, exist_ok=True)
     paths = {}
@@ -42,7 +42,9 @@ def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) 
             weaker = replace(scene, level_dbfs=scene.level_dbfs - lower)
             samples = render(weaker, spec.microphones_m, seed=number + 1)
             soundfile.write(path, samples.T, round(RATE_HZ), subtype="FLOAT")
-    return [Part(array, Placed(WavRecording(path), START_NS), tuple(range(1, 5))) for array, path in paths.items()]
+    return [
+        AssignedRecording(array, FileRecording(path), START_NS, tuple(range(1, 5))) for array, path in paths.items()
+    ]
 
 
 def figures(scene: Scene, events: list[Event]) -> dict[str, int]:
@@ -77,7 +79,7 @@ def main() -> None:
                 scene = replace(scene_of(site, a.sounds, a.rt60, 0.8, seed), noise_dbfs=a.noise_dbfs)
                 name = f"{a.sounds}-{a.rt60:g}-{seed}{a.noise_dbfs:g}"
                 parts = parts_of(site, scene, a.cache, name, lower_db)
-                outputs = offline.run(site, parts, UnpacedClock(), ask=ask)
+                outputs = offline.run(site, parts, UnpacedClock(), backfill=ask)
                 total += Counter(figures(scene, [output for output in outputs if isinstance(output, Event)]))
             print(json.dumps({"lower_db": lower_db, "ask": ask, **total}), flush=True)
 

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Sets up .venv in this checkout: sh scripts/setup.sh [EXTRAS], where EXTRAS is empty or as in `pip install -e '.[dev]'`.
-# Does nothing when nothing has changed since the last time.
+# Sets up .venv in this checkout: sh scripts/setup.sh [EXTRAS], where EXTRAS is empty or names extras of pyproject.toml
+# as in `pip install -e '.[dev]'`. Does nothing if nothing has changed since the last time.
 set -eu
 cd "$(dirname "$0")/.."
 extras=${1-}
@@ -18,7 +18,7 @@ apt_get() {
     fi
 }
 
-# Prints "MAJOR MINOR PATH" of a Python that is new enough, or nothing.
+# Prints "MAJOR MINOR PATH" if a Python is new enough, and nothing otherwise.
 version_of() {
     "$1" -c 'import sys
 if sys.version_info >= (3, 11):
@@ -36,15 +36,16 @@ make_venv() {
     [ -n "$python" ] || fail "expected Python 3.11 or newer, got $(python3 --version 2>&1 || true); install it: apt install python3 python3-venv"
     if ! "$python" -c 'import venv; from ensurepip import version' 2>/dev/null; then
         package=$("$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')
-        say "setup: installing $package, without which $python cannot make virtual environments"
+        say "setup: installing $package, which $python needs to make virtual environments"
         { apt_get update && apt_get install -y --no-install-recommends "$package"; } ||
-            fail "$python cannot make virtual environments; install what it lacks: sudo apt install $package"
+            fail "$python cannot make virtual environments without $package; run: sudo apt install $package"
     fi
     say "setup: making .venv with $("$python" --version)"
     "$python" -m venv --clear .venv
 }
 
-# A moved or copied environment still points to where it was made, and so does one whose Python is gone.
+# Checks that the environment was made in this place with a Python that still exists: a moved or copied environment
+# points to its old place.
 venv_is_ours() {
     [ -n "$(version_of .venv/bin/python)" ] && grep -qF "$PWD/.venv/bin/python" .venv/bin/pip 2>/dev/null
 }
@@ -53,12 +54,12 @@ checksum=$(cksum < pyproject.toml)
 stamp=.venv/livessl-setup
 if venv_is_ours; then
     case $(cat "$stamp" 2>/dev/null || true) in
-        "$checksum [$extras]" | "$checksum [dev]") exit 0 ;; # more extras serve those who ask for fewer
+        "$checksum [$extras]" | "$checksum [dev]") exit 0 ;; # `dev` includes all other extras
     esac
 else
     make_venv
 fi
 rm -f "$stamp"
-say "setup: installing livessl${extras:+ with $extras} and what it needs into .venv"
+say "setup: installing livessl${extras:+ with $extras} and its dependencies into .venv"
 .venv/bin/python -m pip install --quiet --quiet --disable-pip-version-check -e ".${extras:+[$extras]}"
 printf '%s\n' "$checksum [$extras]" > "$stamp"

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Sets livessl up with all that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
+# Installs livessl with everything that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
 set -eu
 cd "$(dirname "$0")/.."
 packages="chromium libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl"
@@ -20,10 +20,10 @@ apt_get() {
 
 if [ -n "$missing" ]; then
     echo "test: installing$missing" >&2
-    # shellcheck disable=SC2086  # a list of words
+    # shellcheck disable=SC2086  # $missing is a list of words
     if ! { apt_get update && apt_get install -y --no-install-recommends $missing; }; then
-        echo "test: could not. Skipped are the tests of the dashboard in a browser without chromium, of the units in deploy/" >&2
-        echo "test: without systemd, of TLS without openssl, of a sound card without the others. To have them:" >&2
+        echo "test: installation failed. Tests that need a missing package are skipped: the dashboard in a browser (chromium)," >&2
+        echo "test: the units in deploy/ (systemd), TLS (openssl), a sound card (the others). To run them, first:" >&2
         echo "test: sudo apt-get install$missing" >&2
     fi
 fi
@@ -36,4 +36,5 @@ ruff check
 ruff format --check
 mypy
 lint-imports
-pytest "$@"
+python -c 'from livessl.core.locate.peak_search import warm_up; warm_up()' # compile once, not in every worker
+pytest -n 4 --dist loadfile "$@"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
@@ -17,10 +20,10 @@ import yaml
 
 from livessl.clock import SystemClock
 from livessl.core.types import Float32Array, Frame, Mark
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
-from livessl.simulate.scene import Scene, make_scene, render
+from livessl.simulation.scene import Scene, make_scene, render
 from livessl.site.load import parse_site
 from livessl.site.models import Site
 
@@ -47,6 +50,9 @@ SMALL: dict[str, Any] = {
 
 FIRST_RASTER = 999
 """A frame's frame index is its number beyond this, where a test does not say otherwise."""
+
+HANG_S = 100.0
+"""Seconds after which a test gives up waiting: on a slow and busy machine only a hang lasts so long."""
 
 Changes = dict[str, Any]
 """Dotted path to value; `...` takes the key away."""
@@ -119,10 +125,10 @@ def heard(array: str, count: int = 2) -> Float32Array:
     return render(scene(count), site_of().array(array).microphones_m, seed=3 + len(array))
 
 
-def scene_parts(start_ns: int, count: int = 2) -> list[Part]:
+def scene_recordings(start_ns: int, count: int = 2) -> list[AssignedRecording]:
     """The scene's recordings, begun at a site time."""
     return [
-        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard(name, count)), start_ns), (1, 2, 3, 4))
+        AssignedRecording(name, MemoryRecording(name, float(RATE_HZ), heard(name, count)), start_ns, (1, 2, 3, 4))
         for name in SMALL["arrays"]
     ]
 
@@ -141,12 +147,24 @@ def mark(sequence: int = 1, frame_index: int = 1000, array: str = "north", power
     return Mark(array, sequence, frame_index, power, power, (power,) * 4)
 
 
-def wait_until(condition: Callable[[], object], what: str, seconds: float = 10.0) -> None:
+def wait_until(condition: Callable[[], object], what: str, seconds: float = HANG_S) -> None:
     """Return as soon as `condition` holds; fail if it does not within some seconds."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds:g} s in vain: {what}"
         time.sleep(0.005)
+
+
+@contextmanager
+def started(*command: str | Path, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A process, ended with all that it has started when the context ends; options are those of `Popen`."""
+    process = subprocess.Popen([str(word) for word in command], text=True, start_new_session=True, **options)
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
 
 
 @contextmanager
@@ -159,5 +177,5 @@ def running_server(site: Site, method: str | None = None) -> Iterator[Server]:
         yield server
     finally:
         server.stop()
-        thread.join(timeout=10)
+        thread.join(timeout=HANG_S)
         assert not thread.is_alive(), "the server does not end"

@@ -20,10 +20,10 @@ from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
-from livessl.simulate.scene import render
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording
+from livessl.simulation.scene import render
 from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, running_server, scene, site_of
@@ -54,18 +54,18 @@ def recorded(array: str) -> Any:
     return render(weaker, site().array(array).microphones_m, seed=3 + len(array))
 
 
-def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[Part]:
+def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[AssignedRecording]:
     """The scene, `times` in a row, strong at north and faint at south, whose clock may be ahead."""
     begin = {"north": start_ns, "south": start_ns + ahead_ns}
     heard = {name: np.tile(recorded(name), (1, times)) for name in begin}
     return [
-        Part(name, Placed(ArrayRecording(name, float(RATE_HZ), heard[name]), begin[name]), (1, 2, 3, 4))
+        AssignedRecording(name, MemoryRecording(name, float(RATE_HZ), heard[name]), begin[name], (1, 2, 3, 4))
         for name in begin
     ]
 
 
 def offline_events(*, ask: bool = True, method: str | None = None, ahead_ns: int = 0) -> list[Event]:
-    outputs = offline.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), ask=ask, method=method)
+    outputs = offline.run(site(), parts(ahead_ns=ahead_ns), UnpacedClock(), backfill=ask, method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
 
@@ -115,7 +115,7 @@ class Live:
         ahead_ns: int = 0,
         clocks: ClockOffsets | None = None,
     ) -> None:
-        self.lines, self.placed = pipelines_of(site(), parts(ahead_ns=ahead_ns))
+        self.lines, self.inputs = make_pipelines(site(), parts(ahead_ns=ahead_ns))
         self.settling = make_two_pass_fusion(site(), ("north", "south"), live=True, clock_offsets=clocks)
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
@@ -125,7 +125,7 @@ class Live:
     def run(self) -> list[Output | FinalResults]:
         outputs: list[Output | FinalResults] = []
         coming: list[tuple[int, list[Message]]] = []
-        for k, (now_ns, batch) in enumerate(played_messages(self.lines, self.placed, UnpacedClock())):
+        for k, (now_ns, batch) in enumerate(paced_messages(self.lines, self.inputs, UnpacedClock())):
             answers = [message for due, messages in coming if due <= k for message in messages]
             coming = [entry for entry in coming if entry[0] > k]
             new = self.settling.step([*batch, *answers], now_ns)
@@ -195,13 +195,15 @@ def test_requests_use_the_frame_indices_of_the_arrays_own_clock() -> None:
 
 def test_nothing_is_requested_for_a_sure_event() -> None:
     loud = [
-        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        replace(
+            part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
+        )
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
     fusion.can_backfill.update({"north", "south"})
     outputs: list[Output] = []
-    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
+    for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
@@ -250,7 +252,7 @@ def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -
     """At four times real time, and as fast as it goes: longer than what a node remembers, or it could not forget."""
     times = 1 if speed else 4
     played = parts(times=times)
-    assert speed or played[0].placed.recording.duration_s > 2 * RECENT_S
+    assert speed or played[0].recording.duration_s > 2 * RECENT_S
     outputs = offline.run(site(), played, UnpacedClock())
     expected = [output for output in outputs if isinstance(output, Event)]
     assert [event.estimate and event.estimate.arrays for event in expected] == [("north", "south")] * SOUNDS * times
@@ -270,7 +272,9 @@ def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -
 def test_event_that_became_final_while_frames_were_awaited_is_not_reported_again() -> None:
     """A node stood still: its sound comes after the early pass has requested frames, and before they come."""
     loud = [
-        replace(part, placed=Placed(ArrayRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), START_NS))
+        replace(
+            part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
+        )
         for part in parts()
     ]
     settling = make_two_pass_fusion(site(), ("north", "south"), live=True)
@@ -279,7 +283,7 @@ def test_event_that_became_final_while_frames_were_awaited_is_not_reported_again
     held: list[Message] | None = []
     asked = False
     told: list[Output | FinalResults] = []
-    for now_ns, batch in played_messages(*pipelines_of(site(), loud), UnpacedClock()):
+    for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         if held is not None:
             held += [message for message in batch if message.array == "south"]
             batch = [message for message in batch if message.array == "north"]

@@ -1,4 +1,4 @@
-"""Instants as text, and clocks that wait."""
+"""Instants as text, and the waiting of clocks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_instant_of_a_text(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "now", "2026-01-31", "2026-01-31T12:00:00", "2026-13-01T00:00:00Z", "12:00Z"])
-def test_text_that_is_no_instant(text: str) -> None:
+def test_text_that_is_not_an_instant_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected RFC 3339 with an offset") as caught:
         utc_ns(text)
     assert repr(text) in str(caught.value)
@@ -50,7 +50,7 @@ def test_any_text_is_an_instant_or_a_value_error(text: str) -> None:
 
 @given(st.datetimes(min_value=datetime(1970, 1, 1), max_value=datetime(2262, 1, 1)))  # noqa: DTZ001 - bounds are naive
 @settings(deadline=None)
-def test_text_and_back_to_the_microsecond(moment: datetime) -> None:
+def test_instants_survive_the_text_form_to_the_microsecond(moment: datetime) -> None:
     microseconds = (moment.replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
     assert utc_ns(utc_text(microseconds * 1000)) == microseconds * 1000
     assert utc_text(microseconds * 1000 + 999) == utc_text(microseconds * 1000)  # rounded down, never into the future
@@ -65,7 +65,7 @@ def test_system_clock_is_utc_and_waits() -> None:
 
 
 @pytest.mark.parametrize("clock", [SystemClock(), PacedClock(100 * NS), UnpacedClock(100 * NS)])
-def test_what_is_past_is_not_waited_for(clock: SystemClock | PacedClock | UnpacedClock) -> None:
+def test_past_times_return_at_once(clock: SystemClock | PacedClock | UnpacedClock) -> None:
     began = time.monotonic()
     assert clock.sleep_until_ns(clock.now_ns() - NS)
     assert time.monotonic() - began < 0.5
@@ -82,7 +82,7 @@ def test_paced_clock_runs_at_its_speed() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
-def test_paced_clock_needs_a_speed(speed: float) -> None:
+def test_paced_clock_refuses_a_speed_that_is_not_positive(speed: float) -> None:
     with pytest.raises(ValueError, match="expected > 0"):
         PacedClock(0, speed)
 
@@ -96,8 +96,8 @@ def test_unpaced_clock_jumps_and_never_goes_back() -> None:
 
 
 @pytest.mark.parametrize("clock", [SystemClock(), PacedClock(0, speed=3600.0)])
-def test_long_waits_are_waited_for_in_pieces(clock: SystemClock | PacedClock) -> None:
-    """So that who waits for an hour can be stopped within a moment."""
+def test_single_sleeps_are_short(clock: SystemClock | PacedClock) -> None:
+    """A caller that waits for an hour can thus be stopped within a moment."""
     began = time.monotonic()
     assert not clock.sleep_until_ns(clock.now_ns() + 3600 * NS)
     assert LONGEST_SLEEP_S <= time.monotonic() - began < 5 * LONGEST_SLEEP_S

@@ -15,12 +15,11 @@ from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset, ClockOffsets
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
-from livessl.recordings.assign import pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import Placed
+from livessl.recordings.assign import make_pipelines
+from livessl.recordings.play import paced_messages
 from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
-from small_site import RATE_HZ, scene, scene_parts, site_of
+from small_site import RATE_HZ, scene, scene_recordings, site_of
 
 START_NS = 1_767_225_600_000_000_000
 SOUNDS = 8
@@ -44,10 +43,10 @@ def batches(ahead_s: float) -> Batches:
     """The messages of two nodes, the second with its clock ahead, and when they come."""
     ahead_ns = round(ahead_s * 1e9)
     parts = [
-        replace(part, placed=Placed(part.placed.recording, START_NS + ahead_ns * (part.array == "south")))
-        for part in scene_parts(START_NS, SOUNDS)
+        replace(part, recording=part.recording, start_ns=START_NS + ahead_ns * (part.array == "south"))
+        for part in scene_recordings(START_NS, SOUNDS)
     ]
-    return list(played_messages(*pipelines_of(site(), parts), UnpacedClock()))
+    return list(paced_messages(*make_pipelines(site(), parts), UnpacedClock()))
 
 
 def located(ahead_s: float) -> tuple[list[Event], ArrayStatus]:

@@ -1,4 +1,4 @@
-"""Arrays of one device processed as one array of all their microphones, and what may not be."""
+"""Joint arrays: several arrays of one device are processed as one array of all their microphones."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import Block, Event, Float32Array, Frame, Mark
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.recording import ArrayRecording, Placed, Spliced
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.recording import MemoryRecording, SplicedRecording, TimedRecording
 from livessl.recordings.session import read_session
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
@@ -30,7 +30,7 @@ from small_site import (
     hiss,
     running_server,
     scene,
-    scene_parts,
+    scene_recordings,
     site_of,
     wait_until,
     write_site,
@@ -42,10 +42,11 @@ NODELESS: Changes = {**JOINT, "nodes": {}}
 START_NS = 1_767_225_600_000_000_000
 
 NEAR_M = 0.5 * 343.0 / RATE_HZ
-"""Way of half a sample: what delays rounded to samples would err by. Ours are finer, and there is no reverberation."""
+"""Path of sound, in metres, in half a sample: the error of delays rounded to samples. Ours are finer, without
+reverberation."""
 
 
-def events_of(site: Site, parts: Sequence[Part]) -> list[Event]:
+def events_of(site: Site, parts: Sequence[AssignedRecording]) -> list[Event]:
     return [o for o in offline.run(site, parts, UnpacedClock(START_NS)) if isinstance(o, Event)]
 
 
@@ -53,9 +54,9 @@ def eight() -> Float32Array:
     return np.concatenate([heard("north"), heard("south")])
 
 
-def whole(array: str = "both") -> Part:
+def whole(array: str = "both") -> AssignedRecording:
     """The scene as one recording of eight channels."""
-    return Part(array, Placed(ArrayRecording("eight", float(RATE_HZ), eight()), START_NS), tuple(range(1, 9)))
+    return AssignedRecording(array, MemoryRecording("eight", float(RATE_HZ), eight()), START_NS, tuple(range(1, 9)))
 
 
 def site_of_eight() -> Site:
@@ -74,7 +75,7 @@ def distances_m(events: Sequence[Event]) -> list[float]:
 
 
 def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
-    """All that an event says, to the last bit."""
+    """Return all fields of an event as exact values."""
     told: list[tuple[Any, ...]] = []
     for event in events:
         assert event.estimate is not None
@@ -84,39 +85,39 @@ def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
     return told
 
 
-def test_joint_arrays_are_one_array_of_all_their_microphones_to_the_last_bit() -> None:
-    joint = events_of(site_of(JOINT), scene_parts(START_NS))
+def test_joint_arrays_give_exactly_the_events_of_one_array() -> None:
+    joint = events_of(site_of(JOINT), scene_recordings(START_NS))
     assert [event.heard_by for event in joint] == [("both",), ("both",)]
     assert max(distances_m(joint)) < NEAR_M
     assert facts(joint) == facts(events_of(site_of_eight(), [whole()]))
-    summed = events_of(site_of(), scene_parts(START_NS))
+    summed = events_of(site_of(), scene_recordings(START_NS))
     assert [event.heard_by for event in summed] == [("north", "south")] * 2
     assert [fact[0] for fact in facts(summed)] != [fact[0] for fact in facts(joint)]
 
 
-def test_a_millisecond_between_the_arrays_is_another_place_for_joint_ones_only() -> None:
-    """What one clock is needed for: a summed pair of arrays does not notice."""
-    north, south = scene_parts(START_NS)
+def test_an_offset_of_a_millisecond_moves_the_events_of_joint_arrays_only() -> None:
+    """Joint arrays therefore need one clock; arrays whose maps are summed do not."""
+    north, south = scene_recordings(START_NS)
     shifted = np.roll(heard("south"), RATE_HZ // 1000, axis=1)
-    late = replace(south, placed=Placed(ArrayRecording("south", float(RATE_HZ), shifted), START_NS))
+    late = replace(south, recording=MemoryRecording("south", float(RATE_HZ), shifted), start_ns=START_NS)
     assert max(distances_m(events_of(site_of(), [north, late]))) < NEAR_M
     assert min(distances_m(events_of(site_of(JOINT), [north, late]))) > 10 * NEAR_M
 
 
-def test_a_third_array_stays_alone() -> None:
+def test_array_outside_the_joint_one_stays_separate() -> None:
     third: Changes = {"arrays.west": {"geometry": {"tetrahedron": {"edge_m": 0.2}}, "position_m": [0.5, 2.6, 1.1]}}
     site = site_of({**JOINT, **third})
     assert [(spec.name, len(spec.microphones_m)) for spec in site.processed] == [("west", 4), ("both", 8)]
     assert [spec.name for spec in site.specs] == ["north", "south", "west"]
 
 
-def test_a_line_hears_them_as_one() -> None:
-    """What is heard by one of them is sound of all eight channels: one mask for all."""
+def test_pipeline_detects_activity_of_joint_arrays_together() -> None:
+    """Activity on one of them activates all eight channels."""
     samples = hiss(2.0, 8, level=1e-4)
     samples[4:, RATE_HZ : RATE_HZ + 3200] += hiss(0.2, 4, seed=1, level=0.2)  # at the southern ones only
-    line = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
-    assert line.arrays == ["both"]
-    made = line.push(Block(0, samples, START_NS)) + line.flush()
+    pipeline = make_pipeline(site_of(JOINT), {"south": [8, 7, 6, 5], "north": [1, 2, 3, 4]}, float(RATE_HZ))
+    assert pipeline.arrays == ["both"]
+    made = pipeline.push(Block(0, samples, START_NS)) + pipeline.flush()
     assert {message.array for message in made} == {"both"}
     frames = [message for message in made if isinstance(message, Frame)]
     assert len([frame for frame in frames if frame.active]) == 4
@@ -128,52 +129,52 @@ def test_a_line_hears_them_as_one() -> None:
     assert levels == 8
 
 
-def refusal(site: Site, parts: Sequence[Part]) -> str:
+def refusal(site: Site, parts: Sequence[AssignedRecording]) -> str:
     with pytest.raises(DeviceError) as caught:
-        pipelines_of(site, parts)
+        make_pipelines(site, parts)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def test_recordings_that_did_not_begin_together() -> None:
-    north, south = scene_parts(START_NS)
-    later = replace(south, placed=replace(south.placed, start_ns=START_NS + 62_500))  # a sample
+def test_recordings_with_different_starts_are_refused() -> None:
+    north, south = scene_recordings(START_NS)
+    later = replace(south, start_ns=START_NS + 62_500)  # a sample
     assert refusal(site_of(JOINT), [north, later]) == (
-        "array 'both': joint processing expects recordings of one beginning, length and sampling rate, got north (0 s, "
-        "5.3 s, 16000 Hz), south (6.25e-05 s, 5.3 s, 16000 Hz); record them through one device, or take joint.both away"
-    ).replace("5.3", f"{north.placed.recording.duration_s:g}")
+        "array 'both': joint processing expects recordings of one start, length and sampling rate, got north (0 s, "
+        "5.3 s, 16000 Hz), south (6.25e-05 s, 5.3 s, 16000 Hz); record them through one device, or remove joint.both"
+    ).replace("5.3", f"{north.recording.duration_s:g}")
 
 
-def test_recordings_of_different_length() -> None:
-    north, south = scene_parts(START_NS)
-    short = ArrayRecording("south", float(RATE_HZ), heard("south")[:, :-1])
-    said = refusal(site_of(JOINT), [north, replace(south, placed=Placed(short, START_NS))])
-    assert "expects recordings of one beginning, length and sampling rate" in said
+def test_recordings_of_different_lengths_are_refused() -> None:
+    north, south = scene_recordings(START_NS)
+    short = MemoryRecording("south", float(RATE_HZ), heard("south")[:, :-1])
+    said = refusal(site_of(JOINT), [north, replace(south, recording=short, start_ns=START_NS)])
+    assert "expects recordings of one start, length and sampling rate" in said
 
 
-def test_array_without_a_recording() -> None:
-    said = refusal(site_of(JOINT), scene_parts(START_NS)[:1])
+def test_missing_recording_of_a_member_is_refused() -> None:
+    said = refusal(site_of(JOINT), scene_recordings(START_NS)[:1])
     assert said == (
         "array 'both': joint processing expects a recording of each of north, south, got none of 'south'; add it, or "
-        "take joint.both away"
+        "remove joint.both"
     )
 
 
-def test_recording_of_all_and_of_one_besides() -> None:
-    said = refusal(site_of(JOINT), [whole(), scene_parts(START_NS)[0]])
-    assert said == "array 'both': expected its recording or 'north''s, got both; take one away"
+def test_recording_of_the_joint_array_and_of_a_member_is_refused() -> None:
+    said = refusal(site_of(JOINT), [whole(), scene_recordings(START_NS)[0]])
+    assert said == "array 'both': expected a recording of it or of 'north', got both; leave one out"
 
 
-def test_files_of_nobody_knows_which_device() -> None:
-    said = refusal(site_of(NODELESS), scene_parts(START_NS))
+def test_files_without_a_node_are_not_taken_for_one_device() -> None:
+    said = refusal(site_of(NODELESS), scene_recordings(START_NS))
     assert said == (
         "array 'both': joint processing expects arrays sampled by one clock, got 'north' by north, 'south' by south; "
         "record them through one device, or let their maps be summed instead"
     )
 
 
-def test_one_recording_of_all_needs_no_node() -> None:
-    joint = facts(events_of(site_of(JOINT), scene_parts(START_NS)))
+def test_one_recording_of_all_members_needs_no_node() -> None:
+    joint = facts(events_of(site_of(JOINT), scene_recordings(START_NS)))
     assert facts(events_of(site_of(NODELESS), [whole()])) == joint
     parts = [
         replace(whole(name), channels=numbers) for name, numbers in (("north", (1, 2, 3, 4)), ("south", (5, 6, 7, 8)))
@@ -183,22 +184,22 @@ def test_one_recording_of_all_needs_no_node() -> None:
     assert facts(events_of(site_of(NODELESS), parts)) != joint
 
 
-def test_a_gap_in_one_recording_only() -> None:
-    def spliced(array: str, *cuts: tuple[float, float]) -> Part:
+def test_gap_in_one_recording_only_is_refused() -> None:
+    def spliced(array: str, *cuts: tuple[float, float]) -> AssignedRecording:
         samples = heard(array)
         stretches = [
-            Placed(
-                ArrayRecording(array, float(RATE_HZ), samples[:, round(first * RATE_HZ) : round(stop * RATE_HZ)]),
+            TimedRecording(
+                MemoryRecording(array, float(RATE_HZ), samples[:, round(first * RATE_HZ) : round(stop * RATE_HZ)]),
                 START_NS + round(first * 1e9),
             )
             for first, stop in cuts
         ]
-        return Part(array, Placed(Spliced(tuple(stretches)), START_NS), (1, 2, 3, 4))
+        return AssignedRecording(array, SplicedRecording(tuple(stretches)), START_NS, (1, 2, 3, 4))
 
     site, end_s = site_of(JOINT), heard("north").shape[1] / RATE_HZ
     torn = ((0.0, 0.3), (0.5, end_s))
     assert len(events_of(site, [spliced("north", *torn), spliced("south", *torn)])) == 2
-    with pytest.raises(DeviceError, match=r"north \+ south: expected recordings that run together .* 0\.300 s after"):
+    with pytest.raises(DeviceError, match=r"north \+ south: expected recordings whose samples match .* 0\.300 s after"):
         events_of(site, [spliced("north", *torn), spliced("south", (0.0, end_s))])
 
 
@@ -249,7 +250,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [piece.array for piece in read_session(session).pieces] == ["north", "south"]
     assert read_session(session).site().joint == {"both": ("north", "south")}
     capsys.readouterr()
-    # nothing but the grid of frames of 50 ms, which a recording's beginning may cut otherwise, is not the same
+    # only the 50 ms grid of frames may differ, because the recordings may begin elsewhere on it
     replayed = told(capsys, "replay", session, "--once", "--speed", "max")
     assert [event["arrays"] for event in replayed] == [["both"], ["both"]]
     for one, other in zip(replayed, joint, strict=True):
@@ -261,7 +262,7 @@ def test_sessions_hold_the_arrays_and_replay_joint_or_apart(files: Path, capsys:
     assert [event["position_m"] for event in again] == [event["position_m"] for event in replayed]
 
 
-def test_simulation_is_of_the_arrays_themselves(files: Path) -> None:
+def test_simulation_writes_the_members_not_the_joint_array(files: Path) -> None:
     arguments = [
         "simulate",
         "--site",
@@ -285,22 +286,22 @@ def test_check_counts_joint_microphones(files: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("both=north,west", r"site.yaml: joint.both.west: no such array; arrays are north, south"),
-        ("north=north,south", r"site.yaml: joint.north: expected another name"),
+        ("both=north,west", r"site.yaml: joint.both.west: expected one of the arrays north, south, got 'west'"),
+        ("north=north,south", r"site.yaml: joint.north: expected a name that no array has"),
     ],
 )
-def test_option_that_is_wrong(files: Path, capsys: pytest.CaptureFixture[str], option: str, said: str) -> None:
+def test_wrong_option_is_refused(files: Path, capsys: pytest.CaptureFixture[str], option: str, said: str) -> None:
     site = write_site(files)
     assert main(["locate", "--site", str(site), *wavs(files), "--joint", option]) == 2
     [complaint] = capsys.readouterr().err.splitlines()
     assert said in complaint
 
 
-def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> None:
+def test_server_accepts_a_joint_node_and_refuses_a_separate_one(files: Path) -> None:
     clock = SystemClock()
     with running_server(site_of(JOINT)) as server:
         endpoint = server.endpoint
-        arguments = (endpoint, scene_parts(START_NS), UnpacedClock(START_NS), clock)
+        arguments = (endpoint, scene_recordings(START_NS), UnpacedClock(START_NS), clock)
         with pytest.raises(UndeliveredError, match="array 'north' is joined in 'both' at the server; give node and"):
             send_session(site_of(), *arguments, "run-1", lambda: False)
         send_session(site_of(JOINT), *arguments, "run-2", lambda: False)
@@ -310,7 +311,7 @@ def test_server_hears_a_joint_node_and_refuses_one_that_is_not(files: Path) -> N
         image = httpx.get(f"{server.url}/api/v1/map", params={"array": "both"})
         unknown = httpx.get(f"{server.url}/api/v1/map", params={"array": "north"})
     for event, expected in zip(
-        read["events"]["events"][::-1], events_of(site_of(JOINT), scene_parts(START_NS)), strict=True
+        read["events"]["events"][::-1], events_of(site_of(JOINT), scene_recordings(START_NS)), strict=True
     ):
         assert expected.estimate is not None
         assert event["position_m"] == [round(float(x), 4) for x in expected.estimate.position_m]

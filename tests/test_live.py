@@ -25,7 +25,7 @@ from websockets.sync.client import connect
 
 from conftest import require
 from livessl.lab import demo
-from livessl.recordings.assign import TOGETHER_NS
+from livessl.recordings.assign import COMMON_START_NS
 
 ROOT = Path(__file__).parents[1]
 LIVESSL = [sys.executable, "-m", "livessl"]
@@ -43,7 +43,7 @@ COUNT = 4
 SEED = 3
 LIVE_TOLERANCE_M = 0.05
 NEAR_M = 0.5
-TOGETHER_S = TOGETHER_NS / 1e9
+TOGETHER_S = COMMON_START_NS / 1e9
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 

@@ -1,4 +1,4 @@
-"""Privacy: what may be stored, for how long, and that everyone can see it."""
+"""Privacy: the data that may be stored, its retention, and its disclosure by the API."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pytest
 from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
+from livessl.errors import ConfigError
 from livessl.server import app
 from livessl.server.store import Query, Store
-from livessl.site.models import ConfigError
-from small_site import running_server, scene_parts, site_of, wait_until, write_site
+from small_site import running_server, scene_recordings, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
 DAY_NS = 86_400_000_000_000
@@ -27,21 +27,19 @@ def event(number: int) -> dict[str, Any]:
     return {"id": f"small-{number}", "confidence": 0.5, "zones": [], "note": f"uttered {number}"}
 
 
-def test_nothing_is_recorded_where_only_positions_may_be_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_record_is_refused_with_positions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, out = write_site(tmp_path, PRIVATE), tmp_path / "session"
     assert main(["record", "--site", str(path), "--node", "lab-pc", "--out", str(out)]) == 2
     assert "privacy: positions-only: no sound may be stored, so nothing is recorded" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_running_it_all_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A database is all that is written, and an event in it is shorter than a frame of sound."""
+def test_a_running_system_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only a database is written, and an event in it is shorter than a frame of sound."""
     monkeypatch.chdir(tmp_path)
     site = site_of({**PRIVATE, "server.events_db": str(tmp_path / "events.db")}, tmp_path)
     with running_server(site) as server:
-        send_session(site, server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run", lambda: False)
+        send_session(site, server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events")
         written = {path.name for path in tmp_path.rglob("*")}
         assert {name.partition("-")[0] for name in written} == {"events.db"}
@@ -58,7 +56,7 @@ def test_running_it_all_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pyt
         (PRIVATE | {"store": {"retention_days": 1.5}}, {"mode": "positions-only", "retention_days": 1.5}),
     ],
 )
-def test_everyone_can_see_what_is_kept(changes: dict[str, Any], privacy: dict[str, Any]) -> None:
+def test_api_discloses_mode_and_retention(changes: dict[str, Any], privacy: dict[str, Any]) -> None:
     with running_server(site_of(changes)) as server:
         for path in ("site", "health"):
             assert httpx.get(f"{server.url}/api/v1/{path}").json()["privacy"] == privacy
@@ -78,7 +76,7 @@ def test_wrong_privacy_is_a_fault(changes: dict[str, Any], said: str) -> None:
         site_of(changes)
 
 
-def test_store_forgets_what_began_before() -> None:
+def test_store_deletes_events_that_began_earlier() -> None:
     store = Store()
     for number in range(5):
         store.add(event(number), number * DAY_NS)
@@ -88,7 +86,7 @@ def test_store_forgets_what_began_before() -> None:
     store.close()
 
 
-def test_file_holds_nothing_of_what_was_deleted(tmp_path: Path) -> None:
+def test_database_file_holds_no_trace_of_deleted_events(tmp_path: Path) -> None:
     path = tmp_path / "events.db"
     store = Store(path)
     store.add(event(1), 0)
@@ -105,7 +103,7 @@ def test_file_holds_nothing_of_what_was_deleted(tmp_path: Path) -> None:
     assert b"uttered 1" not in bytes_on_disk()
 
 
-def test_server_forgets_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_running_server_deletes_old_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "EXPIRE_S", 0.05)
     path = tmp_path / "events.db"
     site = site_of({"store": {"retention_days": 2.0}, "server.events_db": str(path)})
@@ -126,19 +124,19 @@ def test_server_forgets_while_it_runs(tmp_path: Path, monkeypatch: pytest.Monkey
         wait_until(lambda: kept(server.url) == ["small-2"], "another that comes later")
 
 
-def test_file_that_retention_does_not_reach_is_told_of() -> None:
+def test_files_beyond_retention_are_warned_about() -> None:
     sinks = [{"type": "jsonl", "path": "events.jsonl"}]
     [warning] = site_of({"store": {"retention_days": 7}, "server.sinks": sinks}).warnings
     assert warning == "store.retention_days: 7 days do not reach server.sinks; rotate those files yourself"
     assert site_of({"server.sinks": sinks}).warnings == ()
 
 
-def test_no_sound_on_a_disk_where_only_positions_are_kept() -> None:
+def test_spool_on_disk_is_a_fault_with_positions_only() -> None:
     changes: dict[str, Any] = {"privacy": "positions-only", "nodes.lab-pc.spool": {"directory": "spool"}}
     with pytest.raises(ConfigError) as caught:
         site_of(changes)
     (fault,) = caught.value.faults
     assert fault.where.endswith("nodes.lab-pc.spool.directory")
-    assert "no sound is kept on a disk; take it away" in fault.what
+    assert "no sound may be stored on a disk; remove it" in fault.what
     assert site_of({**changes, "nodes.lab-pc.spool": {"directory": None}}).nodes["lab-pc"].spool.directory is None
     assert site_of({**changes, "privacy": "recording"}).nodes["lab-pc"].spool.directory == "spool"

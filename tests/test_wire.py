@@ -1,4 +1,4 @@
-"""Messages survive the wire unchanged, and what is no message is refused in words, whatever it is."""
+"""Messages survive the wire unchanged, and any other bytes raise WireError."""
 
 from __future__ import annotations
 
@@ -138,17 +138,17 @@ def test_every_truncation_is_refused(message: WireMessage) -> None:
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
-def test_anything_added_is_refused(message: WireMessage) -> None:
+def test_extra_bytes_are_refused(message: WireMessage) -> None:
     assert_same(decode(encode(message)), message)
     for tail in (b"\0", b"x", b"{}", bytes(8)):
         refusal(encode(message) + tail)
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
-def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
+def test_mutated_messages_raise_only_wire_errors(message: WireMessage) -> None:
     rng = random.Random(5)
     data = encode(message)[:600]
-    if isinstance(message, Frame):  # a short one, so that header and samples are both hit
+    if isinstance(message, Frame):  # short, so that mutations reach both header and samples
         short = Frame("north", 1, 1000, 0, 16000.0, np.zeros((4, 20), dtype=np.float32), 0.5, True)
         data = encode(short)
     refused = 0
@@ -157,7 +157,7 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
         for _ in range(rng.randint(1, 4)):
             mutated[rng.randrange(len(mutated))] = rng.randrange(256)
         try:
-            encode(decode(bytes(mutated)))  # what is let in can be told on
+            encode(decode(bytes(mutated)))  # whatever decodes can be encoded again
         except WireError:
             refused += 1
     assert refused > 400
@@ -165,7 +165,7 @@ def test_mutations_raise_nothing_but_wire_errors(message: WireMessage) -> None:
 
 @given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
 @settings(max_examples=500, deadline=None)
-def test_random_bodies_raise_nothing_but_wire_errors(body: bytes, kind: int) -> None:
+def test_random_bodies_raise_only_wire_errors(body: bytes, kind: int) -> None:
     for data in (body, struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + body):
         with contextlib.suppress(WireError):
             decode(data)
@@ -191,7 +191,7 @@ JSON_VALUES = st.recursive(
     st.data(),
 )
 @settings(max_examples=300, deadline=None)
-def test_fields_of_any_value_raise_nothing_but_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
+def test_arbitrary_field_values_raise_only_wire_errors(form: tuple[int, str], data: st.DataObject) -> None:
     kind, names = form
     fields = {name: data.draw(JSON_VALUES) for name in names.split()}
     try:
@@ -207,7 +207,7 @@ def hello_with(**fields: Any) -> bytes:
     return encode(EXAMPLES[2])[: struct.calcsize("<4sBBq")] + json.dumps(whole).encode()
 
 
-def test_hello_of_plain_json_is_taken() -> None:
+def test_hello_of_plain_json_is_decoded() -> None:
     assert decode(hello_with()) == Hello("a", "b", {"n": 16000})
 
 
@@ -250,7 +250,7 @@ def test_field_of_a_wrong_value_is_refused(fields: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
-def test_message_says_when_it_was_sent(message: WireMessage) -> None:
+def test_message_carries_its_time_of_sending(message: WireMessage) -> None:
     data = encode(message)
     assert wire.sent_ns(data) == 0
     sent = wire.stamped(wire.stamped(data, 7), 1_767_225_600_123_456_789)
@@ -259,7 +259,7 @@ def test_message_says_when_it_was_sent(message: WireMessage) -> None:
     assert encode(decode(sent)) == data
 
 
-def test_wrong_head_says_what_was_expected() -> None:
+def test_error_about_a_header_names_the_expected_value() -> None:
     data = encode(EXAMPLES[1])
     assert "at least a header" in refusal(data[:5])
     assert "beginning with b'LSSL', got b'HTTP'" in refusal(b"HTTP" + data[4:])
@@ -274,7 +274,7 @@ def test_oversize_is_refused_before_it_is_read() -> None:
     assert f"expected at most {wire.MAX_JSON_BYTES}" in said
 
 
-def test_largest_frame_goes_through() -> None:
+def test_largest_frame_is_decoded() -> None:
     samples = np.zeros((16, wire.MAX_FRAME_SAMPLES), dtype=np.float32)
     largest = Frame("n" * wire.MAX_NAME_BYTES, 1, 1, 1, wire.MAX_RATE_HZ, samples, 0.0, False)
     data = encode(largest)
@@ -291,7 +291,7 @@ def test_samples_must_be_finite(bad: float) -> None:
     assert "NaN or infinity" in said
 
 
-def test_samples_must_be_such_as_a_converter_gives() -> None:
+def test_samples_beyond_the_range_of_a_converter_are_refused() -> None:
     samples = np.zeros((4, 10), dtype=np.float32)
     samples[2, 3] = -MAX_SAMPLE
     decode(encode(Frame("north", 1, 1, 1, 16000.0, samples, 0.0, False)))
@@ -358,24 +358,24 @@ def test_mark_outside_the_limits_is_refused(values: dict[str, Any], expected: st
 
 
 @pytest.mark.parametrize("name", ["", "n" * 65])
-def test_name_that_does_not_fit_is_not_sent(name: str) -> None:
+def test_name_of_a_wrong_length_is_not_encoded(name: str) -> None:
     with pytest.raises(ValueError, match="expected 1 to 64 bytes"):
         encode(Mark(name, 1, 1, 0.0, 0.0, ()))
 
 
-def test_name_that_is_no_text_is_refused() -> None:
+def test_name_that_is_not_text_is_refused() -> None:
     data = encode(Mark("nn", 1, 1, 0.0, 0.0, ()))
     assert "UTF-8" in refusal(data[:-2] + b"\xff\xfe")
 
 
-def test_samples_come_back_read_only() -> None:
+def test_decoded_samples_are_read_only() -> None:
     got = decode(encode(frame()))
     assert isinstance(got, Frame)
     assert not got.samples.flags.writeable
 
 
-def test_who_does_not_answer_greets_as_before_there_were_requests() -> None:
-    """An older server refuses fields that it does not know."""
+def test_greeting_without_answers_omits_the_field() -> None:
+    """Older servers refuse fields that they do not know."""
     plain = encode(Hello("lab-pc", "run", {"north": 16000.0}))
     assert b"answers" not in plain
     assert b'"answers":true' in encode(Hello("lab-pc", "run", {"north": 16000.0}, answers=True))

@@ -1,3 +1,75 @@
-"""livessl tells, live, where in a room a sound happened."""
+"""Locates sounds in a room, live, with a few small microphone arrays set far apart.
 
-__version__ = "0.1.0"
+`livessl.locate("site.yaml", {"north": "north.wav", "south": "south.wav"})` returns the events in recordings. Each name
+below is loaded when it is first used, so that `import livessl` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from livessl.core.geometry import Grid
+    from livessl.core.locate.estimators import Estimator, Localization, Sound
+    from livessl.core.types import ArraySpec, Estimate, Event
+    from livessl.errors import ConfigError
+    from livessl.offline import PowerMap, locate, power_map
+    from livessl.simulation.of_site import Simulation, simulate
+    from livessl.site.load import load_site
+    from livessl.site.models import METHODS, Site
+
+__version__ = "0.2.0"
+
+__all__ = [
+    "METHODS",
+    "ArraySpec",
+    "ConfigError",
+    "Estimate",
+    "Estimator",
+    "Event",
+    "Grid",
+    "Localization",
+    "PowerMap",
+    "Simulation",
+    "Site",
+    "Sound",
+    "__version__",
+    "load_site",
+    "locate",
+    "power_map",
+    "simulate",
+]
+
+_HOMES: Final = {
+    "METHODS": "site.models",
+    "ArraySpec": "core.types",
+    "ConfigError": "errors",
+    "Estimate": "core.types",
+    "Estimator": "core.locate.estimators",
+    "Event": "core.types",
+    "Grid": "core.geometry",
+    "Localization": "core.locate.estimators",
+    "PowerMap": "offline",
+    "Simulation": "simulation.of_site",
+    "Site": "site.models",
+    "Sound": "core.locate.estimators",
+    "load_site": "site.load",
+    "locate": "offline",
+    "power_map": "offline",
+    "simulate": "simulation.of_site",
+}
+"""The module of each name, below `livessl`."""
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'livessl' has no attribute {name!r}")
+    value = getattr(import_module(f"livessl.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,4 +1,4 @@
-"""Time for everyone: the only place that reads a clock, and the text form of an instant."""
+"""Clocks, and the text form of an instant. Only this module reads the machine's clock."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from datetime import UTC, datetime, timedelta
 from typing import Final, Protocol
 
 LONGEST_SLEEP_S: Final = 0.1
-"""Whoever waits looks up so often: to keep a connection alive, or because he was told to stop."""
+"""Longest single sleep, in seconds, so that waiting code can keep its connection alive and notice a stop request."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Clock(Protocol):
-    """Site time, and the means to wait for it; and a time for deadlines, which nobody sets."""
+    """Site time, a means to wait for it, and a monotonic time for deadlines."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch, UTC: for stamps, never for intervals, for it can be set."""
+        """Return nanoseconds since the epoch, UTC: for stamps, not for intervals, because this clock can be set."""
         ...
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since some fixed moment, at the machine's own pace: for intervals."""
+        """Return nanoseconds by the monotonic clock: for intervals."""
         ...
 
     def sleep_until_ns(self, time_ns: int) -> bool:
-        """Return at that site time, or after `LONGEST_SLEEP_S`; whether it has come."""
+        """Wait until that site time, but at most `LONGEST_SLEEP_S`; return True if it has been reached."""
         ...
 
 
@@ -32,20 +32,20 @@ class SystemClock:
     """The machine's clock."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch, UTC."""
+        """Return nanoseconds since the epoch, UTC."""
         return time.time_ns()
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since some fixed moment."""
+        """Return nanoseconds by the monotonic clock."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, time_ns: int) -> bool:
-        """Sleep the difference, so that a schedule's errors never add up."""
+        """Sleep for the difference to the present time, so that the errors of a schedule do not add up."""
         return _sleep((time_ns - time.time_ns()) / 1e9)
 
 
 class PacedClock:
-    """Site time that runs from `start_ns` at `speed` times the machine's: the clock of a replay."""
+    """Site time that runs from `start_ns` on at `speed` times the machine's pace: the clock of a replay."""
 
     def __init__(self, start_ns: int, speed: float = 1.0) -> None:
         if not speed > 0:
@@ -55,51 +55,51 @@ class PacedClock:
         self._began_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch, in the replayed time."""
+        """Return nanoseconds since the epoch in replayed time."""
         return self._start_ns + round((time.monotonic_ns() - self._began_ns) * self._speed)
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since some fixed moment."""
+        """Return nanoseconds by the monotonic clock."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, time_ns: int) -> bool:
-        """Sleep until the replayed time gets there."""
+        """Sleep until the replayed time is reached."""
         return _sleep((time_ns - self.now_ns()) / self._speed / 1e9)
 
 
 class UnpacedClock:
-    """Site time that jumps to whatever is waited for: as fast as the machine can."""
+    """Site time that jumps to each time that is waited for: for processing as fast as the machine can."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The latest time waited for, nanoseconds."""
+        """Return the latest time that was waited for, in nanoseconds."""
         return self._now_ns
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since some fixed moment."""
+        """Return nanoseconds by the monotonic clock."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, time_ns: int) -> bool:
-        """Be there at once."""
+        """Set the time, and return True at once."""
         self._now_ns = max(self._now_ns, time_ns)
         return True
 
 
 def utc_text(time_ns: int) -> str:
-    """RFC 3339 text of an instant, in UTC with microseconds: `2026-01-31T12:00:00.050000Z`."""
+    """Return an instant as RFC 3339 text in UTC with microseconds: `2026-01-31T12:00:00.050000Z`."""
     instant = _EPOCH + timedelta(microseconds=time_ns // 1000)
     return instant.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def utc_ns(text: str) -> int:
-    """Nanoseconds since the epoch of an RFC 3339 text.
+    """Return the nanoseconds since the epoch of an RFC 3339 text.
 
     Raises
     ------
     ValueError
-        Where the text is no instant with an offset.
+        If the text is not an instant with an offset from UTC.
     """
     try:
         instant = datetime.fromisoformat(text)

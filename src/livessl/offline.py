@@ -1,30 +1,166 @@
-"""Recordings through the whole pipeline in one process, without sockets, as fast as the clock given allows."""
+"""The whole pipeline in one process, without sockets: what the command line, notebooks, tests and calibration call."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from livessl import wire
-from livessl.clock import Clock
-from livessl.core.types import BackfillRequest, Frame, Mark, Message, Output
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.site.build.fusion import make_fusion
+from livessl.clock import Clock, UnpacedClock
+from livessl.core.locate.estimators import Sound
+from livessl.core.types import (
+    MAX_SAMPLE,
+    BackfillRequest,
+    Event,
+    Float32Array,
+    FloatArray,
+    Frame,
+    Mark,
+    Message,
+    Output,
+    read_only,
+)
+from livessl.errors import DeviceError
+from livessl.recordings.assign import AssignedRecording, assign_files, make_pipelines, recording_channels
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording
+from livessl.site.build.fusion import make_estimator, make_fusion
+from livessl.site.load import load_site
 from livessl.site.models import Site
+
+SiteOrPath = Site | Path | str
+"""A site, or the path of a site file."""
+
+Samples = NDArray[Any]
+"""Samples (channels, n): floats with full scale at 1, or integers of a converter."""
+
+Given = Samples | Path | str
+"""One array's recording: samples, or the path of a WAV or FLAC file."""
+
+_WIDEST: Final = 64
+"""Most rows of an array of samples that are taken for channels; an axis longer than that is time."""
+
+
+@dataclass(frozen=True, slots=True)
+class PowerMap:
+    """Power over the search volume, with its coordinates.
+
+    Parameters
+    ----------
+    power : (nx, ny, nz) float32
+        Sum of the arrays' maps; the highest point is the likeliest position.
+    arrays : mapping of array name to (nx, ny, nz) float32
+        The map of each array.
+    x_m, y_m, z_m : (nx,), (ny,), (nz,) float64
+        Coordinates of the grid points along each axis, metres.
+    """
+
+    power: Float32Array
+    arrays: Mapping[str, Float32Array]
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+
+
+def locate(
+    site: SiteOrPath,
+    recordings: Mapping[str, Given],
+    sample_rate_hz: float | None = None,
+    method: str | None = None,
+) -> list[Event]:
+    """Locate the sounds in recordings: the live pipeline from activity detection to events, as fast as it can.
+
+    Parameters
+    ----------
+    site : Site, Path or str
+        A site, or the path of a site file.
+    recordings : mapping of array name to (channels, n) array, Path or str
+        One recording for each array, in the order of its microphones; all begin together. A file may hold more
+        channels: the site's node says which are the array's.
+    sample_rate_hz : float or None
+        Sampling rate of the recordings that are arrays of samples; None takes the rate that the site says.
+    method : str or None
+        Name of the estimator; None takes the site's.
+
+    Returns
+    -------
+    list of Event
+        In order of time. Event times count from the beginning of the recordings.
+
+    Raises
+    ------
+    ConfigError
+        Where the site file is wrong.
+    DeviceError
+        Where a recording does not fit the site.
+    """
+    loaded = _site(site)
+    parts = _parts(loaded, recordings, sample_rate_hz)
+    outputs = run(loaded, parts, UnpacedClock(), method=method)
+    return [output for output in outputs if isinstance(output, Event)]
+
+
+def power_map(
+    site: SiteOrPath,
+    recordings: Mapping[str, Given],
+    start_s: float = 0.0,
+    stop_s: float | None = None,
+    sample_rate_hz: float | None = None,
+    method: str | None = None,
+) -> PowerMap:
+    """Map the power of a stretch of recordings over the search volume: one sound, as one segment.
+
+    Parameters
+    ----------
+    site, recordings, sample_rate_hz, method
+        As in `locate`.
+    start_s, stop_s : float, float or None
+        The stretch, seconds after the beginning of the recordings; None is their end.
+
+    Raises
+    ------
+    ConfigError, DeviceError
+        As in `locate`; also where the stretch holds no sound.
+    """
+    loaded = _site(site)
+    sounds = {}
+    for part in _parts(loaded, recordings, sample_rate_hz):
+        rate_hz = part.recording.sample_rate_hz
+        samples = np.concatenate([block.samples for block in part.recording.blocks(0)], axis=1)
+        stop = None if stop_s is None else round(stop_s * rate_hz)
+        segment = samples[np.array(part.channels) - 1, round(start_s * rate_hz) : stop]
+        if not segment.any():
+            end = "the end" if stop_s is None else f"{stop_s:g} s"
+            raise DeviceError(f"array {part.array!r}: expected sound from {start_s:g} s to {end}, got none there")
+        sounds[part.array] = Sound([np.ascontiguousarray(segment)], rate_hz)
+    estimator = make_estimator(loaded, method)
+    maps = estimator.power_maps(estimator.locate(sounds).evidence)
+    grid = maps.grid
+    shape = grid.shape
+    x_m, y_m, z_m = (
+        np.linspace(low, high, count) for low, high, count in zip(grid.lower_m, grid.upper_m, shape, strict=True)
+    )
+    arrays = {name: power.reshape(shape) for name, power in maps.arrays.items()}
+    return PowerMap(maps.fused.reshape(shape), arrays, x_m, y_m, z_m)
 
 
 def run(
     site: Site,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     clock: Clock,
     *,
     method: str | None = None,
-    ask: bool = True,
+    backfill: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[Output]:
-    """Localize everything in the recordings, without sockets: events in order of time.
+    """Yield everything that the fusion makes of recordings, events in order of time.
 
-    With `ask`, arrays that did not find a sound are asked for it, as live.
+    With `backfill`, arrays that did not detect a sound are asked for their frames of it, as in a live server.
 
     Raises
     ------
@@ -32,15 +168,17 @@ def run(
         Where recordings of arrays that the site joins do not belong together.
     """
     fusion = make_fusion(site, method, updates=False)
-    pipelines, placed = pipelines_of(site, parts)
-    if ask:
+    pipelines, inputs = make_pipelines(site, recordings)
+    if backfill:
         fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
     now_ns = 0
-    for now_ns, batch in played_messages(pipelines, placed, clock):
+    for now_ns, batch in paced_messages(pipelines, inputs, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
-        while asks := [output for output in outputs if isinstance(output, BackfillRequest)]:
+        while requests := [output for output in outputs if isinstance(output, BackfillRequest)]:
             yield from (output for output in outputs if not isinstance(output, BackfillRequest))
-            answers = [message for ask in asks for pipeline in pipelines for message in pipeline.backfill(ask)]
+            answers = [
+                message for request in requests for pipeline in pipelines for message in pipeline.backfill(request)
+            ]
             outputs = fusion.step(_over_the_wire(answers), now_ns)
         yield from outputs
         if progress is not None:
@@ -49,6 +187,51 @@ def run(
 
 
 def _over_the_wire(batch: Iterable[Message]) -> list[Message]:
-    """Each message to bytes and back: every step of the live path but the socket."""
+    """Turn each message into bytes and back: every step of the live path but the socket."""
     decoded = (wire.decode(wire.encode(message)) for message in batch)
     return [message for message in decoded if isinstance(message, Frame | Mark)]
+
+
+def _site(site: SiteOrPath) -> Site:
+    return site if isinstance(site, Site) else load_site(site)
+
+
+def _parts(site: Site, recordings: Mapping[str, Given], sample_rate_hz: float | None) -> list[AssignedRecording]:
+    if not recordings:
+        raise DeviceError(f"recordings: expected one for each of {', '.join(site.arrays)}, got none")
+    files = {name: Path(given) for name, given in recordings.items() if isinstance(given, str | Path)}
+    samples = {name: given for name, given in recordings.items() if not isinstance(given, str | Path)}
+    parts = {part.array: part for part in assign_files(site, files)}
+    parts |= {name: _part(site, name, given, sample_rate_hz) for name, given in samples.items()}
+    return [parts[name] for name in recordings]
+
+
+def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None) -> AssignedRecording:
+    known = (*site.arrays, *site.joint)
+    if array not in known:
+        raise DeviceError(f"recordings: no array {array!r}; arrays are {', '.join(known)}")
+    node = site.node_of(array)
+    rate_hz = sample_rate_hz or (site.nodes[node].device.sample_rate_hz if node else None)
+    if rate_hz is None:
+        raise DeviceError(f"array {array!r}: expected the sampling rate of its samples; pass sample_rate_hz")
+    recording = MemoryRecording(f"array {array!r}", float(rate_hz), _checked(array, np.asarray(samples)))
+    return AssignedRecording(array, recording, 0, tuple(recording_channels(site, array, recording)))
+
+
+def _checked(array: str, samples: Samples) -> Float32Array:
+    """Return samples as float32 with full scale at 1."""
+    if samples.ndim != 2 or 0 in samples.shape:
+        raise DeviceError(f"array {array!r}: expected samples (channels, n), got shape {samples.shape}")
+    if len(samples) > _WIDEST >= samples.shape[1]:
+        raise DeviceError(f"array {array!r}: expected samples (channels, n), got {samples.shape}; pass samples.T")
+    if np.issubdtype(samples.dtype, np.signedinteger):
+        samples = samples / np.float32(-float(np.iinfo(samples.dtype).min))
+    checked = np.array(samples, dtype=np.float32)
+    largest = float(np.abs(checked).max())  # NaN where there is any
+    if not largest <= MAX_SAMPLE:
+        raise DeviceError(
+            f"array {array!r}: expected finite samples with full scale at 1, got {largest:g} among them; "
+            "divide by the full scale of the converter"
+        )
+    read_only(checked)
+    return checked

@@ -1,7 +1,7 @@
-"""Messages to bytes and back: version, limits, validation. It knows no socket.
+"""Messages as bytes: encoding, decoding, version, limits and validation. It knows no socket.
 
-One message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, when it was sent), then the body of
-its kind. Sound travels as float32, so that a replayed or live frame is the very frame that was cut.
+A message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, time of sending), then the body of its
+kind. Samples travel as float32, so that a frame arrives bit for bit as it was cut.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROP
 VERSION: Final = 2
 
 MAX_NAME_BYTES: Final = 64
-"""Longest array or node name: the site file allows no longer site, and a header must stay a header."""
+"""Longest array or node name, in bytes: the limit of the site file, which keeps headers short."""
 
 MAX_FRAME_SAMPLES: Final = 19_200
-"""A 50 ms frame at 192 kHz is 9 600 samples; twice that is no frame of ours."""
+"""Most samples of a frame: twice the 9 600 samples of 50 ms at 192 kHz."""
 
 MAX_RATE_HZ: Final = 384_000.0
-"""No sound card samples faster."""
+"""Highest sampling rate, in Hz: no sound card is faster."""
 
 MAX_POWER: Final = 1e80
-"""Of samples that a float32 can hold; sums of such powers do not overflow."""
+"""Largest power: above any that float32 samples can have, and small enough that sums do not overflow."""
 
 MAX_FRAME_INDEX: Final = (2**63 - 1) // FRAME_NS - 1
-"""Site times are 64-bit nanoseconds: until the year 2262."""
+"""Largest frame index: site times are 64-bit nanoseconds, which end in the year 2262."""
 
 MAX_JSON_BYTES: Final = 64 * 1024
-"""Greetings and acknowledgements are a few hundred bytes."""
+"""Longest JSON body, in bytes: greetings and acknowledgements take a few hundred."""
 
 MAX_MESSAGE_BYTES: Final = 256 + 4 * MAX_MICROPHONES * MAX_FRAME_SAMPLES
-"""The largest message there can be: a frame of 16 channels."""
+"""Longest message, in bytes: a frame of 16 channels."""
 
 _MAGIC: Final = b"LSSL"
 _HEAD: Final = struct.Struct("<4sBBq")
@@ -51,31 +51,32 @@ _CLOCK_STATES: Final = tuple(ClockState)
 
 
 class WireError(ValueError):
-    """Bytes that are no message; says what was expected and what was got."""
+    """Bytes that are not a valid message: what was expected, and what was got."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """A node introduces itself.
+    """A node's greeting.
 
     Parameters
     ----------
     node : str
-        Its name in the site file.
+        The node's name in the site file.
     run_id : str
-        New at every start: sequence numbers begin again.
+        A new one at every start, after which sequence numbers begin again.
     arrays : dict of str to float
-        The arrays it captures and their sampling rates in Hz.
+        The node's arrays and their sampling rates in Hz.
     replay : bool
-        The frames carry past times; the server shall follow them instead of its clock.
+        True if the frames carry past times, which the server shall follow instead of its clock.
     problem : str or None
-        What is wrong with its device now, in words.
+        The present problem of the node's device, in words.
     backlog : dict of str to (int, int)
-        Of the arrays that have kept frames from before this connection: their oldest frame index, and the one from
-        which on frames are live. What lies between comes in order of time, as the live sound leaves room; another
-        greeting says when all of it has been sent.
+        For each array with frames from before this connection, the frame index of the oldest, and that of the first
+        live frame. Frames between them come in order of time in the bandwidth that live sound leaves; another greeting
+        reports that all of them have been sent.
     answers : bool
-        It knows requests. Said only to a server that has made one: an older one would not understand the greeting.
+        True if the node answers backfill requests. It is sent only to a server that has made one, because an older
+        server would reject the greeting.
     """
 
     node: str
@@ -89,21 +90,21 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The server's answer and heartbeat.
+    """The server's acknowledgement, which is also its sign of life.
 
     Parameters
     ----------
     run_id : str
-        Of the node's greeting.
+        The run of the node that is addressed.
     received : dict of str to int
-        Frame index, of each array, up to which the server has all frames that the node sent: they need not be sent
-        again while this server lives.
+        For each array, the frame index up to which the server has all frames that the node sent: they need not be
+        sent again while this server runs.
     settled : int or None
-        Frame index before which everything has become events, and these are stored: no frame of it is needed again.
+        Frame index before which all sound has become stored events: no frame before it is needed again.
     who_are_you : bool
-        The server does not know this connection, or misses frames of it: greet, and send again.
+        True if the server does not know this connection, or misses frames of it: the node shall greet and send again.
     refused : str or None
-        Why the node may not join.
+        Reason for which the server refuses the node.
     """
 
     run_id: str
@@ -115,16 +116,16 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The server asks for frames that a node did not send. Their sequence number is 0.
+    """A request of the server for frames that a node did not send. They are sent with the sequence number 0.
 
-    An empty one tells a node that has greeted that requests may come. A node that does not know them leaves them be.
+    An empty request, after a greeting, announces that others may follow. Nodes that do not know requests ignore them.
 
     Parameters
     ----------
     run_id : str
-        Of the node's greeting.
+        The run of the node that is addressed.
     wanted : dict of str to (int, int)
-        Of each array the first frame index, by its own clock, and the one after the last.
+        For each array, by its own clock, the first frame index and the one after the last.
     """
 
     run_id: str
@@ -133,7 +134,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """A node ends on purpose."""
+    """A node's good-bye: it ends on purpose."""
 
     node: str
     run_id: str
@@ -147,7 +148,7 @@ _MARK_KIND: Final = 2
 
 
 def encode(message: WireMessage) -> bytes:
-    """Bytes of a message."""
+    """Return a message as bytes."""
     if isinstance(message, Frame):
         return _encode_frame(message)
     if isinstance(message, Mark):
@@ -160,12 +161,12 @@ def encode(message: WireMessage) -> bytes:
 
 
 def decode(data: bytes) -> WireMessage:
-    """Message of some bytes.
+    """Return the message that some bytes hold.
 
     Raises
     ------
     WireError
-        Where they are not a whole, valid message of this version; never anything else.
+        If they are not a whole, valid message of this version; no other exception is ever raised.
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
@@ -187,12 +188,12 @@ def decode(data: bytes) -> WireMessage:
 
 
 def stamped(data: bytes, sent_ns: int) -> bytes:
-    """The same message, sent at that site time by the sender's clock; 0, as encoded, says nothing."""
+    """Return an encoded message with the time of its sending, in ns of site time by the sender's clock."""
     return b"".join([data[:_SENT_AT], _SENT.pack(sent_ns), data[_HEAD.size :]])
 
 
 def sent_ns(data: bytes) -> int:
-    """When a message that decodes was sent, by the sender's clock; 0 where it does not say."""
+    """Return the time at which an encoded message was sent, in ns by the sender's clock; 0 if it is unknown."""
     return int(_SENT.unpack_from(data, _SENT_AT)[0])
 
 
@@ -233,7 +234,7 @@ def _decode_frame(body: bytes) -> Frame:
     if len(body) - start != 4 * channels * n:
         raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
     samples = np.frombuffer(body, dtype="<f4", offset=start).reshape(channels, n).astype(np.float32, copy=False)
-    largest = float(np.abs(samples).max())  # NaN where there is any
+    largest = float(np.abs(samples).max())  # NaN if any sample is NaN
     if not math.isfinite(largest):
         raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
     if largest > MAX_SAMPLE:
@@ -304,7 +305,7 @@ def _check_frame_index(frame_index: int, what: str) -> None:
 
 
 def _is_unicode(value: Any) -> bool:
-    """Half of a surrogate pair is valid in JSON, and nothing that could be told on."""
+    """Return True for text without lone surrogates, which are valid in JSON but cannot be encoded again."""
     return isinstance(value, str) and not any("\ud800" <= character <= "\udfff" for character in value)
 
 

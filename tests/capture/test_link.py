@@ -1,11 +1,10 @@
-"""A node's link over real sockets: nothing is lost while the server is away, and what is kept is bounded."""
+"""A node's link over real sockets: no frame is lost while the server is away, and the spool is bounded."""
 
 from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from itertools import groupby, islice
 from types import TracebackType
 from typing import Self
@@ -15,7 +14,9 @@ import pytest
 import zmq
 
 from livessl import wire
-from livessl.capture.link import BACKLOG_FRAMES, BEHIND_NS, SILENT_NS, Dealer, Link
+from livessl.capture.dealer import Dealer
+from livessl.capture.link import SILENT_NS, Link
+from livessl.capture.outbox import BACKLOG_FRAMES, LATE_NS
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
@@ -26,7 +27,7 @@ HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
 
 
 class HandClock:
-    """Time that the test moves."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.time_ns = 1_767_225_600_000_000_000
@@ -43,7 +44,7 @@ class HandClock:
 
 
 class Router:
-    """A server that does nothing by itself."""
+    """A server that only does what the test requests."""
 
     def __init__(self, endpoint: str = "tcp://127.0.0.1:*") -> None:
         self._context = zmq.Context()
@@ -64,20 +65,20 @@ class Router:
         self._context.term()
 
     def read(self) -> int:
-        """Take in what has arrived; how many messages that was."""
+        """Read all messages that have arrived; return their number."""
         before = len(self.got)
         while self._socket.poll(2):
             self.peer, data = self._socket.recv_multipart()
             self.got.append(wire.decode(data))
         return len(self.got) - before
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self._socket.send_multipart([self.peer, data])
 
     def ack(self, settled: int | None = None, **received: int) -> None:
-        """Say which frames are here, by number, and before which all is settled."""
+        """Acknowledge frames by number, and settle those before a number."""
         frame_indices = {array: FIRST_RASTER + number for array, number in received.items()}
-        self.say(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
+        self.send(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
 
     def hellos(self) -> list[wire.Hello]:
         return [message for message in self.got if isinstance(message, wire.Hello)]
@@ -99,7 +100,7 @@ def linked(endpoint: str, clock: HandClock | SystemClock | None = None) -> Itera
 
 
 def together(link: Link, router: Router, condition: Callable[[], object], what: str) -> None:
-    """Let both do their work until the condition holds."""
+    """Serve link and router until the condition holds."""
 
     def turn() -> object:
         link.service()
@@ -114,6 +115,7 @@ def connect(link: Link, router: Router) -> None:
     together(link, router, lambda: len(router.hellos()) > count, "a greeting")
     router.ack()
     together(link, router, lambda: link.connected, "the connection")
+    together(link, router, lambda: len(router.hellos()) > count + 1, "the greeting with the backlog")
 
 
 def free_endpoint() -> str:
@@ -150,7 +152,7 @@ def test_frames_arrive_unchanged() -> None:
         assert [wire.encode(message) for message in arrived] == [wire.encode(message) for message in sent]
 
 
-def test_nobody_gets_sound_before_the_greeting_is_answered() -> None:
+def test_no_sound_is_sent_before_the_greeting_is_answered() -> None:
     with Router() as router, linked(router.endpoint) as link:
         link.send([frame()])
         together(link, router, router.hellos, "a greeting")
@@ -159,7 +161,7 @@ def test_nobody_gets_sound_before_the_greeting_is_answered() -> None:
         assert router.frames() == []
 
 
-def test_server_that_was_started_anew_gets_what_the_old_one_had_not_acknowledged() -> None:
+def test_restarted_server_gets_all_unacknowledged_frames() -> None:
     with linked(free_endpoint()) as link:
         with Router(link.endpoint) as router:
             connect(link, router)
@@ -170,28 +172,28 @@ def test_server_that_was_started_anew_gets_what_the_old_one_had_not_acknowledged
         link.send([frame(5)])
         with Router(link.endpoint) as router:
             together(link, router, lambda: router.got, "anything")
-            router.say(wire.encode(wire.Ack("?", {}, who_are_you=True)))
+            router.send(wire.encode(wire.Ack("?", {}, who_are_you=True)))
             together(link, router, router.hellos, "a greeting")
             router.ack()
             together(link, router, lambda: router.frames()[-3:] == [3, 4, 5], "the frames")
 
 
-def test_broken_connection_is_noticed_before_anything_goes_over_the_next() -> None:
-    """What was on its way is lost with it; a greeting that did not count it would tell the server that it has come."""
+def test_broken_connection_is_detected_before_the_next_one_is_used() -> None:
+    """Messages on their way are lost with it, so the next greeting must count them as backlog."""
     with linked(free_endpoint()) as link:
         with Router(link.endpoint) as router:
             connect(link, router)
             link.send([frame(k) for k in range(1, 5)])
             together(link, router, lambda: len(router.frames()) == 4, "the frames")
         with Router(link.endpoint) as router:
-            link.tell("a greeting for another reason")
+            link.report("a greeting for another reason")
             together(link, router, lambda: router.got, "anything")
             first = router.got[0]
             assert isinstance(first, wire.Hello)
             assert first.backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 5)}
 
 
-def test_silence_of_the_server_is_noticed_and_survived() -> None:
+def test_silent_server_is_detected_and_survived() -> None:
     clock = HandClock()
     with Router() as router, linked(router.endpoint, clock) as link:
         connect(link, router)
@@ -218,13 +220,13 @@ def test_only_the_newest_mark_waits_for_the_server() -> None:
             assert router.marks("south") == [100]
             assert router.frames() == [101]
             assert router.marks("north") == [102]
-            # marks are not sent again: they say how things were
+            # marks are not sent again, because they describe a past state
             router.ack(north=101, south=100)
             together(link, router, lambda: link.pending == 0, "the acknowledgement")
 
 
 class Narrow(Dealer):
-    """A connection that takes nothing while it is full."""
+    """A connection that accepts nothing while it is full."""
 
     def __init__(self) -> None:
         self.full = False
@@ -246,8 +248,8 @@ class Narrow(Dealer):
         self.full = True
 
 
-def test_a_mark_that_frames_follow_is_not_sent_after_them() -> None:
-    """It says how many frames were before it. The server would miss those that it does not know of yet, and ask."""
+def test_mark_is_not_sent_after_later_frames() -> None:
+    """A mark carries the number of frames before it; the server would request those that it has not received yet."""
     clock, dealer = HandClock(), Narrow()
     link = Link("", HELLO, clock, dealer=dealer)
     for _ in range(2):
@@ -257,7 +259,7 @@ def test_a_mark_that_frames_follow_is_not_sent_after_them() -> None:
     dealer.full = True
     link.send([mark(1), frame(2), mark(2, array="south")])
     for _ in range(6):
-        clock.time_ns += BEHIND_NS // 5
+        clock.time_ns += LATE_NS // 5
         dealer.coming.append(wire.encode(wire.Ack("run-1", {})))
         link.service()
     dealer.full = False
@@ -273,7 +275,7 @@ def test_a_mark_that_frames_follow_is_not_sent_after_them() -> None:
     link.close(bye=False)
 
 
-def test_spool_is_bounded_and_counts_what_it_drops() -> None:
+def test_spool_is_bounded_and_dropped_frames_are_counted() -> None:
     samples = np.zeros((16, wire.MAX_FRAME_SAMPLES), dtype=np.float32)
     size = samples.nbytes
     count = MEMORY_BYTES // size + 20
@@ -286,20 +288,20 @@ def test_spool_is_bounded_and_counts_what_it_drops() -> None:
         assert link.pending * size <= MEMORY_BYTES < (link.pending + 2) * size
         with Router(endpoint) as router:
             connect(link, router)
-            kept = list(range(link.dropped + 1, count + 1))  # the oldest went
+            kept = list(range(link.dropped + 1, count + 1))  # the oldest were dropped
 
             def all_taken() -> bool:
                 link.service()
                 if router.read() and router.frames():
                     frame_indices = {"north": router.frames()[-1]}
-                    router.say(wire.encode(wire.Ack("run-1", frame_indices)))
+                    router.send(wire.encode(wire.Ack("run-1", frame_indices)))
                 return link.pending == 0
 
-            wait_until(all_taken, "what was kept")
+            wait_until(all_taken, "the backlog")
             assert router.frames() == kept
 
 
-def test_live_sound_goes_first_and_the_rest_in_order_of_time_a_few_ahead() -> None:
+def test_live_sound_goes_first_and_the_backlog_follows_in_order_of_time() -> None:
     endpoint = free_endpoint()
     kept = [frame(k) for k in range(1, 51)]
     with linked(endpoint) as link:
@@ -309,19 +311,23 @@ def test_live_sound_goes_first_and_the_rest_in_order_of_time_a_few_ahead() -> No
             router.ack()
             together(link, router, lambda: link.connected, "the connection")
             link.send([frame(51), frame(52)])
-            together(link, router, lambda: len(router.frames()) == 2 + BACKLOG_FRAMES, "live sound, and some kept")
-            told = router.hellos()[-1].backlog
-            assert told == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 51)}
+            together(
+                link,
+                router,
+                lambda: len(router.frames()) == 2 + BACKLOG_FRAMES,
+                "live sound, and a part of the backlog",
+            )
+            assert router.hellos()[-1].backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 51)}
             assert router.frames() == [*range(1, BACKLOG_FRAMES + 1), 51, 52] or router.frames()[:2] == [51, 52]
             router.ack(north=10)
             together(link, router, lambda: len(router.frames()) == 12 + BACKLOG_FRAMES, "ten more")
             link.send([frame(53)])
-            together(link, router, lambda: 53 in router.frames(), "the live one")
-            assert 27 not in router.frames()  # it went before what was still kept
+            together(link, router, lambda: 53 in router.frames(), "the live frame")
+            assert 27 not in router.frames()  # the live frame preceded the rest of the backlog
             for k in (26, 42, 50):
                 router.ack(north=k)
-                together(link, router, lambda k=k: min(50, k + 16) in router.frames(), "more")  # type: ignore[misc]
-            together(link, router, lambda: router.hellos()[-1].backlog == {}, "the word that all is sent")
+                together(link, router, lambda k=k: min(50, k + 16) in router.frames(), "more of the backlog")  # type: ignore[misc]
+            together(link, router, lambda: router.hellos()[-1].backlog == {}, "the greeting without backlog")
             assert sorted(router.frames()) == list(range(1, 54))
             router.ack(north=53)
             together(link, router, lambda: link.pending == 0, "the acknowledgement")
@@ -330,8 +336,8 @@ def test_live_sound_goes_first_and_the_rest_in_order_of_time_a_few_ahead() -> No
             together(link, router, lambda: link.kept == 4, "the settlement")
 
 
-def test_settled_frames_that_the_server_never_got_are_sent_all_the_same() -> None:
-    """It may have given us up, and goes on without: it shall know what there was."""
+def test_settled_frames_that_the_server_never_received_are_sent() -> None:
+    """The server may have settled without this node, and shall still receive its frames."""
     endpoint = free_endpoint()
     with linked(endpoint) as link:
         link.send([frame(k) for k in range(1, 6)])
@@ -343,12 +349,12 @@ def test_settled_frames_that_the_server_never_got_are_sent_all_the_same() -> Non
             together(link, router, lambda: link.kept == 0, "the settlement")
 
 
-def test_refusal_is_kept_until_it_is_taken_back() -> None:
+def test_refusal_lasts_until_the_server_accepts() -> None:
     clock = HandClock()
     with Router() as router, linked(router.endpoint, clock) as link:
         assert link.refused is None
         together(link, router, router.hellos, "a greeting")
-        router.say(wire.encode(wire.Ack("run-1", {}, refused="array 'north' is captured already")))
+        router.send(wire.encode(wire.Ack("run-1", {}, refused="array 'north' is captured already")))
         together(link, router, lambda: link.refused, "the refusal")
         assert link.refused == "array 'north' is captured already"
         assert not link.connected
@@ -360,7 +366,7 @@ def test_refusal_is_kept_until_it_is_taken_back() -> None:
         assert link.refused is None
 
 
-def test_greetings_are_not_more_than_one_a_second() -> None:
+def test_greetings_are_sent_at_most_once_a_second() -> None:
     clock = HandClock()
     with Router() as router, linked(router.endpoint, clock) as link:
         together(link, router, router.hellos, "a greeting")
@@ -372,7 +378,7 @@ def test_greetings_are_not_more_than_one_a_second() -> None:
         together(link, router, lambda: len(router.hellos()) == 2, "another greeting")
 
 
-def test_node_without_sound_says_once_a_second_that_it_is_there() -> None:
+def test_node_without_sound_greets_once_a_second() -> None:
     clock = HandClock()
     with Router() as router, linked(router.endpoint, clock) as link:
         connect(link, router)
@@ -388,50 +394,50 @@ def test_node_without_sound_says_once_a_second_that_it_is_there() -> None:
         clock.time_ns += 900_000_000
         link.service()
         router.read()
-        assert len(router.hellos()) == count + 1  # sound is sign enough
+        assert len(router.hellos()) == count + 1  # a frame is a sign of life, too
 
 
-def test_what_is_no_acknowledgement_is_left_alone(caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_other_than_acknowledgements_are_ignored(caplog: pytest.LogCaptureFixture) -> None:
     with Router() as router, linked(router.endpoint) as link:
         connect(link, router)
         link.send([frame(1)])
         together(link, router, router.frames, "the frame")
         for data in (b"", b"rubbish", wire.encode(wire.Bye("x", "y")), wire.encode(wire.Ack("run-0", {"north": 9}))):
-            router.say(data)
+            router.send(data)
         router.ack(south=3)
         router.ack(north=1)
         together(link, router, lambda: link.pending == 0, "the acknowledgement")
         assert link.connected
-    assert "sent something else than an acknowledgement" in caplog.text
+    assert "sent an invalid message" in caplog.text
 
 
-def test_trouble_with_the_device_is_told_once() -> None:
+def test_device_problem_is_reported_once() -> None:
     with Router() as router, linked(router.endpoint) as link:
         connect(link, router)
         for _ in range(3):
-            link.tell("input device 'UMC' is not connected")
-        link.tell(None)
+            link.report("input device 'UMC' is not connected")
+        link.report(None)
 
-        def told() -> list[str | None]:
-            """What was said, without repetitions."""
+        def reported() -> list[str | None]:
+            """Return the reported problems without repetitions."""
             return [problem for problem, _ in groupby(hello.problem for hello in router.hellos())]
 
-        together(link, router, lambda: len(told()) >= 3, "the trouble and its end")
-        assert told() == [None, "input device 'UMC' is not connected", None]
+        together(link, router, lambda: len(reported()) >= 3, "the problem and its end")
+        assert reported() == [None, "input device 'UMC' is not connected", None]
         assert [hello.problem for hello in router.hellos()].count("input device 'UMC' is not connected") == 1
 
 
-def test_trouble_is_in_the_greeting_of_a_server_that_comes_later() -> None:
+def test_device_problem_is_in_the_first_greeting_of_a_later_server() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link:
-        link.tell("unplugged")
+        link.report("unplugged")
         with Router(endpoint) as router:
             together(link, router, router.hellos, "a greeting")
             assert router.hellos()[0].problem == "unplugged"
 
 
 @pytest.mark.parametrize("bye", [True, False])
-def test_good_bye(bye: bool) -> None:
+def test_good_bye_is_sent_on_request(bye: bool) -> None:
     with Router() as router:
         link = Link(router.endpoint, HELLO, SystemClock())
         connect(link, router)
@@ -444,7 +450,7 @@ def test_good_bye(bye: bool) -> None:
         assert (wire.Bye("lab-pc", "run-1") in router.got) is bye
 
 
-def test_close_does_not_wait_for_a_server_that_is_not_there() -> None:
+def test_close_does_not_wait_for_an_absent_server() -> None:
     clock = SystemClock()
     link = Link(free_endpoint(), HELLO, clock)
     link.send([frame(k) for k in range(1, 100)])
@@ -460,8 +466,8 @@ def test_wait_connected_can_be_stopped() -> None:
         assert not link.connected
 
 
-def test_restart_of_the_real_server_loses_nothing_and_doubles_nothing() -> None:
-    """The server ends amid sixty frames: each one gets to the old or the new, and to neither twice."""
+def test_restart_of_the_real_server_neither_loses_nor_repeats_frames() -> None:
+    """Each of sixty frames reaches the old or the new server, and neither gets a frame twice."""
     clock = SystemClock()
     site = site_of({"server.bind": free_endpoint()})
     numbers = iter(range(1, 61))
@@ -497,14 +503,8 @@ def test_restart_of_the_real_server_loses_nothing_and_doubles_nothing() -> None:
     assert set(first) | set(second) == set(range(1, 61))
 
 
-def greeted(link: Link) -> bool:
-    """Let the link work; whether it has greeted."""
-    link.service()
-    return link._hello_ns > 0
-
-
-def test_a_clock_set_back_an_hour_stops_nothing() -> None:
-    """Stamps may jump; intervals are counted by a time that nobody sets."""
+def test_link_works_while_the_clock_is_set_back() -> None:
+    """Stamps may jump; intervals follow the monotonic clock."""
 
     class SetBack(HandClock):
         def now_ns(self) -> int:
@@ -514,39 +514,39 @@ def test_a_clock_set_back_an_hour_stops_nothing() -> None:
         with Router() as router:
             link = Link(router.endpoint, HELLO, clock)
             try:
-                wait_until(partial(greeted, link), "the first greeting to go out")
-                before = link._hello_ns
+                together(link, router, lambda router=router: len(router.hellos()) == 1, "the first greeting")  # type: ignore[misc]
                 clock.time_ns += 1_000_000_000
-                link.service()
-                assert link._hello_ns > before
+                together(link, router, lambda router=router: len(router.hellos()) == 2, "another greeting")  # type: ignore[misc]
             finally:
                 link.close(bye=False)
 
 
-def remembered(ask: BackfillRequest) -> list[Message]:
+def remembered(request: BackfillRequest) -> list[Message]:
     return [
-        frame(0, frame_index=frame_index, array=ask.array, active=False)
-        for frame_index in range(ask.first, ask.last + 1)
+        frame(0, frame_index=frame_index, array=request.array, active=False)
+        for frame_index in range(request.first, request.last + 1)
     ]
 
 
-def test_what_the_server_asks_for_is_sent_and_not_kept() -> None:
+def test_requested_frames_are_sent_and_not_kept() -> None:
     with Router() as router:
-        link = Link(router.endpoint, HELLO, SystemClock(), recent=remembered)
+        link = Link(router.endpoint, HELLO, SystemClock(), backfill=remembered)
         connect(link, router)
-        assert not [m for m in router.got if isinstance(m, wire.Hello) and m.answers]  # an older server would refuse it
-        router.say(wire.encode(wire.Request("run-1")))
+        assert not [
+            m for m in router.got if isinstance(m, wire.Hello) and m.answers
+        ]  # an older server would refuse the field
+        router.send(wire.encode(wire.Request("run-1")))
         greets = [m for m in router.got if isinstance(m, wire.Hello)]
         together(link, router, lambda: hellos(router) > len(greets), "another greeting")
         last = [m for m in router.got if isinstance(m, wire.Hello)][-1]
         assert last.answers
-        router.say(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
+        router.send(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
         together(link, router, lambda: len(sounds(router)) == 3, "the answer")
         assert [(m.array, m.frame_index, m.sequence) for m in sounds(router)] == [
             ("south", k, 0) for k in (700, 701, 702)
         ]
         assert link.kept == link.pending == 0
-        router.say(wire.encode(wire.Request("another run", {"south": (700, 703)})))
+        router.send(wire.encode(wire.Request("another run", {"south": (700, 703)})))
         router.ack()
         link.service()
         router.read()
@@ -562,13 +562,13 @@ def sounds(router: Router) -> list[Frame]:
     return [message for message in router.got if isinstance(message, Frame)]
 
 
-def test_another_server_is_not_taken_to_ask() -> None:
+def test_another_server_is_not_assumed_to_know_requests() -> None:
     clock = HandClock()
     with Router() as router:
-        link = Link(router.endpoint, HELLO, clock, recent=remembered)
+        link = Link(router.endpoint, HELLO, clock, backfill=remembered)
         connect(link, router)
         before = hellos(router)
-        router.say(wire.encode(wire.Request("run-1")))
+        router.send(wire.encode(wire.Request("run-1")))
         together(link, router, lambda: hellos(router) > before, "another greeting")
         clock.time_ns += 2 * SILENT_NS
         before = hellos(router)
@@ -578,11 +578,11 @@ def test_another_server_is_not_taken_to_ask() -> None:
         link.close(bye=False)
 
 
-def test_who_remembers_nothing_does_not_offer_it() -> None:
+def test_node_without_backfill_does_not_announce_answers() -> None:
     with Router() as router:
         link = Link(router.endpoint, HELLO, SystemClock())
         connect(link, router)
-        router.say(wire.encode(wire.Request("run-1")))
+        router.send(wire.encode(wire.Request("run-1")))
         router.ack()
         together(link, router, lambda: link.connected, "an acknowledgement")
         link.close(bye=False)

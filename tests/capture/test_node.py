@@ -1,4 +1,4 @@
-"""A capture node from sound to server: what it sends, how it ends, and what it says when nobody takes it."""
+"""A capture node from sound to server: its messages, its end, and its errors when the server does not take them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from livessl.capture.node import (
 )
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.receiver import Item, Joined, Left, Receiver
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, mark, site_of, wait_until
@@ -39,20 +39,20 @@ CLOCK = SystemClock()
 
 
 class PatientClock(SystemClock):
-    """A node by this clock never takes the server for gone.
+    """A clock by which the server is never silent.
 
-    By another it does where the machine stands still for two seconds, and sends again what the server has: frames come
-    twice then, and rightly.
+    With a real clock, a pause of the machine of two seconds makes the link reconnect and send frames again, as it
+    should, but these tests count frames.
     """
 
     def monotonic_ns(self) -> int:
-        """No interval passes."""
+        """Return a constant time."""
         return 0
 
 
 @dataclass
 class There:
-    """The real receiver, and all that came."""
+    """The real receiver, and all items that it has received."""
 
     receiver: Receiver
     items: list[Item] = field(default_factory=list)
@@ -62,7 +62,7 @@ class There:
         return site_of({"nodes.lab-pc.server": self.receiver.endpoint})
 
     def of(self, kind: type[Item]) -> list[Item]:
-        """What has come of a kind."""
+        """Return the received items of a kind."""
         self.items += self.receiver.take(1000, 0.001)
         return [item for item in self.items if isinstance(item, kind)]
 
@@ -81,29 +81,29 @@ def server() -> Iterator[There]:
 
 
 def sound() -> Float32Array:
-    """A second and a half, with a burst after the first second."""
+    """Return 1.5 s of quiet noise with a burst after the first second."""
     samples = hiss(1.5, level=1e-3)
     samples[:, RATE_HZ : RATE_HZ + RATE_HZ // 5] += hiss(0.2, seed=1, level=0.2)
     return samples
 
 
-def parts(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[Part]:
+def recordings(start_ns: int = START_NS, samples: Float32Array | None = None) -> list[AssignedRecording]:
     heard = sound() if samples is None else samples
-    placed = Placed(ArrayRecording("burst", float(RATE_HZ), heard), start_ns)
-    return [Part(array, placed, (1, 2, 3, 4)) for array in ARRAYS]
+    burst = MemoryRecording("burst", float(RATE_HZ), heard)
+    return [AssignedRecording(array, burst, start_ns, (1, 2, 3, 4)) for array in ARRAYS]
 
 
 def never() -> bool:
     return False
 
 
-def replay(there: There, played: list[Part], progress: Callable[[int], None] | None = None) -> None:
+def replay(there: There, played: list[AssignedRecording], progress: Callable[[int], None] | None = None) -> None:
     pace = UnpacedClock(START_NS)
     send_session(there.site, there.receiver.endpoint, played, pace, PatientClock(), "run-1", never, progress)
 
 
 def assert_whole(there: There, first: int = FIRST) -> None:
-    """Every message of both arrays is there, in order, the burst in frames."""
+    """Assert that every message of both arrays has arrived in order, and the burst as frames."""
     for array in ARRAYS:
         messages = there.messages(array)
         assert [m.sequence for m in messages] == list(accumulate(isinstance(m, Frame) for m in messages))
@@ -111,25 +111,25 @@ def assert_whole(there: There, first: int = FIRST) -> None:
         assert messages[-1].frame_index == first + 29
 
 
-def test_session_arrives_whole_and_is_said_good_bye_to() -> None:
+def test_session_arrives_whole_and_ends_with_a_good_bye() -> None:
     with server() as there:
         progress: list[int] = []
-        replay(there, parts(), progress.append)
+        replay(there, recordings(), progress.append)
         wait_until(lambda: there.of(Left), "the good-bye")
         hello = wire.Hello("replay", "run-1", {"north": 16000.0, "south": 16000.0}, replay=True)
         assert there.items[0] == Joined(hello)
-        assert there.items[-1] == Left(replace(hello, answers=True))  # for the server knows how to ask
+        assert there.items[-1] == Left(replace(hello, answers=True))  # because the server has announced requests
         assert_whole(there)
         assert progress == sorted(progress)
         assert progress[-1] == START_NS + 1_500_000_000
 
 
-def test_session_waits_for_a_server_that_comes_later() -> None:
+def test_session_waits_for_a_server_that_starts_later() -> None:
     with server() as there:
         site = site_of({"server.bind": there.receiver.endpoint})
     played = Thread(
         target=send_session,
-        args=(site, site.server.bind, parts(), UnpacedClock(START_NS), PatientClock(), "run-1", never),
+        args=(site, site.server.bind, recordings(), UnpacedClock(START_NS), PatientClock(), "run-1", never),
     )
     played.start()
     receiver = Receiver(site, CLOCK)
@@ -144,18 +144,18 @@ def test_session_waits_for_a_server_that_comes_later() -> None:
 
 
 def knocking() -> Float32Array:
-    """Forty seconds of noise, every other half second: nearly every frame is kept."""
+    """Return 40 s of noise that is loud every other half second, so that nearly every frame is sent."""
     samples = hiss(40.0, level=0.1)
     loud = np.arange(samples.shape[1]) // (RATE_HZ // 2) % 2 == 1
     return np.where(loud, samples, 1e-3 * samples).astype(np.float32)
 
 
-def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
+def test_session_is_not_played_faster_than_the_server_takes_messages() -> None:
     with server() as there:
-        played = Thread(target=replay, args=(there, parts(samples=knocking())))
+        played = Thread(target=replay, args=(there, recordings(samples=knocking())))
         played.start()
         wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.monotonic_ns()), "the node")
-        wait_until(there.receiver._queue.full, "a full queue")  # nobody takes anything
+        wait_until(there.receiver._queue.full, "a full queue")  # no message is taken
         assert played.is_alive()
         wait_until(lambda: there.of(Left), "the end", 30)
         played.join()
@@ -166,7 +166,7 @@ def test_session_is_not_played_faster_than_the_server_takes_it() -> None:
 
 
 class Stuck(SystemClock):
-    """Time that passes while nothing is sent: a tenth of a second whenever somebody waits."""
+    """A clock that advances by a tenth of a second at each wait."""
 
     def __init__(self) -> None:
         self.waited_ns = 0
@@ -179,17 +179,17 @@ class Stuck(SystemClock):
         return super().sleep_until_ns(time_ns)
 
 
-def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
-    """Nor ended before: the server may ask for what is remembered. But where it settles nothing it goes on."""
+def test_session_is_not_played_far_ahead_of_the_settled_time() -> None:
+    """The server can thus still request frames; but the replay continues if the server settles nothing."""
     clock, reached = Stuck(), dict[int, int]()
     with server() as there:
-        there.receiver.ingest.settled = dict.fromkeys(ARRAYS, FIRST + 20)
+        there.receiver.ingest.final_until = dict.fromkeys(ARRAYS, FIRST + 20)
 
         def note(end_ns: int) -> None:
             reached[clock.waited_ns] = end_ns - START_NS
-            there.of(Left)  # take what has come
+            there.of(Left)  # take the messages that have arrived
 
-        played = parts(samples=hiss(15.0, level=1e-3))
+        played = recordings(samples=hiss(15.0, level=1e-3))
         pace = UnpacedClock(START_NS)
         send_session(there.site, there.receiver.endpoint, played, pace, clock, "run-1", never, note)
     before, *_, after = (reached[waited_ns] for waited_ns in sorted(reached))
@@ -199,54 +199,56 @@ def test_session_is_not_played_far_ahead_of_what_is_settled() -> None:
 
 
 def test_recordings_arrive_whole() -> None:
-    """At real speed; they began a little ago, so that there is nothing to wait for."""
+    """Recordings play at real speed; these began a little ago, so that the test need not wait."""
     with server() as there:
         first = CLOCK.now_ns() // FRAME_NS - 30
-        capture_recordings(there.site, "lab-pc", parts(first * FRAME_NS), PatientClock(), "run-1", never)
+        capture_recordings(there.site, "lab-pc", recordings(first * FRAME_NS), PatientClock(), "run-1", never)
         wait_until(lambda: there.of(Left), "the good-bye")
         assert there.items[0] == Joined(wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0}))
         for array in ARRAYS:
             frames = [m.frame_index - first for m in there.messages(array) if isinstance(m, Frame)]
-            assert sorted(frames) == list(range(12, 30))  # live ones overtake what was cut before the connection
+            assert sorted(frames) == list(range(12, 30))  # live frames overtake those cut before the connection
 
 
-def test_nobody_there_is_told_at_the_end() -> None:
+def test_absent_server_is_reported_at_the_end() -> None:
     with server() as there:
         endpoint, site = there.receiver.endpoint, there.site
     with pytest.raises(UndeliveredError) as caught:
-        capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", never)
-    assert str(caught.value).endswith(f"were never taken by the server at {endpoint}; is one running there?")
+        capture_recordings(site, "lab-pc", recordings(), UnpacedClock(START_NS), "run-1", never)
+    assert str(caught.value).endswith(f"were never acknowledged by the server at {endpoint}; is one running there?")
     assert int(str(caught.value).split()[0]) >= 36
 
 
-def test_refusal_is_told() -> None:
+def test_refusal_is_reported() -> None:
     with server() as there:
         first = Link(there.receiver.endpoint, wire.Hello("other-pc", "run-0", {"north": 16000.0}), CLOCK)
         first.wait_connected(never)
         sequence = count(1)
 
         def heard() -> bool:
-            first.send([mark(next(sequence))])  # who is silent for 2 s no longer holds its arrays
+            first.send([mark(next(sequence))])  # a node that is silent for 2 s loses its arrays
             return False
 
         start_ns = CLOCK.now_ns() - 2_000_000_000
         with pytest.raises(UndeliveredError, match="refused the sound: array 'north' is captured by node 'other-pc'"):
-            capture_recordings(there.site, "lab-pc", parts(start_ns), CLOCK, "run-1", heard)
+            capture_recordings(there.site, "lab-pc", recordings(start_ns), CLOCK, "run-1", heard)
         with pytest.raises(UndeliveredError, match="refused the sound: live nodes are connected"):
-            send_session(there.site, first.endpoint, parts()[1:], UnpacedClock(START_NS), CLOCK, "run-2", heard)
+            send_session(there.site, first.endpoint, recordings()[1:], UnpacedClock(START_NS), CLOCK, "run-2", heard)
         first.close(bye=True)
 
 
-def test_stopping_is_no_failure() -> None:
+def test_stopping_is_not_an_error() -> None:
     with server() as there:
         site = there.site
     asked = count()
-    capture_recordings(site, "lab-pc", parts(), UnpacedClock(START_NS), "run-1", lambda: next(asked) > 10)
-    send_session(site, "tcp://127.0.0.1:1", parts(), UnpacedClock(START_NS), CLOCK, "run-1", lambda: next(asked) > 15)
+    capture_recordings(site, "lab-pc", recordings(), UnpacedClock(START_NS), "run-1", lambda: next(asked) > 10)
+    send_session(
+        site, "tcp://127.0.0.1:1", recordings(), UnpacedClock(START_NS), CLOCK, "run-1", lambda: next(asked) > 15
+    )
 
 
 class Scripted:
-    """A device whose troubles are written down: for each 50 ms None, or what is wrong instead of sound."""
+    """A device that follows a script: for each 50 ms either None, or a problem in place of sound."""
 
     name = "UMC1820"
     sample_rate_hz = float(RATE_HZ)
@@ -279,7 +281,7 @@ class Scripted:
 
 
 def captured(script: list[str | None], stop: Callable[[Scripted], bool]) -> tuple[There, Scripted]:
-    """What a server that knows the node gets of such a device."""
+    """Return what a connected server receives from such a device."""
     with server() as there:
         device = Scripted(script, lambda: there.of(Joined))
         capture_device(there.site, "lab-pc", device, CLOCK, "run-1", lambda: stop(device))
@@ -287,7 +289,7 @@ def captured(script: list[str | None], stop: Callable[[Scripted], bool]) -> tupl
         return there, device
 
 
-def test_device_is_entered_heard_and_left() -> None:
+def test_device_is_entered_captured_and_left() -> None:
     there, device = captured([None] * 30, lambda _: False)
     assert device.entered
     assert device.left
@@ -297,7 +299,7 @@ def test_device_is_entered_heard_and_left() -> None:
         assert there.messages(array)[-1].frame_index == FIRST + 29
 
 
-def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCaptureFixture) -> None:
+def test_device_problem_and_its_end_reach_the_server(caplog: pytest.LogCaptureFixture) -> None:
     unplugged = "input device 'UMC1820' is not connected"
     seen: set[str | None] = set()
     with server() as there:
@@ -320,7 +322,7 @@ def test_trouble_of_the_device_reaches_the_server_and_goes(caplog: pytest.LogCap
     assert "device 'UMC1820' delivers sound" in caplog.text
 
 
-def test_device_is_left_when_told_to_stop() -> None:
+def test_device_is_left_on_stop() -> None:
     heard: list[bool] = []
 
     def after_twenty(device: Scripted) -> bool:
@@ -332,11 +334,11 @@ def test_device_is_left_when_told_to_stop() -> None:
     assert all(m.frame_index < FIRST + 20 for m in there.messages("north"))
 
 
-def test_full_scale_and_beyond_arrive_as_they_are() -> None:
+def test_samples_beyond_full_scale_arrive_unchanged() -> None:
     samples = sound()
     samples[:, RATE_HZ] = 1.7
     with server() as there:
-        replay(there, parts(samples=samples))
+        replay(there, recordings(samples=samples))
         wait_until(lambda: there.of(Left), "the good-bye")
         frames = [item for item in there.items if isinstance(item, Frame)]
         assert max(float(frame.samples.max()) for frame in frames) == pytest.approx(1.7)

@@ -1,4 +1,4 @@
-"""The PortAudio device: against a fake `sounddevice` for what no test machine has, and against a virtual sound card."""
+"""The PortAudio device, with a fake `sounddevice` for rare hardware states, and with a virtual sound card."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from livessl.capture.sound_device import SoundDevice, input_devices
 from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -37,11 +37,11 @@ NOW_NS = 1_700_000_000_000_000_000
 
 
 class FakeError(Exception):
-    """Stands for sounddevice.PortAudioError: a text, and usually a code."""
+    """Replaces sounddevice.PortAudioError: a text, and usually a code."""
 
 
 class FakeStream:
-    """Stands for sounddevice.InputStream; `play` is the driver."""
+    """Replaces sounddevice.InputStream; `play` acts as the driver."""
 
     opened: ClassVar[list[FakeStream]] = []
     refusal: ClassVar[FakeError | None] = None
@@ -72,7 +72,7 @@ class FakeStream:
 
 
 class BrokenStream(FakeStream):
-    """A stream that can no longer even say whether it is active."""
+    """A stream that fails even when its state is read."""
 
     @property
     def active(self) -> bool:
@@ -84,7 +84,7 @@ class BrokenStream(FakeStream):
 
 
 class FakePortAudio:
-    """Stands for the sounddevice module: new devices show only after `_terminate` and `_initialize`."""
+    """Replaces the sounddevice module: new devices appear only after `_terminate` and `_initialize`."""
 
     PortAudioError = FakeError
     InputStream = FakeStream
@@ -96,7 +96,7 @@ class FakePortAudio:
         self.running = True
 
     def plug(self, *devices: tuple[str, int]) -> None:
-        """Put devices (name, input channels) in, with PortAudio already aware of them."""
+        """Connect devices (name, input channels) that PortAudio has detected already."""
         self.plugged = self.seen = list(devices)
 
     def query_hostapis(self) -> list[dict[str, Any]]:
@@ -128,7 +128,7 @@ class FakePortAudio:
 
 @pytest.fixture
 def portaudio(monkeypatch: pytest.MonkeyPatch) -> FakePortAudio:
-    """A fake library where `import sounddevice` finds it, and a device that waits milliseconds."""
+    """Install the fake library as `sounddevice`, and shorten the device's waits to milliseconds."""
     fake = FakePortAudio()
     fake.plug(("Built-in: ALC257 (hw:0,0)", 2), ("HDMI (hw:0,3)", 0), ("UMC1820: USB Audio (hw:1,0)", 8))
     monkeypatch.setitem(sys.modules, "sounddevice", fake)
@@ -166,7 +166,7 @@ class TestFinding:
             assert opened.problem is None
         assert [stream.wanted["device"] for stream in FakeStream.opened] == [2]
 
-    def test_asks_for_what_was_configured(self, portaudio: FakePortAudio) -> None:
+    def test_stream_is_opened_as_configured(self, portaudio: FakePortAudio) -> None:
         with SoundDevice(SoundDeviceConfig(name="UMC", sample_rate_hz=44100, block_s=0.01), 8, UnpacedClock()):
             wanted = FakeStream.opened[0].wanted
         assert (wanted["samplerate"], wanted["blocksize"], wanted["channels"]) == (44100, 441, 8)
@@ -174,40 +174,42 @@ class TestFinding:
 
     def test_ambiguous_name_prints_the_candidates(self, portaudio: FakePortAudio) -> None:
         portaudio.plug(("UMC1820: USB Audio (hw:1,0)", 8), ("UMC404HD (hw:2,0)", 4), ("Webcam", 1))
-        with pytest.raises(DeviceError, match=r"'umc'.*fits one input device, got 2: ALSA: UMC1820.*ALSA: UMC404HD"):
+        with pytest.raises(DeviceError, match=r"'umc'.*matches one input device, got 2: ALSA: UMC1820.*ALSA: UMC404HD"):
             device("umc").__enter__()
 
-    def test_host_api_tells_namesakes_apart(self, portaudio: FakePortAudio) -> None:
+    def test_host_api_distinguishes_devices_of_one_name(self, portaudio: FakePortAudio) -> None:
         portaudio.plug(("UMC1820", 8), ("JACK UMC1820", 8))
         with pytest.raises(DeviceError, match="got 2"):
             device("UMC1820").__enter__()
         with device("JACK Audio Connection Kit: UMC1820"):
             assert FakeStream.opened[0].wanted["device"] == 1
 
-    def test_host_api_alone_names_nothing(self, portaudio: FakePortAudio) -> None:
+    def test_host_api_alone_matches_no_device(self, portaudio: FakePortAudio) -> None:
         for name in ("ALSA", "ALSA: "):
             with device(name) as opened:
                 assert "not connected" in str(opened.problem)
 
-    def test_name_in_full_wins_over_names_that_hold_it(self, portaudio: FakePortAudio) -> None:
+    def test_full_name_takes_precedence_over_names_that_contain_it(self, portaudio: FakePortAudio) -> None:
         portaudio.plug(("Mic Pro", 4), ("Mic", 4))
         with device("mic"):
             assert FakeStream.opened[0].wanted["device"] == 1
 
-    def test_too_few_channels(self, portaudio: FakePortAudio) -> None:
-        with pytest.raises(DeviceError, match="'ALC257' has 2 input channels, arrays use channel 5; correct"):
+    def test_device_with_too_few_channels_is_refused(self, portaudio: FakePortAudio) -> None:
+        with pytest.raises(DeviceError, match="'ALC257': expected at least 5 input channels, got 2; correct"):
             device("ALC257", channels=5).__enter__()
 
-    def test_outputs_do_not_count(self, portaudio: FakePortAudio) -> None:
+    def test_output_devices_are_not_listed(self, portaudio: FakePortAudio) -> None:
         assert [found.name for found in input_devices()] == ["Built-in: ALC257 (hw:0,0)", "UMC1820: USB Audio (hw:1,0)"]
 
-    def test_rate_that_the_device_lacks(self, portaudio: FakePortAudio, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_unsupported_sampling_rate_is_refused(
+        self, portaudio: FakePortAudio, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(FakeStream, "refusal", FakeError("Invalid sample rate", -9997))
         with pytest.raises(DeviceError, match=r"4 channels at 48000 Hz; set device\.sample_rate_hz"):
             device().__enter__()
         assert FakeStream.opened[0].closed
 
-    def test_without_the_library(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_portaudio_is_reported(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "sounddevice.py").write_text('raise OSError("PortAudio library not found")\n')
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.delitem(sys.modules, "sounddevice", raising=False)
@@ -243,7 +245,7 @@ class TestBlocks:
             (9.0, 5.0, 0.020),
         ],
     )
-    def test_stamp_is_the_time_of_conversion_where_sane(
+    def test_stamp_is_the_conversion_time_if_plausible(
         self, portaudio: FakePortAudio, age_s: float, origin_s: float, believed_s: float
     ) -> None:
         with device() as opened:
@@ -251,7 +253,7 @@ class TestBlocks:
             block = next(opened)
         assert abs(block.stamp_ns - (NOW_NS - believed_s * 1e9)) < 1000  # float64 seconds keep a microsecond
 
-    def test_stamp_does_not_believe_a_sound_server(self, portaudio: FakePortAudio) -> None:
+    def test_conversion_time_of_a_sound_server_is_ignored(self, portaudio: FakePortAudio) -> None:
         portaudio.plug(("pulse", 32))
         with device("pulse") as opened:
             FakeStream.opened[0].play(noise(), age_s=0.2)
@@ -280,14 +282,14 @@ class TestBlocks:
         assert (after.first_index, after.overflow) == ((capacity + 3) * BLOCK, True)
         assert (later.first_index, later.overflow) == ((capacity + 4) * BLOCK, False)
 
-    def test_silence_of_the_device_is_said(self, portaudio: FakePortAudio) -> None:
+    def test_empty_block_comes_while_the_device_is_silent(self, portaudio: FakePortAudio) -> None:
         with device() as opened:
             FakeStream.opened[0].play(noise())
             _, block = islice(opened, 2)
         assert (block.first_index, block.samples.shape, block.stamp_ns) == (BLOCK, (4, 0), NOW_NS)
         assert not block.overflow
 
-    def test_ends_with_the_context(self, portaudio: FakePortAudio) -> None:
+    def test_iterator_ends_with_the_context(self, portaudio: FakePortAudio) -> None:
         opened = device()
         assert list(opened) == []
         with opened:
@@ -297,7 +299,7 @@ class TestBlocks:
 
 
 class TestWaiting:
-    def test_absent_device_is_waited_for(self, portaudio: FakePortAudio) -> None:
+    def test_absent_device_is_opened_when_it_appears(self, portaudio: FakePortAudio) -> None:
         umc = portaudio.plugged.pop()
         portaudio._initialize()
         with device() as opened:
@@ -309,7 +311,7 @@ class TestWaiting:
             FakeStream.opened[0].play(noise())
             assert next(opened).first_index == 0
 
-    def test_vanished_device_comes_back_with_a_gap(self, portaudio: FakePortAudio) -> None:
+    def test_device_that_returns_continues_after_a_gap(self, portaudio: FakePortAudio) -> None:
         umc = portaudio.plugged[-1]
         with device() as opened:
             FakeStream.opened[0].play(noise())
@@ -328,7 +330,7 @@ class TestWaiting:
         assert (back.first_index, back.overflow) == (BLOCK, True)
         assert (later.first_index, later.overflow) == (2 * BLOCK, False)
 
-    def test_stream_that_fails_when_asked_is_gone(
+    def test_stream_whose_state_cannot_be_read_is_given_up(
         self, portaudio: FakePortAudio, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(FakePortAudio, "InputStream", BrokenStream)
@@ -341,7 +343,7 @@ class TestWaiting:
             steps(opened, lambda: len(FakeStream.opened) == 2)
             assert opened.problem is None
 
-    def test_busy_device_is_tried_again(self, portaudio: FakePortAudio, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_busy_device_is_retried(self, portaudio: FakePortAudio, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(FakeStream, "refusal", FakeError("Device unavailable", -9985))
         with device() as opened:
             assert opened.problem == "device 'UMC1820' cannot be opened: Device unavailable; trying again"
@@ -349,7 +351,7 @@ class TestWaiting:
             monkeypatch.setattr(FakeStream, "refusal", None)
             steps(opened, lambda: opened.problem is None)
 
-    def test_wrong_device_in_mid_run_is_a_problem_not_the_end(self, portaudio: FakePortAudio) -> None:
+    def test_unsuitable_device_during_a_run_is_a_problem_and_no_error(self, portaudio: FakePortAudio) -> None:
         portaudio.plug()
         with device() as opened:
             portaudio.plugged = [("UMC1820 a", 8), ("UMC1820 b", 8)]
@@ -357,7 +359,7 @@ class TestWaiting:
             portaudio.plugged = portaudio.plugged[:1]
             steps(opened, lambda: opened.problem is None)
 
-    def test_library_that_does_not_start_is_started_again(self, portaudio: FakePortAudio) -> None:
+    def test_start_of_portaudio_is_retried(self, portaudio: FakePortAudio) -> None:
         umc = portaudio.plugged[-1]
         portaudio.plug()
         with device() as opened:
@@ -368,7 +370,7 @@ class TestWaiting:
 
 
 TONES_HZ = (440.0, 700.0, 1130.0, 1870.0)
-"""One for each channel; none is another's harmonic."""
+"""Frequencies in Hz, one for each channel; none is a harmonic of another."""
 
 AMPLITUDE = 0.5
 
@@ -377,7 +379,7 @@ import sys
 import numpy as np
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 with SoundDevice(SoundDeviceConfig(name="virtual", sample_rate_hz=48000), 4, SystemClock()) as device:
     blocks = []
@@ -399,7 +401,7 @@ WATCHER = """
 import json
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 clock, last = SystemClock(), None
 end_ns = clock.now_ns() + 60_000_000_000
@@ -416,10 +418,10 @@ with SoundDevice(SoundDeviceConfig(name="virtual", sample_rate_hz=48000), 4, clo
 
 
 class VirtualCard:
-    """A sound card of four channels that is a PulseAudio of our own; what is played into it can be recorded."""
+    """A virtual sound card of four channels, a private PulseAudio: sound that is played into it can be recorded."""
 
     CHANNELS = "front-left,front-right,rear-left,rear-right"
-    """In this order ALSA numbers four channels, so nothing on the way has a reason to mix them."""
+    """Channel map in ALSA's order of four channels, so that no layer remixes them."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -491,7 +493,7 @@ class VirtualCard:
         )
 
     def start(self, *command: str) -> subprocess.Popen[str]:
-        """Start a program that meets this card and no other; it ends with the test."""
+        """Start a program that sees only this card; it ends with the test."""
         process = subprocess.Popen(
             command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
@@ -525,7 +527,7 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualCard]:
 
 
 def sine_parts(signal: NDArray[np.floating[Any]], frequency_hz: float) -> tuple[float, float]:
-    """Amplitude of the sine that fits best, and RMS of what it leaves."""
+    """Return the amplitude of the best fitting sine, and the RMS of the residual."""
     phase = 2 * np.pi * frequency_hz * np.arange(len(signal)) / RATE_HZ
     basis = np.column_stack([np.cos(phase), np.sin(phase)])
     weights, *_ = np.linalg.lstsq(basis, signal, rcond=None)
@@ -533,7 +535,7 @@ def sine_parts(signal: NDArray[np.floating[Any]], frequency_hz: float) -> tuple[
 
 
 @pytest.mark.sound_card
-def test_records_each_channel_of_a_card_in_its_place(card: VirtualCard, tmp_path: Path) -> None:
+def test_each_channel_of_a_card_is_recorded_in_its_place(card: VirtualCard, tmp_path: Path) -> None:
     card.plug_in()
     seconds = np.arange(20 * RATE_HZ)[:, None] / RATE_HZ
     card.play((AMPLITUDE * np.sin(2 * np.pi * np.array(TONES_HZ) * seconds)).astype(np.float32))
@@ -562,7 +564,7 @@ def test_records_each_channel_of_a_card_in_its_place(card: VirtualCard, tmp_path
 
 
 @pytest.mark.sound_card
-def test_waits_for_a_card_that_is_pulled_out(card: VirtualCard) -> None:
+def test_card_that_is_pulled_out_is_opened_again(card: VirtualCard) -> None:
     watcher = card.start(sys.executable, "-c", WATCHER)
     assert watcher.stdout is not None
     states: Iterator[dict[str, Any]] = (json.loads(line) for line in watcher.stdout)

@@ -1,4 +1,4 @@
-"""What a node keeps: bounded, in order, through kills and full disks."""
+"""The spool keeps frames in order, within its bounds, through killed processes and full disks."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_frames_come_back_unchanged_in_order_of_time(place: Path | None) -> None
     spool.close()
 
 
-def test_what_is_settled_is_forgotten(place: Path | None) -> None:
+def test_settled_frames_are_released(place: Path | None) -> None:
     spool = filled(place)
     spool.forget("north", 6)
     assert frame_indices(spool) == [("south", 3), ("south", 6), ("north", 7), ("north", 8), ("south", 9), ("north", 10)]
@@ -63,7 +63,7 @@ def test_what_is_settled_is_forgotten(place: Path | None) -> None:
     spool.close()
 
 
-def test_oldest_go_first_and_are_told(place: Path | None) -> None:
+def test_oldest_frames_are_removed_and_returned(place: Path | None) -> None:
     spool = filled(place, range(1, 5), max_bytes=4 * SIZE)
     _, gone = spool.append(frame(5, frame_index=5))
     assert [(kept.array, kept.frame_index) for kept in gone] == [("north", 1)]
@@ -71,13 +71,13 @@ def test_oldest_go_first_and_are_told(place: Path | None) -> None:
     spool.close()
 
 
-def test_age_is_bounded(place: Path | None) -> None:
+def test_old_frames_are_removed(place: Path | None) -> None:
     spool = filled(place, range(1, 40), max_age_s=0.5)
     assert [frame_index for _, frame_index in frame_indices(spool)] == list(range(29, 40))
     spool.close()
 
 
-def test_clock_set_back_takes_the_future_away(place: Path | None) -> None:
+def test_clock_set_back_removes_later_frames(place: Path | None) -> None:
     spool = filled(place, range(1, 9))
     _, gone = spool.append(frame(9, frame_index=5))
     assert sorted(kept.frame_index for kept in gone) == [5, 7, 8]
@@ -85,10 +85,10 @@ def test_clock_set_back_takes_the_future_away(place: Path | None) -> None:
     spool.close()
 
 
-def test_frames_outlive_the_node(tmp_path: Path) -> None:
+def test_frames_outlive_the_process(tmp_path: Path) -> None:
     spool = filled(tmp_path)
     expected = contents(spool)
-    # no close: the node was killed
+    # not closed, as after a kill
     again = Spool(tmp_path)
     assert contents(again) == expected
     assert again.torn == 0
@@ -98,8 +98,8 @@ def test_frames_outlive_the_node(tmp_path: Path) -> None:
     again.close()
 
 
-def test_node_that_is_killed_leaves_whole_frames(tmp_path: Path) -> None:
-    """A real process, killed with -9 while it writes."""
+def test_killed_node_leaves_whole_frames(tmp_path: Path) -> None:
+    """A real process is killed with signal 9 while it writes."""
     ready, told = os.pipe()
     child = os.fork()
     if child == 0:
@@ -145,7 +145,7 @@ def test_torn_or_changed_tail_ends_a_segment(
     again.close()
 
 
-def test_segments_go_when_nothing_of_them_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segment_without_needed_frames_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spools, "SEGMENT_BYTES", 3 * (SIZE + 8) + 8)
     spool = filled(tmp_path)
     assert len(list(tmp_path.iterdir())) == 4
@@ -176,7 +176,7 @@ def disk_of(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_full_disk_costs_nothing_while_memory_lasts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_full_disk_loses_nothing_while_memory_lasts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     spool = Spool(tmp_path)
     with disk_of(SIZE // 2):
         for k in range(1, 8):
@@ -186,20 +186,20 @@ def test_full_disk_costs_nothing_while_memory_lasts(tmp_path: Path, caplog: pyte
         assert isinstance(wire.decode(data), Frame)
     spool.append(frame(8, frame_index=8))
     assert len(contents(spool)) == 8
-    assert caplog.text.count("kept in memory now: free space") == 1
+    assert caplog.text.count("kept in memory now; free space") == 1
     spool.close()
     again = Spool(tmp_path)
     assert [frame_index for _, frame_index in frame_indices(again)] == [8]
     again.close()
 
 
-def test_folder_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(SpoolError, match=r"spool\.directory: cannot use .*file.*; name a writable folder, or null"):
         Spool(tmp_path / "file")
 
 
-def test_what_changed_under_us_is_told(tmp_path: Path) -> None:
+def test_changed_segment_is_reported(tmp_path: Path) -> None:
     spool = filled(tmp_path)
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[: SIZE // 2])

@@ -24,13 +24,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from livessl import __version__
 from livessl.capture.link import Link
-from livessl.cli import main as command_line
 from livessl.cli.main import main
 from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.errors import ConfigError, Fault
 from livessl.lab import demo
 from livessl.recordings.session import read_session
 from livessl.server.receiver import Receiver
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.site.models import Site
 from livessl.wire import Hello
 from small_site import RATE_HZ, hiss, running_server, site_of, wait_until, write_site, write_wav
 
@@ -159,7 +159,7 @@ def test_wrong_use(run: Run, arguments: str, said: str) -> None:
 def test_check_of_a_good_site(run: Run, recorded: Recorded) -> None:
     done = run("check", recorded.site)
     assert done.code == 0
-    assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid nodes" in done.out
+    assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid points" in done.out
     [told] = run("check", recorded.site, "--json").objects
     expected = {"valid": True, "faults": [], "warnings": [], "site": "small", "arrays": ["north", "south"]}
     assert told == {**expected, "nodes": 3840}
@@ -349,7 +349,7 @@ def test_all_files_that_do_not_fit_are_told(run: Run, recorded: Recorded, tmp_pa
         ("north=1,2,3", "expected 4 different channel numbers from 1 to 4 for array 'north', got [1, 2, 3]"),
         ("north=1,2,3,5", "expected 4 different channel numbers from 1 to 4"),
         ("north=1,2,3,3", "expected 4 different channel numbers from 1 to 4"),
-        ("west=1,2,3,4", "channels of array 'west': no recording of it is given; there are north, south"),
+        ("west=1,2,3,4", "channels of array 'west': expected an array with a recording (north, south)"),
     ],
 )
 def test_channels_that_do_not_fit(run: Run, recorded: Recorded, channels: str, said: str) -> None:
@@ -475,9 +475,7 @@ def test_what_is_for_files_is_not_for_an_audio_interface(
 ) -> None:
     done = run("capture", "--site", recorded.site, "--node", "lab-pc", *options)
     assert done.code == 2
-    assert done.err == (
-        f"livessl: error: {options[0]}: applies to files, and none is given; take it away or add --wav\n"
-    )
+    assert done.err == (f"livessl: error: {options[0]}: applies to files, and none is given; remove it or add --wav\n")
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 0), (("--once",), 130)])
@@ -490,7 +488,7 @@ def test_interrupted_demo(run: Run, monkeypatch: pytest.MonkeyPatch, options: tu
 def test_interrupted_simulation_is_cut_short(
     run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.simulate.export.write_scene", interrupted)
+    monkeypatch.setattr("livessl.cli.simulate.write_scene", interrupted)
     assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
 
 
@@ -519,7 +517,8 @@ def test_capture_with_no_server_says_so_at_the_end(run: Run, recorded: Recorded,
     done = run("capture", "--site", site, "--node", "lab-pc", *recorded.wavs(), "--start-at", begin)
     assert done.code == 1
     assert re.search(
-        rf"livessl: error: \d+ messages were never taken by the server at {endpoint}; is one running there\?", done.err
+        rf"livessl: error: \d+ messages were never acknowledged by the server at {endpoint}; is one running there\?",
+        done.err,
     )
 
 
@@ -695,7 +694,12 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
     seen: list[set[int]] = []
-    monkeypatch.setattr(command_line, "load_site", lambda _: seen.append(threads()) or site_of())  # type: ignore[func-returns-value]
+
+    def load(_: Path) -> Site:
+        seen.append(threads())
+        return site_of()
+
+    monkeypatch.setattr("livessl.cli.check.load_site", load)
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")
@@ -718,7 +722,7 @@ def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
             [Fault(site.server.http.host, f"{site.server.http.port} {site.server.http.tokens} {site.keys}")]
         )
 
-    monkeypatch.setattr("livessl.server.app.Server", refuse)
+    monkeypatch.setattr("livessl.cli.replay.Server", refuse)
     assert main(["replay", str(session), *([] if own else ["--site", str(path)])]) == 2
     expected = "127.0.0.1: 8001 None None" if own else "0.0.0.0: 8001 tokens.yaml None"
     assert expected in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_a_node_loads_nothing_that_localizes() -> None:
         "livessl.core.kernels",
         "livessl.core.locate.peak_search",
     }
-    heavy |= {"livessl.core.locate.srp", "livessl.server", "livessl.simulate", "fastapi", "numba", "uvicorn"}
+    heavy |= {"livessl.core.locate.srp", "livessl.server", "livessl.simulation", "fastapi", "numba", "uvicorn"}
     assert names & (heavy | OTHER_COMMANDS | NEVER_LIVE) == set()
 
 
@@ -57,7 +57,7 @@ def test_a_server_loads_nothing_of_other_commands(tmp_path: Path) -> None:
         site.write_text(text, encoding="utf-8")
         names = loaded("serve", "--site", str(site), code=1)  # once all else is ready
     assert {"livessl.server.api.app", "livessl.core.locate.peak_search", "fastapi", "numba"} <= names
-    assert names & (OTHER_COMMANDS | NEVER_LIVE | {"livessl.recordings.recording", "livessl.simulate"}) == set()
+    assert names & (OTHER_COMMANDS | NEVER_LIVE | {"livessl.recordings.recording", "livessl.simulation"}) == set()
 
 
 def test_methods_of_a_site_file_are_the_estimators() -> None:

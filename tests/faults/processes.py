@@ -28,8 +28,8 @@ from proxy import Proxy
 from websockets.sync.client import connect
 
 from livessl.clock import utc_ns, utc_text
-from livessl.simulate.export import write_scene
-from livessl.simulate.scene import make_scene
+from livessl.simulation.export import write_scene
+from livessl.simulation.scene import make_scene
 from livessl.site import keys
 from livessl.site.load import load_site
 from small_site import RATE_HZ, Changes, hiss, small

@@ -34,12 +34,12 @@ from clients import Listener, Log, open_client
 from livessl import wire
 from livessl.clock import UnpacedClock, utc_ns
 from livessl.core.types import FRAME_NS, Frame, Message
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
 from livessl.server.latency import Arrival
-from livessl.simulate.scene import make_scene, render
+from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, site_of
 
@@ -135,16 +135,16 @@ def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
         heard: dict[str, Heard] = {}
         for spec in site.specs:
             samples = render(scene, spec.microphones_m, seed=k)
-            part = Part(spec.name, Placed(ArrayRecording(spec.name, float(RATE_HZ), samples), 0), (1, 2, 3, 4))
+            part = AssignedRecording(spec.name, MemoryRecording(spec.name, float(RATE_HZ), samples), 0, (1, 2, 3, 4))
             heard[spec.name] = _by_interval(site, part)
         sounds.append(heard)
     return sounds
 
 
-def _by_interval(site: Site, part: Part) -> dict[int, list[Frame]]:
+def _by_interval(site: Site, part: AssignedRecording) -> dict[int, list[Frame]]:
     found: dict[int, list[Frame]] = {}
     run_up: list[Frame] = []
-    for _, batch in played_messages(*pipelines_of(site, [part]), UnpacedClock()):
+    for _, batch in paced_messages(*make_pipelines(site, [part]), UnpacedClock()):
         for message in batch:
             if isinstance(message, Frame):
                 run_up.append(message)
@@ -253,7 +253,7 @@ class Soak(World):
     def __enter__(self) -> Self:
         self._thread = threading.Thread(target=self.http.run, daemon=True)
         self._thread.start()
-        while not self.http._uvicorn.started:
+        while not self.http.uvicorn.started:
             time.sleep(0.01)
         return self
 
@@ -306,8 +306,8 @@ class Soak(World):
         """Wait until the server's loop has told all that it was given; else it would fall behind by hours."""
         if self.http.parts.failure is not None:
             raise RuntimeError("the server has failed") from self.http.parts.failure
-        assert self.http._loop is not None
-        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http._loop).result()
+        assert self.http.loop is not None
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0), self.http.loop).result()
 
     def disturbances(self) -> Iterator[int]:
         """Do something bad, and say how many intervals shall pass before the next."""

@@ -15,7 +15,7 @@ import pytest
 import soundfile
 from processes import NODES, TAIL_S, Playing, wait_for
 
-from livessl.simulate.scene import Scene, make_scene, render
+from livessl.simulation.scene import Scene, make_scene, render
 from small_site import RATE_HZ, hiss, site_of
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from livessl import wire
-from livessl.capture.link import Dealer, Link
+from livessl.capture.dealer import Dealer
+from livessl.capture.link import Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
 from livessl.core.locate.estimators import ESTIMATORS, Localization, PowerMaps, Sound

@@ -1,4 +1,4 @@
-"""From blocks to messages: the right channels, and the same messages however the blocks are cut."""
+"""Pipelines of recordings: arrays get their channels, and the messages do not depend on block boundaries."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array, Frame, Mark, Message
 from livessl.errors import DeviceError
 from livessl.recordings.assign import recording_channels
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import MemoryRecording, TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
 from small_site import RATE_HZ, Changes, hiss, site_of
@@ -38,14 +38,14 @@ SCENE = scene()
 
 
 def messages(cuts: Sequence[int], channels: dict[str, list[int]], site: Site = SITE) -> list[Message]:
-    """What a line makes of the scene, cut at these samples."""
-    line = make_pipeline(site, channels, float(RATE_HZ))
+    """Return the pipeline's messages for the scene, cut at these samples."""
+    pipeline = make_pipeline(site, channels, float(RATE_HZ))
     made: list[Message] = []
     edges = [0, *sorted(cuts), SCENE.shape[1]]
     for first, stop in pairwise(edges):
         stamp_ns = START_NS + round(first / RATE_HZ * 1e9)
-        made += line.push(Block(first, np.ascontiguousarray(SCENE[:, first:stop]), stamp_ns))
-    return made + line.flush()
+        made += pipeline.push(Block(first, np.ascontiguousarray(SCENE[:, first:stop]), stamp_ns))
+    return made + pipeline.flush()
 
 
 BOTH = {"north": [1, 2, 3, 4], "south": [5, 6, 7, 8]}
@@ -53,7 +53,7 @@ WHOLE = messages([], BOTH)
 
 
 def by_array(made: Sequence[Message], array: str) -> list[bytes]:
-    """An array's messages, to the bit, but for what marks say of the device's clock: that comes of each stamp."""
+    """Return an array's messages as bytes, without the clock fields of marks, which depend on each stamp."""
     mine = [message for message in made if message.array == array]
     for message in mine:
         if isinstance(message, Mark):
@@ -93,46 +93,46 @@ def test_frames_hold_the_sound_of_their_channels() -> None:
 
 @given(st.lists(st.integers(1, SCENE.shape[1] - 1), unique=True, max_size=60))
 @settings(max_examples=40, deadline=None)
-def test_however_blocks_are_cut_the_frames_are_the_same(cuts: list[int]) -> None:
+def test_frames_do_not_depend_on_block_boundaries(cuts: list[int]) -> None:
     made = messages(cuts, BOTH)
     for array in BOTH:
         assert by_array(made, array) == by_array(WHOLE, array)
 
 
-def test_other_sound_gives_other_messages() -> None:
+def test_different_sound_gives_different_messages() -> None:
     assert by_array(WHOLE, "north") != by_array(WHOLE, "south")
 
 
-def test_played_messages_are_those_of_the_lines() -> None:
-    lines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
-    placed = [Placed(ArrayRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
+def test_paced_messages_are_those_of_the_pipelines() -> None:
+    pipelines = [make_pipeline(SITE, {name: numbers}, float(RATE_HZ)) for name, numbers in BOTH.items()]
+    recordings = [TimedRecording(MemoryRecording(name, float(RATE_HZ), SCENE), START_NS) for name in BOTH]
     clock = UnpacedClock(START_NS)
     made: list[Message] = []
-    for known_ns, batch in played_messages(lines, placed, clock):
+    for known_ns, batch in paced_messages(pipelines, recordings, clock):
         assert known_ns == clock.now_ns()
         for message in batch:
-            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # nothing is known before it was heard
+            assert (message.frame_index + 1) * FRAME_NS <= known_ns + 1  # no message precedes its sound
         made += batch
     assert known_ns == START_NS + 2_000_000_000
     for array in BOTH:
         assert by_array(made, array) == by_array(WHOLE, array)
 
 
-def test_played_messages_of_a_short_recording_are_flushed() -> None:
-    """Shorter than the warm-up: everything comes at the end."""
-    line = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
-    short = Placed(ArrayRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
-    batches = [batch for _, batch in played_messages([line], [short], UnpacedClock())]
+def test_messages_of_a_short_recording_are_flushed() -> None:
+    """The recording is shorter than the warm-up, so that all messages come at its end."""
+    pipeline = make_pipeline(SITE, {"north": [1, 2, 3, 4]}, float(RATE_HZ))
+    short = TimedRecording(MemoryRecording("short", float(RATE_HZ), SCENE[:, : RATE_HZ // 4]), START_NS)
+    batches = [batch for _, batch in paced_messages([pipeline], [short], UnpacedClock())]
     assert [len(batch) for batch in batches[:-1]] == [0] * (len(batches) - 1)
     assert len(batches[-1]) == 5
 
 
-def test_line_names_its_arrays() -> None:
+def test_pipeline_names_its_arrays() -> None:
     assert make_pipeline(SITE, BOTH, float(RATE_HZ)).arrays == ["north", "south"]
 
 
-def recording(channels: int, rate_hz: float = RATE_HZ) -> ArrayRecording:
-    return ArrayRecording("take1.wav", float(rate_hz), hiss(0.1, channels))
+def recording(channels: int, rate_hz: float = RATE_HZ) -> MemoryRecording:
+    return MemoryRecording("take1.wav", float(rate_hz), hiss(0.1, channels))
 
 
 NODELESS: Changes = {"nodes": {}}
@@ -141,16 +141,16 @@ NODELESS: Changes = {"nodes": {}}
 @pytest.mark.parametrize(
     ("changes", "array", "channels", "wanted", "expected"),
     [
-        ({}, "south", 4, None, [1, 2, 3, 4]),  # as many as microphones: they are the array's
+        ({}, "south", 4, None, [1, 2, 3, 4]),  # as many channels as microphones
         ({}, "south", 8, None, [5, 6, 7, 8]),  # the whole device: the node's channels
         ({}, "south", 6, None, [1, 2, 3, 4]),  # not the whole device
         ({}, "north", 8, None, [1, 2, 3, 4]),
         (NODELESS, "south", 8, None, [1, 2, 3, 4]),
-        ({}, "south", 8, [8, 7, 2, 1], [8, 7, 2, 1]),  # as wanted
+        ({}, "south", 8, [8, 7, 2, 1], [8, 7, 2, 1]),  # the channels given
         (NODELESS, "south", 4, [4, 3, 2, 1], [4, 3, 2, 1]),
     ],
 )
-def test_which_channels_are_an_arrays(
+def test_channels_of_an_array_are_chosen(
     changes: Changes, array: str, channels: int, wanted: list[int] | None, expected: list[int]
 ) -> None:
     assert recording_channels(site_of(changes), array, recording(channels), wanted) == expected
@@ -170,7 +170,8 @@ def test_which_channels_are_an_arrays(
             {},
             recording(4),
             [0, 1, 2, 3],
-            "expected 4 different channel numbers from 1 to 4 for array 'north', got [0, 1, 2, 3]",
+            "expected 4 different channel numbers from 1 to 4 for array 'north', got [0, 1, 2, 3]; channels "
+            "count from 1",
         ),
         (
             {},
@@ -193,8 +194,8 @@ def test_which_channels_are_an_arrays(
         ),
     ],
 )
-def test_recording_that_does_not_fit(
-    changes: Changes, one: ArrayRecording, wanted: list[int] | None, said: str
+def test_recording_that_does_not_fit_is_refused(
+    changes: Changes, one: MemoryRecording, wanted: list[int] | None, said: str
 ) -> None:
     with pytest.raises(DeviceError) as caught:
         recording_channels(site_of(changes), "north", one, wanted)
@@ -202,6 +203,6 @@ def test_recording_that_does_not_fit(
     assert said in str(caught.value)
 
 
-def test_channel_wanted_twice_is_refused() -> None:
+def test_channel_given_twice_is_refused() -> None:
     with pytest.raises(DeviceError, match="expected 4 different channel numbers"):
         recording_channels(SITE, "north", recording(4), [1, 2, 2, 4])

@@ -1,4 +1,4 @@
-"""What is recorded can be replayed: the same samples at the same times, gaps as gaps."""
+"""Recorded sessions replay with the same samples at the same times, and with their gaps."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from livessl.capture.record import record_device
 from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
-from livessl.recordings.assign import Part, parts_from_sessions, parts_from_wavs
-from livessl.recordings.recorder import Recorder, record_parts
-from livessl.recordings.recording import ArrayRecording, Placed, WavRecording
+from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions
+from livessl.recordings.recorder import Recorder, record_playback
+from livessl.recordings.recording import FileRecording, MemoryRecording
 from livessl.recordings.session import read_session
 from small_site import RATE_HZ, Changes, hiss, site_of, write_wav
 
@@ -47,32 +47,34 @@ def block(samples: Float32Array, first: int, stop: int, jitter_ns: int = 0, *, o
 
 
 @pytest.mark.parametrize(("kind", "subtype"), [("flac", "PCM_24"), ("wav", "FLOAT")])
-def test_wav_part_becomes_a_session_without_loss(tmp_path: Path, kind: Literal["flac", "wav"], subtype: str) -> None:
+def test_wav_recording_becomes_a_session_without_loss(
+    tmp_path: Path, kind: Literal["flac", "wav"], subtype: str
+) -> None:
     heard = {name: sixteen_bits(hiss(1.01, seed=k)) for k, name in enumerate(BOTH)}
     wavs = {name: write_wav(tmp_path / f"{name}.wav", heard[name], subtype="PCM_16") for name in BOTH}
     out = tmp_path / "out"
-    parts = parts_from_wavs(SITE, wavs, start_ns=START_NS)
-    assert record_parts(out, SITE, parts, UnpacedClock(START_NS), never, kind)
+    parts = assign_files(SITE, wavs, start_ns=START_NS)
+    assert record_playback(out, SITE, parts, UnpacedClock(START_NS), never, kind)
     session = read_session(out)
     assert {piece.array: piece.start_ns for piece in session.pieces} == dict.fromkeys(BOTH, START_NS)
     for piece in session.pieces:
         assert soundfile.info(session.path(piece)).subtype == subtype
         assert_array_equal(read(session.path(piece)), heard[piece.array])
-    replayed = parts_from_sessions(session.site(), [session])
-    assert {part.array: (part.placed.start_ns, part.channels) for part in replayed} == dict.fromkeys(
+    replayed = assign_sessions(session.site(), [session])
+    assert {part.array: (part.start_ns, part.channels) for part in replayed} == dict.fromkeys(
         BOTH, (START_NS, (1, 2, 3, 4))
     )
 
 
-def test_recording_stops_when_told(tmp_path: Path) -> None:
-    part = Part("north", Placed(ArrayRecording("hiss", float(RATE_HZ), hiss(5.0)), START_NS), (1, 2, 3, 4))
+def test_recording_stops_on_request(tmp_path: Path) -> None:
+    part = AssignedRecording("north", MemoryRecording("hiss", float(RATE_HZ), hiss(5.0)), START_NS, (1, 2, 3, 4))
     clock = UnpacedClock(START_NS)
-    assert record_parts(tmp_path, SITE, [part], clock, lambda: clock.now_ns() >= START_NS + 500_000_000)
+    assert record_playback(tmp_path, SITE, [part], clock, lambda: clock.now_ns() >= START_NS + 500_000_000)
     [piece] = read_session(tmp_path).pieces
     assert read(tmp_path / piece.file).shape == (4, RATE_HZ // 2)
 
 
-def test_channels_of_the_device_in_microphone_order(tmp_path: Path) -> None:
+def test_channels_are_recorded_in_microphone_order(tmp_path: Path) -> None:
     samples = sixteen_bits(hiss(0.2, 8))
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, samples.shape[1]))
@@ -81,8 +83,8 @@ def test_channels_of_the_device_in_microphone_order(tmp_path: Path) -> None:
         assert_array_equal(read(session.path(piece)), samples[np.array(BOTH[piece.array]) - 1])
 
 
-def test_start_is_better_than_one_jittering_stamp(tmp_path: Path) -> None:
-    """Stamps jitter by up to 20 ms, later than true; the fit over 20 s leaves their mean, to a few ms."""
+def test_start_time_is_fitted_to_all_stamps(tmp_path: Path) -> None:
+    """Stamps are up to 20 ms late; the fit over 20 s is late by their mean, to a few ms."""
     samples = hiss(20.0, 8)
     rng = np.random.default_rng(3)
     step = RATE_HZ // 50
@@ -90,7 +92,7 @@ def test_start_is_better_than_one_jittering_stamp(tmp_path: Path) -> None:
         for first in range(0, samples.shape[1], step):
             recorder.push(block(samples, first, first + step, jitter_ns=int(rng.uniform(0, 20e6))))
     for piece in read_session(tmp_path).pieces:
-        # mean 10 ms; the line's error at its end is 2 sigma / sqrt(n) = 2 * 5.8 ms / sqrt(1000) = 0.4 ms
+        # mean 10 ms; the fit's error at its end is 2 sigma / sqrt(n) = 2 * 5.8 ms / sqrt(1000) = 0.4 ms
         assert_allclose((piece.start_ns - START_NS) / 1e6, 10.0, rtol=0, atol=4 * 0.4)
 
 
@@ -98,19 +100,19 @@ def test_gap_begins_a_new_file(tmp_path: Path) -> None:
     samples = sixteen_bits(hiss(3.0, 8))
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, 8000))
-        recorder.push(block(samples, 8000, 8000))  # nothing, yet no gap
+        recorder.push(block(samples, 8000, 8000))  # an empty block is not a gap
         recorder.push(block(samples, 8000, 16000))
         assert recorder.recorded
         recorder.push(block(samples, 24000, 32000))  # samples are missing before it
-        recorder.push(block(samples, 32000, 40000, overflow=True))  # as here, nobody knows how many
+        recorder.push(block(samples, 32000, 40000, overflow=True))  # an unknown number is missing here
     session = read_session(tmp_path)
     north = [piece for piece in session.pieces if piece.array == "north"]
     assert [piece.file for piece in north] == ["north-000.flac", "north-001.flac", "north-002.flac"]
     for piece, first, stop in zip(north, (0, 24000, 32000), (16000, 32000, 40000), strict=True):
         assert piece.start_ns == START_NS + round(first / RATE_HZ * 1e9)
         assert_array_equal(read(session.path(piece)), samples[:4, first:stop])
-    [part] = [part for part in parts_from_sessions(SITE, [session]) if part.array == "north"]
-    blocks = list(part.placed.recording.blocks(part.placed.start_ns))
+    [part] = [part for part in assign_sessions(SITE, [session]) if part.array == "north"]
+    blocks = list(part.recording.blocks(part.start_ns))
     starts = [b.first_index for b, before in zip(blocks[1:], blocks, strict=False) if follows_a_gap(b, before)]
     assert starts == [24000]
 
@@ -119,7 +121,7 @@ def follows_a_gap(one: Block, before: Block) -> bool:
     return one.first_index - before.first_index != int(before.samples.shape[1])
 
 
-def test_what_is_complete_survives_a_crash(tmp_path: Path) -> None:
+def test_complete_files_survive_a_crash(tmp_path: Path) -> None:
     samples = hiss(2.0, 8)
     recorder = Recorder(tmp_path, SITE, BOTH, float(RATE_HZ))
     recorder.push(block(samples, 0, 8000))
@@ -129,13 +131,13 @@ def test_what_is_complete_survives_a_crash(tmp_path: Path) -> None:
     assert starts(tmp_path) == dict.fromkeys(names[:2], 0)
     recorder.push(block(samples, 10000, 12000))
     second = round(10000 / RATE_HZ * 1e9)
-    told = starts(tmp_path)  # the recorder still runs
-    assert list(told) == names
-    assert told[names[0]] == told[names[1]] > 0  # all stamps of a stretch tell its start, once it is whole
-    assert told[names[2]] == told[names[3]] == second
-    assert WavRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
+    written = starts(tmp_path)  # the recorder still runs
+    assert list(written) == names
+    assert written[names[0]] == written[names[1]] > 0  # a complete segment has a start fitted to all stamps
+    assert written[names[2]] == written[names[3]] == second
+    assert FileRecording(tmp_path / names[0]).duration_s == 9000 / RATE_HZ
     recorder.__exit__(None, None, None)
-    assert len(parts_from_sessions(SITE, [read_session(tmp_path)])) == 2
+    assert len(assign_sessions(SITE, [read_session(tmp_path)])) == 2
 
 
 def starts(directory: Path) -> dict[str, int]:
@@ -150,7 +152,7 @@ def test_nothing_recorded_leaves_no_session(tmp_path: Path) -> None:
 
 
 class Ailing:
-    """A device that stops for a while and says so."""
+    """A device that stops for a while and reports it."""
 
     name = "UMC1820"
     sample_rate_hz = float(RATE_HZ)
@@ -169,14 +171,14 @@ class Ailing:
             yield block(samples, first, first if self.problem else first + 1600)
 
 
-def test_trouble_of_the_device_is_told_when_it_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_device_problem_is_logged_when_it_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         record_device(Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)), Ailing(), never)
     assert caplog.messages == ["unplugged", "device 'UMC1820' delivers sound again"]
 
 
 def test_wav_has_no_limit_of_4_gib(tmp_path: Path) -> None:
-    """Only the container can tell: a file that long is none for a test."""
+    """The test checks only the container format, because a file of 4 GiB takes too long to write."""
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ), "wav") as recorder:
         recorder.push(block(hiss(0.5, 8), 0, 8000))
     assert soundfile.info(tmp_path / "north-000.wav").format == "RF64"
@@ -194,22 +196,22 @@ def test_more_than_eight_microphones_are_wav(tmp_path: Path) -> None:
     assert_array_equal(read(tmp_path / "north-000.wav"), samples[:9])
 
 
-def test_24_bits_keep_what_a_converter_gives(tmp_path: Path) -> None:
+def test_24_bits_hold_the_samples_of_a_converter(tmp_path: Path) -> None:
     samples = hiss(0.5, 8, level=1e-4)
     with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
         recorder.push(block(samples, 0, 8000))
     assert_allclose(read(tmp_path / "north-000.flac"), samples[:4], rtol=0, atol=2**-23)
-    assert WavRecording(tmp_path / "north-000.flac").channels == 4
+    assert FileRecording(tmp_path / "north-000.flac").channels == 4
 
 
-def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
+def test_every_file_that_does_not_fit_is_reported(tmp_path: Path) -> None:
     wavs = {
         "north": write_wav(tmp_path / "few.wav", hiss(0.1, 3)),
         "south": tmp_path / "missing.wav",
         "west": write_wav(tmp_path / "good.wav", hiss(0.1)),
     }
     with pytest.raises(DeviceError) as caught:
-        parts_from_wavs(SITE, wavs)
+        assign_files(SITE, wavs)
     few, missing, west = str(caught.value).splitlines()
     assert "few.wav: expected 4 channels" in few
     assert "missing.wav: expected a WAV or FLAC file, cannot read it: no such file" in missing
@@ -217,8 +219,8 @@ def test_every_file_that_does_not_fit_is_told(tmp_path: Path) -> None:
     assert "no such array; arrays are north, south" in west
 
 
-def test_wavs_begin_together_but_for_their_offset(tmp_path: Path) -> None:
+def test_files_begin_together_except_for_their_offset(tmp_path: Path) -> None:
     site = site_of({"arrays.south.wav_offset_s": -0.25})
     path = write_wav(tmp_path / "hiss.wav", hiss(0.1))
-    parts = parts_from_wavs(site, {"north": path, "south": path}, start_ns=START_NS)
-    assert [part.placed.start_ns - START_NS for part in parts] == [0, -250_000_000]
+    parts = assign_files(site, {"north": path, "south": path}, start_ns=START_NS)
+    assert [part.start_ns - START_NS for part in parts] == [0, -250_000_000]

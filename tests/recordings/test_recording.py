@@ -1,4 +1,4 @@
-"""Recordings that stand in for devices: what is read, when it is said to have been heard, and what is refused."""
+"""Recordings read like devices: their samples, their time stamps, and files that are refused."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
 from livessl.recordings.recording import (
-    ArrayRecording,
-    Looped,
-    Placed,
+    FileRecording,
+    LoopedRecording,
+    MemoryRecording,
     Recording,
-    Spliced,
-    WavRecording,
-    merged,
-    played,
+    SplicedRecording,
+    TimedRecording,
+    merged_blocks,
+    paced_blocks,
 )
 from small_site import RATE_HZ, hiss, write_wav
 
@@ -35,9 +35,9 @@ def joined(blocks: Iterable[Block]) -> Float32Array:
     return np.concatenate([block.samples for block in blocks], axis=1)
 
 
-def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4, seed: int = 0) -> ArrayRecording:
+def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4, seed: int = 0) -> MemoryRecording:
     samples = hiss(seconds * rate_hz / RATE_HZ, channels, seed)
-    return ArrayRecording("hiss", float(rate_hz), samples)
+    return MemoryRecording("hiss", float(rate_hz), samples)
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4,
         ("flac", "PCM_24", 2**-23),
     ],
 )
-def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
+def test_every_sample_format_is_read(tmp_path: Path, ending: str, subtype: str, rounding: float) -> None:
     samples = hiss(0.33, channels=5)
     path = write_wav(tmp_path / f"sound.{ending}", samples, subtype=subtype)
-    read = WavRecording(path)
+    read = FileRecording(path)
     assert (read.name, read.sample_rate_hz, read.channels) == (str(path), RATE_HZ, 5)
     assert read.duration_s == pytest.approx(0.33)
     got = joined(read.blocks(0))
@@ -67,18 +67,18 @@ def test_every_sample_format(tmp_path: Path, ending: str, subtype: str, rounding
 
 def refusal(path: Path) -> str:
     with pytest.raises(DeviceError) as caught:
-        WavRecording(path)
+        FileRecording(path)
     said = str(caught.value)
     assert said.startswith(f"{path}: expected ")
     assert "\n" not in said
     return said
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file_is_refused(tmp_path: Path) -> None:
     assert refusal(tmp_path / "missing.wav").endswith("expected a WAV or FLAC file, cannot read it: no such file")
 
 
-def test_what_is_no_sound_file(tmp_path: Path) -> None:
+def test_file_without_sound_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes.wav"
     for content in (b"", b"dear diary", b"RIFF", bytes(1000)):
         path.write_bytes(content)
@@ -86,42 +86,42 @@ def test_what_is_no_sound_file(tmp_path: Path) -> None:
     assert "expected a WAV or FLAC file, cannot read it" in refusal(tmp_path)
 
 
-def test_zero_length(tmp_path: Path) -> None:
+def test_file_of_zero_length_is_refused(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "empty.wav", np.zeros((4, 0), dtype=np.float32))
     assert "got a file of zero length; record it again" in refusal(path)
 
 
 @pytest.mark.parametrize("subtype", ["FLOAT", "DOUBLE"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_samples_that_are_not_finite(tmp_path: Path, subtype: str, bad: float) -> None:
+def test_samples_that_are_not_finite_are_refused(tmp_path: Path, subtype: str, bad: float) -> None:
     samples = hiss(20.0)
-    samples[2, 300_000] = bad  # beyond the first part that is scanned
+    samples[2, 300_000] = bad  # beyond the first samples that are scanned
     said = refusal(write_wav(tmp_path / "broken.wav", samples, subtype=subtype))
     assert "got NaN or infinity at sample 300000 of channel 3; export it again" in said
 
 
-def test_samples_that_no_converter_gives(tmp_path: Path) -> None:
+def test_samples_beyond_the_range_of_a_converter_are_refused(tmp_path: Path) -> None:
     samples = hiss(20.0)
-    samples[2, 300_000] = -1e6  # the largest that is taken
-    WavRecording(write_wav(tmp_path / "loud.wav", samples))
+    samples[2, 300_000] = -1e6  # the largest that is accepted
+    FileRecording(write_wav(tmp_path / "loud.wav", samples))
     samples[2, 300_000] = -1.001e6
     said = refusal(write_wav(tmp_path / "broken.wav", samples))
     assert "samples around 1 at full scale, got -1.001e+06 at sample 300000 of channel 3; export it again" in said
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT"])
-def test_silence(tmp_path: Path, subtype: str) -> None:
+def test_all_zero_file_is_refused(tmp_path: Path, subtype: str) -> None:
     samples = np.zeros((4, 300_001), dtype=np.float32)
     assert "got all-zero samples; was the right input recorded?" in refusal(
         write_wav(tmp_path / "silence.wav", samples, subtype=subtype)
     )
     samples[3, -1] = 0.5  # one click, at the very end, is sound
-    WavRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
+    FileRecording(write_wav(tmp_path / "click.wav", samples, subtype=subtype))
 
 
-def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
+def test_file_removed_after_the_check_is_reported(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "sound.wav", hiss())
-    read = WavRecording(path)
+    read = FileRecording(path)
     path.unlink()
     with pytest.raises(DeviceError, match="no such file"):
         next(read.blocks(0))
@@ -130,7 +130,7 @@ def test_file_that_vanishes_between_check_and_play(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate_hz", [16000, 22050, 44100, 48000, 96000])
 def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -> None:
     source = recording(1.01, rate_hz)
-    read: list[Recording] = [source, WavRecording(write_wav(tmp_path / "s.wav", source.samples, rate_hz))]
+    read: list[Recording] = [source, FileRecording(write_wav(tmp_path / "s.wav", source.samples, rate_hz))]
     for one in read:
         blocks = list(one.blocks(START_NS))
         index = 0
@@ -144,46 +144,52 @@ def test_stamps_are_ideal_and_indices_contiguous(tmp_path: Path, rate_hz: int) -
         assert_array_equal(joined(blocks), source.samples)
 
 
-def test_merged_comes_in_the_order_of_completion() -> None:
+def test_merged_blocks_come_in_order_of_completion() -> None:
     early, late, short = recording(0.5), recording(0.3, 22050, seed=1), recording(0.05, seed=2)
-    placed = [Placed(late, START_NS + 133_000_000), Placed(early, START_NS), Placed(short, START_NS + 900_000_000)]
-    entries = list(merged(placed))
+    recordings = [
+        TimedRecording(late, START_NS + 133_000_000),
+        TimedRecording(early, START_NS),
+        TimedRecording(short, START_NS + 900_000_000),
+    ]
+    entries = list(merged_blocks(recordings))
     ends = [end_ns for end_ns, _, _ in entries]
     assert ends == sorted(ends)
-    for line, item in enumerate(placed):
-        mine = [(end_ns, block) for end_ns, of, block in entries if of == line]
+    for index, item in enumerate(recordings):
+        mine = [(end_ns, block) for end_ns, of, block in entries if of == index]
         assert_array_equal(joined(block for _, block in mine), joined_of(item))
         assert mine[0][1].stamp_ns == item.start_ns
         for end_ns, block in mine:
             assert abs(end_ns - block.stamp_ns - block.samples.shape[1] / item.recording.sample_rate_hz * 1e9) <= 1
-    assert [line for _, line, _ in entries] != sorted(line for _, line, _ in entries)  # they do interleave
+    assert [index for _, index, _ in entries] != sorted(index for _, index, _ in entries)  # the recordings interleave
 
 
-def joined_of(item: Placed) -> Float32Array:
+def joined_of(item: TimedRecording) -> Float32Array:
     return joined(item.recording.blocks(item.start_ns))
 
 
 def test_no_block_is_played_before_it_is_complete() -> None:
     clock = UnpacedClock(START_NS)
-    placed = [Placed(recording(0.2), START_NS), Placed(recording(0.2, 44100), START_NS + 7)]
-    seen = [(clock.now_ns(), end_ns) for end_ns, _, _ in played(placed, clock)]
+    recordings = [TimedRecording(recording(0.2), START_NS), TimedRecording(recording(0.2, 44100), START_NS + 7)]
+    seen = [(clock.now_ns(), end_ns) for end_ns, _, _ in paced_blocks(recordings, clock)]
     assert seen == [(end_ns, end_ns) for _, end_ns in seen]
     assert len(seen) == 20
 
 
 class Sleeper(UnpacedClock):
-    """It never sleeps longer than 70 ms at a time."""
+    """A clock whose single sleeps last at most 70 ms."""
 
     def sleep_until_ns(self, time_ns: int) -> bool:
         return super().sleep_until_ns(min(time_ns, self.now_ns() + 70_000_000)) and self.now_ns() >= time_ns
 
 
-def test_whoever_waits_for_sound_hears_of_it() -> None:
-    """Before the beginning and in a gap come empty blocks, so that a listener can look up."""
-    spliced = Spliced((Placed(recording(0.04), START_NS), Placed(recording(0.04), START_NS + NS)))
+def test_empty_blocks_come_while_no_block_is_due() -> None:
+    """Empty blocks come before the beginning and in a gap, so that a caller can do other work."""
+    spliced = SplicedRecording(
+        (TimedRecording(recording(0.04), START_NS), TimedRecording(recording(0.04), START_NS + NS))
+    )
     clock = Sleeper(START_NS - NS)
     last_ns, heard = START_NS - NS, []
-    for now_ns, _, block in played([Placed(spliced, START_NS)], clock):
+    for now_ns, _, block in paced_blocks([TimedRecording(spliced, START_NS)], clock):
         assert now_ns - last_ns <= 70_000_000
         last_ns = now_ns
         heard.append(block.samples.shape[1])
@@ -191,9 +197,9 @@ def test_whoever_waits_for_sound_hears_of_it() -> None:
     assert heard.count(0) == 14 + 13  # a second and 20 ms; then a second less 20 ms
 
 
-def test_looped_goes_on_without_a_gap() -> None:
+def test_looped_recording_has_no_gaps() -> None:
     once = recording(0.05)  # not a whole number of blocks
-    looped = Looped(once)
+    looped = LoopedRecording(once)
     assert (looped.name, looped.channels, looped.sample_rate_hz) == ("hiss", 4, RATE_HZ)
     assert looped.duration_s == float("inf")
     blocks = list(islice(looped.blocks(START_NS), 12))
@@ -205,13 +211,13 @@ def test_looped_goes_on_without_a_gap() -> None:
         index += block.samples.shape[1]
 
 
-def test_spliced_keeps_the_gap() -> None:
+def test_spliced_recording_keeps_the_gap() -> None:
     first, second = recording(0.1, seed=1), recording(0.1, seed=2)
     gap_ns = 2 * NS + 31_250  # 2 s and half a sample
-    spliced = Spliced((Placed(first, START_NS), Placed(second, START_NS + gap_ns)))
+    spliced = SplicedRecording((TimedRecording(first, START_NS), TimedRecording(second, START_NS + gap_ns)))
     assert spliced.duration_s == pytest.approx(2.1, abs=1e-4)
     assert (spliced.name, spliced.channels, spliced.sample_rate_hz) == ("hiss", 4, RATE_HZ)
-    for shift_ns in (0, 500 * NS):  # played when it was recorded, or at any other time
+    for shift_ns in (0, 500 * NS):  # at the time of recording, or at any other
         blocks = list(spliced.blocks(START_NS + shift_ns))
         before, after = blocks[:5], blocks[5:]
         assert_array_equal(joined(before), first.samples)
@@ -221,12 +227,12 @@ def test_spliced_keeps_the_gap() -> None:
         assert after[0].first_index == round(gap_ns * RATE_HZ / 1e9) > before[-1].first_index + 320
 
 
-def test_block_of_another_shape_cannot_be_made() -> None:
+def test_block_of_a_wrong_shape_is_refused() -> None:
     for samples in (np.zeros(4, dtype=np.float32), np.zeros((4, 5))):
         with pytest.raises(ValueError, match=re.escape("(channels, n) float32")):
             Block(0, samples, 0)  # type: ignore[arg-type]
 
 
-def test_soundfile_writes_what_these_tests_believe(tmp_path: Path) -> None:
+def test_soundfile_writes_the_formats_of_these_tests(tmp_path: Path) -> None:
     path = write_wav(tmp_path / "s.wav", hiss(0.1), subtype="PCM_24")
     assert soundfile.info(path).subtype == "PCM_24"

@@ -1,4 +1,4 @@
-"""A session on disk says what was recorded, when and where, and needs nothing beside its folder."""
+"""A session on disk describes its files, their start times and the site, and needs nothing outside its folder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
+from livessl.errors import ConfigError
 from livessl.recordings.session import SESSION_FILE, piece, read_session, site_text, write_session
 from livessl.site.load import parse_site
-from livessl.site.models import ConfigError
 from small_site import Changes, site_of
 
 START_NS = 1_767_225_600_123_456_000
@@ -28,7 +28,7 @@ RICH: Changes = {
 SQUARE = {"microphones_m": [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0.05]]}
 
 
-def test_pieces_come_back(tmp_path: Path) -> None:
+def test_pieces_survive_writing_and_reading(tmp_path: Path) -> None:
     pieces = [piece("north", "north-000.flac", START_NS), piece("south", "south-000.flac", START_NS + 1_000)]
     write_session(tmp_path, site_of(), pieces)
     session = read_session(tmp_path)
@@ -44,7 +44,7 @@ def test_start_is_plain_text_in_utc(tmp_path: Path) -> None:
     assert described == {"array": "north", "file": "n.wav", "start_utc": "2026-01-01T00:00:00.123456Z"}
 
 
-def test_site_stands_alone(tmp_path: Path) -> None:
+def test_site_of_a_session_needs_no_other_files(tmp_path: Path) -> None:
     (tmp_path / "square.yaml").write_text(yaml.safe_dump(SQUARE), encoding="utf-8")
     site = site_of(RICH, tmp_path)
     (tmp_path / "square.yaml").unlink()
@@ -73,7 +73,7 @@ def fault_of(directory: Path) -> str:
     return str(fault)
 
 
-def test_folder_without_session(tmp_path: Path) -> None:
+def test_folder_without_session_is_refused(tmp_path: Path) -> None:
     said = fault_of(tmp_path)
     assert "expected a recorded session, cannot read it: No such file or directory" in said
     assert "make one with `livessl record` or `livessl simulate`" in said
@@ -87,31 +87,31 @@ def test_folder_without_session(tmp_path: Path) -> None:
         ("version: 2026-02-31", "not valid YAML"),
         ("version: 1\npieces: []\n", r"pieces: .*at least 1 item"),
         ("version: 2\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z'}]\n", "version 1, got 2"),
-        ("version: 1\npieces: [{array: n, file: n.wav}]\n", "pieces.0.start_utc: .*required"),
+        ("version: 1\npieces: [{array: n, file: n.wav}]\n", "pieces.0.start_utc: missing; add it"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: yesterday}]\n", "expected RFC 3339 .*'yesterday'"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z', x: 1}]\n", "pieces.0.x"),
     ],
 )
-def test_session_that_cannot_be_understood(tmp_path: Path, text: str, what: str) -> None:
+def test_invalid_session_is_refused(tmp_path: Path, text: str, what: str) -> None:
     (tmp_path / SESSION_FILE).write_text(text, encoding="utf-8")
     said = fault_of(tmp_path)
     assert re.search(what, said), said
 
 
-def test_session_that_is_no_text(tmp_path: Path) -> None:
+def test_session_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / SESSION_FILE).write_bytes(b"\xff\xfe\xfa")
     assert "not valid YAML" in fault_of(tmp_path)
 
 
-def test_session_whose_site_is_gone(tmp_path: Path) -> None:
+def test_session_without_site_file_is_refused(tmp_path: Path) -> None:
     write_session(tmp_path, site_of(), [piece("north", "n.wav", START_NS)])
     (tmp_path / "site.yaml").unlink()
     with pytest.raises(ConfigError, match=r"site\.yaml: cannot be read: No such file"):
         read_session(tmp_path).site()
 
 
-def test_session_says_nothing_of_where_secrets_are() -> None:
-    """It goes elsewhere, and is played there without them."""
+def test_session_leaves_out_the_paths_of_secrets() -> None:
+    """Sessions are copied to other machines and replayed there without keys."""
     secrets = {"tokens": "tokens.yaml", "certificate": "site.crt", "private_key": "site.key"}
     site = site_of({"keys": "keys", "server.http": {"host": "0.0.0.0", "port": 8001, **secrets}})
     written = yaml.safe_load(site_text(site))

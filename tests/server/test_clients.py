@@ -16,7 +16,7 @@ from small_site import running_server, site_of, wait_until
 
 
 @pytest.mark.processes
-def test_stalled_clients_delay_nobody_and_cost_little() -> None:
+def test_stalled_clients_delay_no_other_client_and_cost_little_memory() -> None:
     outcome = measure(clients=12, stalled=4, updates_per_s=100.0, seconds=6.0)
     # a server that waits for the stalled ones would be late by SEND_TIMEOUT_S, 30 s; a busy machine, by less than one
     assert outcome.delay_p50_ms < 1000.0
@@ -25,8 +25,8 @@ def test_stalled_clients_delay_nobody_and_cost_little() -> None:
     assert outcome.rss_peak_mb - outcome.rss_before_mb < 12 * MAX_CLIENT_KB / 1000 + 10.0
 
 
-def test_client_that_leaves_with_much_on_its_way_is_no_news(caplog: pytest.LogCaptureFixture) -> None:
-    """Its queue is not written to a connection that is gone, line by line of complaint in the log."""
+def test_client_that_leaves_with_messages_on_their_way_causes_no_log_line(caplog: pytest.LogCaptureFixture) -> None:
+    """Its queue is not written to the closed connection; asyncio would log a warning for each message."""
     with running_server(site_of()) as server:
         client = open_client("127.0.0.1", int(server.url.rpartition(":")[2]), None)
         wait_until(lambda: server.parts.fanout.clients == 1, "its place")
@@ -39,23 +39,23 @@ def test_client_that_leaves_with_much_on_its_way_is_no_news(caplog: pytest.LogCa
                 server.parts.fanout.publish({"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": []})
             done.set()
 
-        assert server._loop is not None
-        server._loop.call_soon_threadsafe(leave)
+        assert server.loop is not None
+        server.loop.call_soon_threadsafe(leave)
         assert done.wait(5)
         wait_until(lambda: server.parts.fanout.clients == 0, "its place to be free")
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
 
 
-def test_server_ends_while_a_client_says_good_bye() -> None:
-    """A client that does not read what it was sent, but has said that it goes, is closing until the last byte."""
+def test_server_stops_while_a_client_closes_its_socket() -> None:
+    """A client that has sent a closing frame but does not read stays in the state of closing until its last byte."""
     with running_server(site_of()) as server:
         client = open_client("127.0.0.1", int(server.url.rpartition(":")[2]), 4096)
         wait_until(lambda: server.parts.fanout.clients == 1, "its place")
-        assert server._loop is not None
+        assert server.loop is not None
         text = "x" * 100_000  # more than the two sockets' buffers hold
         for number in range(8):
             message = {"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": [], "text": text}
-            server._loop.call_soon_threadsafe(server.parts.fanout.publish, message)
+            server.loop.call_soon_threadsafe(server.parts.fanout.publish, message)
         wait_until(lambda: any(c.transport.get_write_buffer_size() for c in connections(server)), "the unread")
         client.sendall(bytes([0x88, 0x80, 0, 0, 0, 0]))  # a closing frame, masked with zeros
         wait_until(lambda: server.parts.fanout.clients == 0, "its leaving to be noticed")
@@ -64,4 +64,4 @@ def test_server_ends_while_a_client_says_good_bye() -> None:
 
 
 def connections(server: Server) -> list[Any]:
-    return list(server._uvicorn.server_state.connections)
+    return list(server.uvicorn.server_state.connections)

@@ -10,10 +10,10 @@ import numpy as np
 from livessl.capture.node import capture_recordings
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import ArrayRecording, Placed
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
-from livessl.simulate.scene import Scene, Source, render
+from livessl.simulation.scene import Scene, Source, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, running_server, scene, site_of, wait_until
 
@@ -24,19 +24,19 @@ THREE = {"arrays.east": EAST, "nodes.lab-pc.arrays": CHANNELS}
 
 
 def play(server: Server, true_site: Site, sounding: Scene) -> None:
-    """Send, live, what arrays that stand as a site says hear of a scene, to a server that may believe otherwise."""
+    """Send a scene live, as received by arrays in the places of one site, to a server whose site may differ."""
     start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
     parts = []
     for seed, spec in enumerate(true_site.specs):
         samples = render(sounding, spec.microphones_m, seed=seed)
         parts.append(
-            Part(spec.name, Placed(ArrayRecording(spec.name, float(RATE_HZ), samples), start_ns), (1, 2, 3, 4))
+            AssignedRecording(spec.name, MemoryRecording(spec.name, float(RATE_HZ), samples), start_ns, (1, 2, 3, 4))
         )
     node = site_of({**THREE, "nodes.lab-pc.server": server.endpoint})
     capture_recordings(node, "lab-pc", parts, CLOCK, "run-1", lambda: False)
 
 
-def test_a_turned_array_is_named_by_events_state_and_metrics() -> None:
+def test_turned_array_is_named_by_events_state_and_metrics() -> None:
     wrong = {**EAST, "orientation_deg": {"yaw": 40}}
     with running_server(site_of({**THREE, "arrays.east": wrong})) as server:
         play(server, site_of(THREE), scene(3))

@@ -1,4 +1,4 @@
-"""Subscribers: everything numbered, filtered as asked, and a slow reader told what he missed."""
+"""Subscribers: messages are numbered and filtered, and a slow reader gets a gap for what it missed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from livessl.server.fanout import BACKLOG, LAGGING, PAST, Fanout, Filter, Subscr
 
 
 def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = (), sound: int | None = None) -> JsonObject:
-    """An update of a sound, by default of one of its own."""
+    """Return an update of a sound, by default of a sound of its own."""
     event_id = f"lab-{n if sound is None else sound}"
     return {"kind": "update", "n": n, "event_id": event_id, "confidence": confidence, "zones": list(zones)}
 
@@ -24,7 +24,7 @@ def event(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> J
 
 
 async def waiting(subscription: Subscription) -> list[JsonObject]:
-    """All that waits for a subscriber."""
+    """Return all messages that wait for a subscriber."""
     messages: list[JsonObject] = []
     while True:
         try:
@@ -34,7 +34,7 @@ async def waiting(subscription: Subscription) -> list[JsonObject]:
 
 
 def drained(subscription: Subscription) -> list[JsonObject]:
-    """The same, where nothing is asked afterwards: a subscription belongs to one event loop."""
+    """Return the same in an event loop of its own, to which the subscription then belongs."""
     return asyncio.run(waiting(subscription))
 
 
@@ -52,7 +52,7 @@ def test_messages_are_numbered_without_holes() -> None:
     assert fanout.last_seq == 6
 
 
-def test_nothing_comes_after_unsubscribing() -> None:
+def test_nothing_arrives_after_unsubscribing() -> None:
     fanout = Fanout()
     subscription = fanout.subscribe(Filter())
     assert fanout.clients == 1
@@ -80,7 +80,7 @@ ARRAYS: JsonObject = {"kind": "arrays", "arrays": []}
         ({"zone": "window"}, "arrays"),
     ],
 )
-def test_filters(wanted: dict[str, Any], passing: str) -> None:
+def test_filter_passes_what_the_client_chose(wanted: dict[str, Any], passing: str) -> None:
     messages = {
         "event sure": event(confidence=0.9),
         "event unsure at the door": event(confidence=0.1, zones=("door", "hall")),
@@ -100,7 +100,7 @@ def test_filtered_messages_keep_their_numbers() -> None:
     assert [message["seq"] for message in drained(subscription)] == [1, 4]
 
 
-def test_slow_reader_loses_the_oldest_that_are_no_events_and_is_told() -> None:
+def test_slow_reader_loses_the_oldest_states_first_and_gets_a_gap() -> None:
     fanout = Fanout()
     subscription = fanout.subscribe(Filter())
     events = [3, 50, 100]
@@ -134,7 +134,7 @@ def test_backlog_of_events_alone_is_bounded_too() -> None:
     assert [message["n"] for message in rest] == list(range(10, BACKLOG + 10))
 
 
-def test_full_backlog_without_loss_is_no_gap() -> None:
+def test_full_queue_without_loss_gives_no_gap() -> None:
     fanout = Fanout()
     subscription = fanout.subscribe(Filter())
     for k in range(BACKLOG):
@@ -142,7 +142,7 @@ def test_full_backlog_without_loss_is_no_gap() -> None:
     assert [message["n"] for message in drained(subscription)] == list(range(BACKLOG))
 
 
-def test_slow_reader_hinders_nobody() -> None:
+def test_slow_reader_does_not_hinder_others() -> None:
     fanout = Fanout()
     fanout.subscribe(Filter())
     quick = fanout.subscribe(Filter())
@@ -157,7 +157,7 @@ def test_slow_reader_hinders_nobody() -> None:
     assert asyncio.run(both()) == list(range(3 * BACKLOG))
 
 
-def test_next_waits_for_news() -> None:
+def test_next_waits_for_a_message() -> None:
     fanout = Fanout()
 
     async def wait() -> JsonObject:
@@ -171,7 +171,7 @@ def test_next_waits_for_news() -> None:
     assert asyncio.run(wait())["n"] == 7
 
 
-def test_slow_reader_gets_every_event_and_the_newest_of_everything_else() -> None:
+def test_slow_reader_gets_every_event_and_the_newest_state_of_each_subject() -> None:
     fanout = Fanout()
     subscription = fanout.subscribe(Filter())
     events = [5, 700, 701, 2000]
@@ -192,7 +192,7 @@ def test_slow_reader_gets_every_event_and_the_newest_of_everything_else() -> Non
     assert fanout.superseded == 3000 + 600 - len(got)
 
 
-def test_reader_who_keeps_up_gets_everything() -> None:
+def test_reader_that_keeps_up_gets_everything() -> None:
     fanout = Fanout()
     subscription = fanout.subscribe(Filter())
     for k in range(LAGGING):
@@ -204,7 +204,7 @@ def test_reader_who_keeps_up_gets_everything() -> None:
     assert [message["n"] for message in drained(late)] == [*range(LAGGING - 1), LAGGING]
 
 
-def test_text_is_made_once_for_all() -> None:
+def test_text_is_made_once_for_all_subscribers() -> None:
     fanout = Fanout()
     one, two = fanout.subscribe(Filter()), fanout.subscribe(Filter())
     fanout.publish(event(1))
@@ -220,7 +220,7 @@ def numbers(subscription: Subscription) -> list[Any]:
     return [message.get("seq", message) for message in drained(subscription)]
 
 
-def test_client_that_comes_back_gets_what_it_missed_in_order() -> None:
+def test_client_that_reconnects_gets_what_it_missed_in_order() -> None:
     fanout = Fanout(first_seq=100)
     for k in range(10):
         fanout.publish(update(k) if k % 2 else event(k))
@@ -233,7 +233,7 @@ def test_client_that_comes_back_gets_what_it_missed_in_order() -> None:
     assert numbers(fanout.subscribe(Filter())) == []
 
 
-def test_client_that_comes_back_is_told_what_is_gone() -> None:
+def test_client_that_reconnects_gets_a_gap_for_what_is_no_longer_kept() -> None:
     fanout = Fanout(first_seq=100)
     for k in range(PAST + 50):
         fanout.publish(event(k))
@@ -248,7 +248,7 @@ def test_client_that_comes_back_is_told_what_is_gone() -> None:
     assert "number 1000000 has not been told" in gap["reason"]
 
 
-def test_the_past_of_many_arrays_is_small_and_told_word_for_word() -> None:
+def test_kept_messages_of_many_arrays_are_small_and_unchanged() -> None:
     fanout = Fanout()
     live = fanout.subscribe(Filter())
     texts = []

@@ -1,4 +1,4 @@
-"""The gate before the nodes' socket: enrolled nodes are heard, nobody else is, whatever he tries."""
+"""The guard of the nodes' socket: enrolled nodes are received, and no other peer is, whatever it tries."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from livessl.capture.link import Link
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Frame
+from livessl.errors import ConfigError
 from livessl.server.receiver import Joined, Receiver
 from livessl.site import keys
 from livessl.site.keys import KeyPair, NodeKeys
-from livessl.site.models import ConfigError, Site
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.models import Site
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
@@ -34,7 +35,7 @@ NODES = ("lab-pc", "other", "replay")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site's folder, its keys made and its nodes enrolled; `stranger` has keys, but nobody enrolled him."""
+    """Return a site's folder, its keys made and its nodes enrolled; `stranger` has keys, but is not enrolled."""
     directory = tmp_path_factory.mktemp("site")
     keys.make_server_keys(directory / "keys")
     for name in NODES:
@@ -86,7 +87,7 @@ def taken(receiver: Receiver) -> list[object]:
     return list(receiver.take(100, 0.001))
 
 
-def assert_heard(receiver: Receiver, held: NodeKeys, sequence: int) -> None:
+def assert_received(receiver: Receiver, held: NodeKeys, sequence: int) -> None:
     """A good node greets, and its frame arrives."""
     with linked(receiver.endpoint, held, replace(HELLO, run_id=f"good-{sequence}")) as link:
         until(link, lambda: link.connected or link.refused, "an answer")
@@ -104,14 +105,14 @@ def assert_heard(receiver: Receiver, held: NodeKeys, sequence: int) -> None:
     taken(receiver)
 
 
-def test_enrolled_node_is_heard(folder: Path) -> None:
+def test_enrolled_node_is_received(folder: Path) -> None:
     with receiving(folder) as receiver:
-        assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
+        assert_received(receiver, keys_of(folder, "lab-pc"), 1)
         assert receiver.refusals.count("nodes") == 0
         assert receiver.enrolled == sorted(NODES)
 
 
-def test_what_is_sent_cannot_be_read_on_the_way(folder: Path) -> None:
+def test_messages_cannot_be_read_on_the_way(folder: Path) -> None:
     with receiving(folder) as receiver, Tap(receiver.endpoint) as tap:
         with linked(tap.endpoint, keys_of(folder, "lab-pc")) as link:
             until(link, lambda: link.connected, "the connection")
@@ -129,7 +130,7 @@ BROKE_OFF = "broke off the handshake"
 
 
 def pretenders(folder: Path) -> dict[str, tuple[NodeKeys | None, set[str]]]:
-    """Everyone who is not enrolled, and the reasons one of which is counted."""
+    """Return the keys of every kind of peer that is not enrolled, and the reasons one of which is counted."""
     good = keys_of(folder, "lab-pc")
     other = KeyPair(*(z85.decode(half) for half in zmq.curve_keypair()))
     return {
@@ -142,7 +143,7 @@ def pretenders(folder: Path) -> dict[str, tuple[NodeKeys | None, set[str]]]:
 
 
 @pytest.mark.parametrize("who", ["not enrolled", "a new pair", "no keys", "wrong server", "half a pair"])
-def test_pretender_is_not_heard(folder: Path, who: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_pretender_is_not_received(folder: Path, who: str, caplog: pytest.LogCaptureFixture) -> None:
     held, reasons = pretenders(folder)[who]
     with receiving(folder) as receiver, caplog.at_level(logging.WARNING):
         with linked(receiver.endpoint, held) as link:
@@ -154,13 +155,13 @@ def test_pretender_is_not_heard(folder: Path, who: str, caplog: pytest.LogCaptur
         assert reason in reasons
         assert taken(receiver) == []
         assert receiver.ingest.live_nodes(CLOCK.monotonic_ns()) == []
-        assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
+        assert_received(receiver, keys_of(folder, "lab-pc"), 1)
     assert len([r for r in caplog.records if f"was refused: {reason}" in r.getMessage()]) == 1
 
 
 @pytest.mark.parametrize(("stays", "reason"), [(True, WITHOUT_KEYS), (False, BROKE_OFF)])
-def test_whoever_hangs_up_first_without_keys_is_told_apart(folder: Path, *, stays: bool, reason: str) -> None:
-    """The greeting of ZMTP 3.1 whose mechanism is NULL, as of a node without keys: whole, or only begun."""
+def test_peer_without_keys_is_told_from_one_that_breaks_off(folder: Path, *, stays: bool, reason: str) -> None:
+    """The peer sends the ZMTP 3.1 greeting of a node without keys, mechanism NULL: all of it, or its beginning."""
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
     with receiving(folder) as receiver:
         say(receiver, greeting if stays else greeting[:11], wait_s=10.0 if stays else 0.2)
@@ -175,14 +176,14 @@ def test_whoever_hangs_up_first_without_keys_is_told_apart(folder: Path, *, stay
         (HELLO, None),
     ],
 )
-def test_key_speaks_for_its_own_node_only(folder: Path, hello: wire.Hello, reason: str | None) -> None:
+def test_key_is_valid_for_its_own_node_only(folder: Path, hello: wire.Hello, reason: str | None) -> None:
     with receiving(folder) as receiver, linked(receiver.endpoint, keys_of(folder, "lab-pc"), hello) as link:
         until(link, lambda: link.connected or link.refused, "an answer")
         assert link.refused == reason
         assert [isinstance(item, Joined) for item in taken(receiver)] == ([True] if reason is None else [])
 
 
-def test_node_speaks_for_its_own_arrays_only(folder: Path) -> None:
+def test_node_may_send_its_own_arrays_only(folder: Path) -> None:
     hello = replace(HELLO, node="other")
     with receiving(folder) as receiver, linked(receiver.endpoint, keys_of(folder, "other"), hello) as link:
         until(link, lambda: link.connected or link.refused, "an answer")
@@ -190,7 +191,7 @@ def test_node_speaks_for_its_own_arrays_only(folder: Path) -> None:
 
 
 class Tap:
-    """A wire between a node and the server that writes down what the node says."""
+    """A wire between a node and the server that records what the node sends."""
 
     def __init__(self, endpoint: str) -> None:
         self._port = int(endpoint.rpartition(":")[2])
@@ -212,7 +213,7 @@ class Tap:
             thread.join(timeout=5)
 
     def said(self) -> list[bytes]:
-        """One stream of bytes for each connection."""
+        """Return the stream of bytes of each connection."""
         return [bytes(part) for part in self._said]
 
     def _accept(self) -> None:
@@ -244,7 +245,7 @@ def _pump(source: socket.socket, sink: socket.socket, log: bytearray | None) -> 
 
 @pytest.fixture(scope="module")
 def overheard(folder: Path) -> bytes:
-    """All that a good node said, from the greeting to its frames."""
+    """Return all that a good node sent, from the greeting to its frames."""
     with receiving(folder) as receiver, Tap(receiver.endpoint) as tap:
         with linked(tap.endpoint, keys_of(folder, "lab-pc")) as link:
             until(link, lambda: link.connected, "the connection")
@@ -255,7 +256,7 @@ def overheard(folder: Path) -> bytes:
 
 
 def say(receiver: Receiver, data: bytes, *, wait_s: float) -> None:
-    """Bytes to the server's port, and hang up once it does, or after a while."""
+    """Send bytes to the server's port, and hang up once the server does, or after a while."""
     with socket.create_connection(("127.0.0.1", int(receiver.endpoint.rpartition(":")[2]))) as connection:
         connection.settimeout(wait_s)
         try:
@@ -266,8 +267,8 @@ def say(receiver: Receiver, data: bytes, *, wait_s: float) -> None:
             pass
 
 
-def test_replayed_connection_is_not_heard(folder: Path, overheard: bytes) -> None:
-    """Every byte of a good connection again: the server has thrown its half of the keys away since."""
+def test_replayed_connection_is_not_received(folder: Path, overheard: bytes) -> None:
+    """Every byte of a good connection is sent again; the server has dropped its half of the session keys since."""
     assert len(overheard) > 5 * 4 * 800 * 2  # with the sound
     with receiving(folder) as receiver:
         for _ in range(3):
@@ -275,10 +276,10 @@ def test_replayed_connection_is_not_heard(folder: Path, overheard: bytes) -> Non
         wait_until(lambda: receiver.refusals.count("nodes") >= 3, "the refusals")
         assert taken(receiver) == []
         assert receiver.ingest.malformed == 0
-        assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
+        assert_received(receiver, keys_of(folder, "lab-pc"), 1)
 
 
-def test_truncated_and_spoilt_handshakes_are_not_heard(folder: Path, overheard: bytes) -> None:
+def test_truncated_and_spoilt_handshakes_are_not_received(folder: Path, overheard: bytes) -> None:
     rng = random.Random(5)
     greeting, hello = 64, 64 + 202  # ZMTP 3.1: the greeting's bytes, and the CURVE HELLO command's with its head
     cuts = [0, 1, 10, greeting - 1, greeting, greeting + 1, hello - 1, hello, hello + 1, hello + 100]
@@ -295,30 +296,34 @@ def test_truncated_and_spoilt_handshakes_are_not_heard(folder: Path, overheard: 
         wait_until(lambda: receiver.refusals.count("nodes") >= 1, "a refusal")
         assert taken(receiver) == []
         assert receiver.failure is None
-        assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
+        assert_received(receiver, keys_of(folder, "lab-pc"), 1)
 
 
-def test_silent_connections_keep_nobody_out(folder: Path) -> None:
+def test_silent_connections_keep_no_node_out(folder: Path) -> None:
     with receiving(folder) as receiver:
         port = int(receiver.endpoint.rpartition(":")[2])
         silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(50)]
         try:
-            assert_heard(receiver, keys_of(folder, "lab-pc"), 1)
+            assert_received(receiver, keys_of(folder, "lab-pc"), 1)
         finally:
             for each in silent:
                 each.close()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_guard_that_fails_lets_nobody_in_and_ends_the_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> list[bytes]:
+def test_guard_that_fails_lets_no_node_in_and_ends_the_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
         raise RuntimeError("out of order")
 
-    monkeypatch.setattr("livessl.server.guard._answer", fail)
-    with receiving(folder) as receiver, linked(receiver.endpoint, keys_of(folder, "lab-pc")) as link:
-        until(link, lambda: receiver.failure is not None, "the failure")
+    with receiving(folder) as receiver:
+        monkeypatch.setattr(receiver.refusals, "note", fail)
+        with linked(receiver.endpoint, keys_of(folder, "stranger")) as link:
+            until(link, lambda: receiver.failure is not None, "the failure")
         assert str(receiver.failure) == "out of order"
-        assert not link.connected
+        with linked(receiver.endpoint, keys_of(folder, "lab-pc")) as link:
+            began_ns = CLOCK.monotonic_ns()
+            until(link, lambda: CLOCK.monotonic_ns() - began_ns > 500_000_000, "a while")
+            assert not link.connected
         assert taken(receiver) == []
 
 
@@ -327,14 +332,14 @@ def test_server_whose_keys_are_missing_does_not_start(tmp_path: Path) -> None:
         Receiver(keyed(tmp_path), CLOCK)
 
 
-def test_scene_is_heard_by_key_live_and_replayed(folder: Path) -> None:
-    """The whole path, and what is told of it."""
+def test_scene_is_located_with_keys_live_and_replayed(folder: Path) -> None:
+    """The whole path, and what the API reports of it."""
     with running_server(keyed(folder)) as server:
         site = keyed(folder, {"nodes.lab-pc.server": server.endpoint})
         start_ns = CLOCK.now_ns() // FRAME_NS * FRAME_NS - round(scene().duration_s * 1e9)
-        capture_recordings(site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events, live")
-        send_session(site, server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
+        send_session(site, server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run-2", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 4, "both events, replayed")
         with linked(server.endpoint, keys_of(folder, "stranger")) as link:
             until(link, lambda: server.parts.refusals.count("nodes"), "the refusal")

@@ -9,7 +9,7 @@ import pytest
 
 from livessl import wire
 from livessl.core.types import BackfillRequest
-from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Arrival, Ingest
+from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Ingest, Received
 from livessl.wire import Ack, Bye, Hello, Request
 from small_site import frame, mark, site_of
 
@@ -23,7 +23,7 @@ def ingest() -> Ingest:
     return Ingest(site_of(WEST))
 
 
-def tell(into: Ingest, message: wire.WireMessage, peer: bytes = b"p1", now_ns: int = NOW) -> Arrival:
+def tell(into: Ingest, message: wire.WireMessage, peer: bytes = b"p1", now_ns: int = NOW) -> Received:
     return into.receive(peer, wire.encode(message), now_ns)
 
 
@@ -34,23 +34,23 @@ def joined(**changes: Any) -> Ingest:
 
 
 def refusal(into: Ingest, hello: Hello, peer: bytes = b"p2", now_ns: int = NOW) -> str | None:
-    arrival = tell(into, hello, peer, now_ns)
-    assert arrival.reply is not None
-    assert arrival.reply.run_id == hello.run_id
-    assert (arrival.joined is None) or arrival.reply.refused is None
-    return arrival.reply.refused
+    received = tell(into, hello, peer, now_ns)
+    assert received.reply is not None
+    assert received.reply.run_id == hello.run_id
+    assert (received.joined is None) or received.reply.refused is None
+    return received.reply.refused
 
 
 def test_greeting_is_answered_with_what_is_known() -> None:
     into = ingest()
-    arrival = tell(into, HELLO)
-    assert arrival == Arrival(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
+    received = tell(into, HELLO)
+    assert received == Received(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
     tell(into, frame(1))
     again = tell(into, HELLO)
-    assert again == Arrival(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
+    assert again == Received(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
 
 
-def test_run_that_comes_back_by_another_connection_goes_on() -> None:
+def test_run_that_reconnects_goes_on() -> None:
     into = joined()
     tell(into, frame(4))
     assert tell(into, HELLO, b"p9").reply == Ack("run-1", {"north": 1003})
@@ -70,8 +70,8 @@ def test_new_run_counts_from_the_beginning() -> None:
 
 
 @pytest.mark.parametrize("message", [frame(), mark(), Bye("lab-pc", "run-1")])
-def test_stranger_is_asked_who_he_is(message: wire.WireMessage) -> None:
-    assert tell(ingest(), message) == Arrival(reply=WHO)
+def test_unknown_peer_is_requested_to_greet(message: wire.WireMessage) -> None:
+    assert tell(ingest(), message) == Received(reply=WHO)
 
 
 def test_messages_pass_once_each() -> None:
@@ -85,17 +85,17 @@ def test_messages_pass_once_each() -> None:
 def test_gaps_in_the_sequence_are_counted() -> None:
     into = joined()
     for sequence in (7, 8, 12, 13):
-        arrival = tell(into, frame(sequence))
-        assert arrival == Arrival(reply=WHO) if sequence == 12 else arrival.message is not None  # send them again
+        received = tell(into, frame(sequence))
+        assert received == Received(reply=WHO) if sequence == 12 else received.message is not None  # send them again
     assert into.sequence_gaps == {"north": 3, "south": 0, "west": 0}
 
 
-def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
+def test_marks_reveal_lost_frames_and_are_no_loss_themselves() -> None:
     into = joined()
     for message in (mark(4, 1000), mark(4, 1005), frame(5, 1006), mark(5, 1007)):  # four marks were never sent
         assert tell(into, message).message is not None
     assert into.sequence_gaps["north"] == 0
-    assert tell(into, mark(8, 1011)) == Arrival(reply=WHO)  # frames 6 to 8 never came
+    assert tell(into, mark(8, 1011)) == Received(reply=WHO)  # frames 6 to 8 never came
     assert into.sequence_gaps["north"] == 3
     assert tell(into, frame(9, 1012)).message is not None
     assert into.sequence_gaps["north"] == 3
@@ -104,7 +104,7 @@ def test_marks_tell_of_lost_frames_and_are_no_loss_themselves() -> None:
 
 def test_good_bye_ends_a_run() -> None:
     into = joined()
-    assert tell(into, Bye("lab-pc", "run-1")) == Arrival(left=HELLO)
+    assert tell(into, Bye("lab-pc", "run-1")) == Received(left=HELLO)
     assert into.live_nodes(NOW) == []
     assert tell(into, frame(1)).reply == WHO
     assert refusal(into, replace(HELLO, run_id="run-2")) is None
@@ -148,7 +148,7 @@ OTHER = Hello("other-pc", "run-9", {"west": 16000.0})
         (replace(OTHER, arrays={"west": 6001.0}), None),
     ],
 )
-def test_who_may_join(hello: Hello, reason: str | None) -> None:
+def test_greeting_that_contradicts_the_site_is_refused(hello: Hello, reason: str | None) -> None:
     into = joined()
     said = refusal(into, hello)
     if reason is None:
@@ -169,7 +169,7 @@ def test_live_node_waits_for_a_replay_to_end() -> None:
     assert refusal(into, OTHER) is None
 
 
-def test_refused_node_may_come_when_the_place_is_free() -> None:
+def test_refused_node_may_join_when_its_place_is_free() -> None:
     into = joined()
     taken = replace(OTHER, arrays={"north": 16000.0})
     assert refusal(into, taken) is not None
@@ -188,14 +188,14 @@ def test_refused_node_may_come_when_the_place_is_free() -> None:
     ],
     ids=["nothing", "rubbish", "truncated", "acknowledgement", "array not announced", "rate not announced"],
 )
-def test_malformed_is_counted_and_changes_nothing(data: bytes) -> None:
+def test_malformed_message_is_counted_and_changes_nothing(data: bytes) -> None:
     into = joined()
-    assert into.receive(b"p1", data, NOW) == Arrival()
+    assert into.receive(b"p1", data, NOW) == Received()
     assert into.malformed == 1
     assert tell(into, frame(1)).message is not None
 
 
-def test_rubbish_is_noticed_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_messages_are_logged_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:
     into = ingest()
     for k in range(100):
         into.receive(b"p1", b"rubbish", NOW + k)
@@ -206,7 +206,7 @@ def test_rubbish_is_noticed_once_a_minute(caplog: pytest.LogCaptureFixture) -> N
     assert "message refused (101 so far): " in caplog.text
 
 
-def test_problem_of_a_device_is_told_until_it_is_over() -> None:
+def test_problem_of_a_device_is_reported_until_it_is_over() -> None:
     into = joined()
     assert into.problem_of("north") is None
     tell(into, replace(HELLO, problem="unplugged"))
@@ -218,7 +218,7 @@ def test_problem_of_a_device_is_told_until_it_is_over() -> None:
     assert into.problem_of("north") is None
 
 
-def test_a_node_is_told_once_that_it_may_be_asked() -> None:
+def test_node_is_informed_once_that_the_server_may_request_frames() -> None:
     into = ingest()
     assert tell(into, HELLO).offer == Request("run-1")
     assert tell(into, HELLO).offer is None  # an older one that says nothing of it
@@ -239,7 +239,7 @@ def test_requests_go_to_nodes_that_know_them() -> None:
     assert into.requests(asks) == []
 
 
-def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
+def test_requested_frame_is_handed_on_and_not_counted() -> None:
     into = joined()
     tell(into, frame(1))
     asked = frame(0, frame_index=700, active=False)
@@ -250,17 +250,17 @@ def test_what_was_asked_for_is_handed_on_and_counts_for_nothing() -> None:
     assert into.acknowledgements(NOW + ACK_NS)[0][1].received == {"north": 1001}
 
 
-def test_request_of_a_node_is_refused() -> None:
+def test_request_from_a_node_is_refused() -> None:
     into = joined()
     tell(into, Request("run-1"))
     assert into.malformed == 1
 
 
-def test_settled_is_told_by_each_nodes_own_clock() -> None:
+def test_final_frame_index_is_acknowledged_by_each_nodes_own_clock() -> None:
     into = joined()
-    into.settled = {"north": 103, "south": 100}
+    into.final_until = {"north": 103, "south": 100}
     (_, ack), *_ = into.acknowledgements(NOW + ACK_NS)
-    assert ack.settled == min(into.settled[array] for array in HELLO.arrays)
-    into.settled = {}
+    assert ack.settled == min(into.final_until[array] for array in HELLO.arrays)
+    into.final_until = {}
     (_, ack), *_ = into.acknowledgements(NOW + 2 * ACK_NS)
     assert ack.settled is None

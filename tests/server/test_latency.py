@@ -1,4 +1,4 @@
-"""Where the time goes: stages that add up, of the message that everyone waited for."""
+"""Stages of latency: they add up, and are those of the message that arrived last."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EVENT = Event("small-1", BEGUN_NS, ENDED_NS, Status.LOCATED, None, ESTIMATE, 0.0
 MS = 1_000_000
 
 
-def test_stages_are_those_of_the_message_that_came_last() -> None:
+def test_stages_are_those_of_the_message_that_arrived_last() -> None:
     arrivals = Arrivals()
     arrivals.note(RASTER, Arrival(END_NS + 3 * MS, END_NS + 4 * MS))
     arrivals.note(RASTER, Arrival(END_NS + 10 * MS, END_NS + 11 * MS))
@@ -32,7 +32,7 @@ def test_stages_are_those_of_the_message_that_came_last() -> None:
     assert stages.total == stages.ours == pytest.approx(0.015)
 
 
-def test_an_event_waits_for_quiet_and_that_is_no_delay_of_ours() -> None:
+def test_quiet_that_ends_an_event_is_not_counted_as_delay() -> None:
     arrivals = Arrivals()
     arrivals.note(RASTER, Arrival(END_NS + 2 * MS, END_NS + 3 * MS))
     stages = arrivals.stages(EVENT, END_NS + 7 * MS)
@@ -42,7 +42,7 @@ def test_an_event_waits_for_quiet_and_that_is_no_delay_of_ours() -> None:
     assert stages.ours == pytest.approx(0.007)
 
 
-def test_nobody_knows_what_nobody_stamped() -> None:
+def test_stages_are_unknown_without_a_time_stamp() -> None:
     arrivals = Arrivals()
     assert arrivals.stages(UPDATE, END_NS) is None
     arrivals.note(RASTER, Arrival(0, END_NS))  # a sender that does not say
@@ -51,7 +51,7 @@ def test_nobody_knows_what_nobody_stamped() -> None:
     assert arrivals.stages(UPDATE, END_NS) is not None
 
 
-def test_old_intervals_are_forgotten() -> None:
+def test_old_arrivals_are_forgotten() -> None:
     arrivals = Arrivals()
     for frame_index in range(RASTER, RASTER + KEPT):
         arrivals.note(frame_index, Arrival(END_NS, END_NS))

@@ -1,4 +1,4 @@
-"""Maps are drawn for whoever looks, and for nobody else."""
+"""Maps are drawn for readers and watchers, and not without them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GCC_OF_NOTHING = GCC(np.array([[0, 1]]), np.array([0.0, 1e-4]), np.zeros((1, 2))
 
 
 class Artist:
-    """Draws maps whose powers count the nodes; remembers what it drew."""
+    """Draws maps whose powers count the grid points; remembers what it drew."""
 
     def __init__(self) -> None:
         self.drew: list[tuple[int, frozenset[str]]] = []
@@ -56,7 +56,7 @@ def maps() -> Iterator[Maps]:
     assert not any(thread.name == "maps" for thread in threading.enumerate())
 
 
-def test_nothing_is_drawn_for_nobody(maps: Maps, artist: Artist) -> None:
+def test_nothing_is_drawn_without_a_reader(maps: Maps, artist: Artist) -> None:
     assert maps.newest("fused") is None
     for time_ns in range(3):
         maps.show(window(time_ns), artist.draw)
@@ -66,7 +66,7 @@ def test_nothing_is_drawn_for_nobody(maps: Maps, artist: Artist) -> None:
     assert drawn.window.time_ns == 2
 
 
-def test_what_is_drawn_already_is_not_drawn_again(maps: Maps, artist: Artist) -> None:
+def test_drawing_is_not_repeated(maps: Maps, artist: Artist) -> None:
     maps.show(window(1), artist.draw)
     first = maps.newest("fused")
     assert maps.newest("fused") is first
@@ -81,7 +81,7 @@ def test_what_is_drawn_already_is_not_drawn_again(maps: Maps, artist: Artist) ->
     assert maps.newest("fused") is not first
 
 
-def test_array_that_heard_nothing_has_no_map(maps: Maps, artist: Artist) -> None:
+def test_array_that_detected_nothing_has_no_map(maps: Maps, artist: Artist) -> None:
     maps.show(window(1), artist.draw)
     drawn = maps.newest("south")
     assert drawn is not None
@@ -89,7 +89,7 @@ def test_array_that_heard_nothing_has_no_map(maps: Maps, artist: Artist) -> None
     assert maps.newest("south") is drawn
 
 
-def test_watchers_see_the_newest_until_they_leave(maps: Maps, artist: Artist) -> None:
+def test_watchers_get_the_newest_pictures_until_they_leave(maps: Maps, artist: Artist) -> None:
     news = threading.Event()
     began_ns = CLOCK.monotonic_ns()
     with maps.watching("fused", ("floor", "side"), news.set):
@@ -108,7 +108,7 @@ def test_watchers_see_the_newest_until_they_leave(maps: Maps, artist: Artist) ->
     assert artist.drew[before:] == [(100, frozenset({"north"}))]  # nobody watches the fused one any more
 
 
-def test_watcher_who_comes_late_sees_what_there_is(maps: Maps, artist: Artist) -> None:
+def test_watcher_that_comes_late_gets_the_newest_window(maps: Maps, artist: Artist) -> None:
     maps.show(window(1), artist.draw)
     assert maps.newest("fused") is not None
     with maps.watching("north", ("front",), lambda: None), maps.watching("south", ("floor",), lambda: None):
@@ -118,7 +118,7 @@ def test_watcher_who_comes_late_sees_what_there_is(maps: Maps, artist: Artist) -
         assert maps.drawn.pictures["north", "front"] is not None
 
 
-def test_picture_in_bytes(maps: Maps, artist: Artist) -> None:
+def test_packed_picture_follows_its_description(maps: Maps, artist: Artist) -> None:
     maps.show(window(10**9), artist.draw)
     with maps.watching("fused", ("floor",), lambda: None):
         wait_until(lambda: maps.drawn is not None, "a picture")
@@ -137,7 +137,7 @@ def test_picture_in_bytes(maps: Maps, artist: Artist) -> None:
     assert len(np.unique(levels)) == 8
 
 
-def test_map_of_another_time_is_never_shown(maps: Maps, artist: Artist) -> None:
+def test_map_of_another_run_is_never_shown(maps: Maps, artist: Artist) -> None:
     artist.may_go_on.clear()
     maps.show(window(1), artist.draw)
     asking = threading.Thread(target=maps.newest, args=("fused",))
@@ -157,7 +157,7 @@ def test_map_of_another_time_is_never_shown(maps: Maps, artist: Artist) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_failure_is_told(maps: Maps) -> None:
+def test_failure_is_reported(maps: Maps) -> None:
     def fail(window: Window, arrays: frozenset[str]) -> PowerMaps:
         raise MemoryError("no room for a map")
 

@@ -1,4 +1,4 @@
-"""Work shared between two threads: all of it is done, once, and what goes wrong is told."""
+"""Work shared between two threads: each item is done once, and errors are raised."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def parallel() -> Iterator[Parallel]:
 
 
 @pytest.mark.parametrize("count", [0, 1, FEW, FEW + 1, 500])
-def test_everything_is_done_once(parallel: Parallel, count: int) -> None:
+def test_each_item_is_done_once(parallel: Parallel, count: int) -> None:
     done: list[int] = []
     parallel.for_each(done.append, range(count))
     assert sorted(done) == list(range(count))
 
 
 def test_two_threads_work(parallel: Parallel) -> None:
-    both = threading.Barrier(2, timeout=10.0)  # nobody passes alone
+    both = threading.Barrier(2, timeout=10.0)  # no thread passes alone
 
     def meet(number: int) -> None:
         if number < 2:
@@ -35,7 +35,7 @@ def test_two_threads_work(parallel: Parallel) -> None:
 
 
 @pytest.mark.parametrize("wrong", [0, 40])
-def test_what_goes_wrong_is_raised(parallel: Parallel, wrong: int) -> None:
+def test_error_of_either_thread_is_raised(parallel: Parallel, wrong: int) -> None:
     def work(number: int) -> None:
         if number == wrong:
             raise ValueError(f"number {number}")

@@ -1,4 +1,4 @@
-"""The nodes' socket: whatever a stranger throws at it, a good node carries on."""
+"""The nodes' socket: whatever another peer sends to it, a good node is served."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def receiving() -> Iterator[Receiver]:
 
 @contextmanager
 def stranger(receiver: Receiver) -> Iterator[zmq.Socket[bytes]]:
-    """Someone who sends what he likes."""
+    """Connect a peer that sends what it likes."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.connect(receiver.endpoint)
@@ -63,7 +63,7 @@ def assert_works(receiver: Receiver, link: Link, first: int) -> None:
     wait_until(arrived, "the good node's frames")
 
 
-def test_malformed_messages_hinder_nobody() -> None:
+def test_malformed_messages_hinder_no_other_node() -> None:
     rng = random.Random(2)
     good = [wire.encode(message) for message in (frame(), mark(), HELLO)]
     with receiving() as receiver, node(receiver) as link, stranger(receiver) as socket:
@@ -81,7 +81,7 @@ def test_malformed_messages_hinder_nobody() -> None:
         assert receiver.failure is None
 
 
-def test_oversized_message_cuts_only_its_sender_off() -> None:
+def test_oversized_message_disconnects_only_its_sender() -> None:
     with receiving() as receiver, node(receiver) as link, stranger(receiver) as socket:
         assert_works(receiver, link, 1)
         with socket.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor:
@@ -118,12 +118,12 @@ def test_items_come_in_order() -> None:
         assert items[4] == Left(HELLO)
 
 
-def test_full_queue_leaves_the_sound_with_the_node() -> None:
-    """Nobody takes anything; the node is still acknowledged what was taken in, and loses nothing."""
+def test_full_queue_leaves_frames_with_the_node() -> None:
+    """While nothing is taken, the node still gets acknowledgements of what is in the queue, and loses nothing."""
     total = QUEUE_MESSAGES + 300
     with receiving() as receiver, node(receiver) as link:
         link.send([frame(k) for k in range(1, total + 1)])
-        wait_until(lambda: link.service() or receiver._queue.full(), "a full queue")  # type: ignore[func-returns-value]
+        wait_until(lambda: link.service() or receiver.queued == QUEUE_MESSAGES, "a full queue")  # type: ignore[func-returns-value]
         got: list[int] = []
 
         def all_arrived() -> bool:
@@ -136,7 +136,7 @@ def test_full_queue_leaves_the_sound_with_the_node() -> None:
         assert link.dropped == 0
 
 
-def test_address_that_is_taken() -> None:
+def test_taken_address_is_an_error_with_its_cure() -> None:
     with receiving() as receiver:
         with pytest.raises(BindError) as caught:
             Receiver(site_of({"server.bind": receiver.endpoint}), CLOCK)
@@ -149,7 +149,7 @@ def test_address_that_is_taken() -> None:
     again.stop()
 
 
-def test_take_waits_no_longer_than_told() -> None:
+def test_take_waits_no_longer_than_it_may() -> None:
     with receiving() as receiver:
         began_ns = CLOCK.now_ns()
         assert receiver.take(10, 0.05) == []

@@ -1,4 +1,4 @@
-"""Who was turned away: every one counted, a bounded number remembered, each told once."""
+"""Refusals: every one is counted, a bounded number is remembered, and each is logged once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from livessl.clock import SystemClock
 from livessl.server.refusals import MAX_KNOWN, Refusals
 
 
-def test_each_is_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_refusal_is_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     refusals = Refusals(SystemClock())
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
@@ -28,7 +28,7 @@ def test_each_is_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None
     assert max(refusals.known(), key=lambda refused: refused.count).count == 3
 
 
-def test_many_addresses_cost_no_more_memory_nor_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_many_addresses_cost_bounded_memory_and_log_lines(caplog: pytest.LogCaptureFixture) -> None:
     refusals = Refusals(SystemClock())
     with caplog.at_level(logging.WARNING):
         for number in range(10 * MAX_KNOWN):

@@ -23,14 +23,14 @@ from livessl.capture.link import Link
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
-from livessl.recordings.recording import Placed, Spliced
+from livessl.recordings.recording import SplicedRecording
 from livessl.server import app, site_time
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
 from livessl.server.store import StoreError
-from livessl.site.keys import add_token
-from small_site import Changes, frame, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.tokens import add_token
+from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 START_NS = 1_767_225_600_000_000_000
@@ -70,24 +70,26 @@ class Subscriber:
 def play(server: Server, speed: float | None = None) -> None:
     """Send the scene as a replay, as fast as it goes or at a speed."""
     pace = UnpacedClock(START_NS) if speed is None else PacedClock(START_NS, speed)
-    send_session(site_of(), server.endpoint, scene_parts(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False)
+    send_session(
+        site_of(), server.endpoint, scene_recordings(START_NS), pace, CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
     server.wait_idle()
 
 
 def offline_events() -> list[dict[str, Any]]:
-    """The events of the scene without any server."""
+    """Return the events of the scene, located without a server."""
     site = site_of()
     encoder = Messages(site, START_NS, utc=True)
-    outputs = offline.run(site, scene_parts(START_NS), UnpacedClock(START_NS))
+    outputs = offline.run(site, scene_recordings(START_NS), UnpacedClock(START_NS))
     return [encoder.event(output) for output in outputs if isinstance(output, Event)]
 
 
 def without_delays(event: dict[str, Any]) -> dict[str, Any]:
-    """An event but for what depends on how fast it was played, and on its place among the messages."""
+    """Return an event without what depends on the speed of the replay and on its place among the messages."""
     return {name: value for name, value in event.items() if name not in ("latency_s", "start_s", "seq", "v")}
 
 
-def test_replay_reaches_subscribers_and_rest_as_it_would_be_offline() -> None:
+def test_replay_gives_subscribers_and_rest_the_same_events_as_offline() -> None:
     with running_server(site_of()) as server:
         subscriber, events_only = Subscriber(server), Subscriber(server, "?kinds=event")
         play(server)
@@ -128,7 +130,7 @@ def test_replay_twice_gives_the_same() -> None:
     assert len(stored) == 2  # the same events, not four
 
 
-def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> None:
+def test_running_replay_has_maps_tracks_and_its_own_time() -> None:
     with running_server(site_of()) as server:
         playing = Thread(target=play, args=(server, 2.0))
         playing.start()
@@ -151,12 +153,12 @@ def test_while_a_replay_runs_there_are_maps_and_tracks_and_its_own_time() -> Non
 
 
 def test_gap_in_a_recording_does_not_end_its_replay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nine seconds without sound at six times the speed, and a server that soon loses its patience."""
+    """Nine seconds without sound, at six times the speed, outlast the silence that ends a replay."""
     monkeypatch.setattr(site_time, "REPLAY_SILENT_NS", 200_000_000)
     gap_ns = round(scene().duration_s * 1e9) // FRAME_NS * FRAME_NS + 9_000_000_000
     twice = [
-        replace(first, placed=Placed(Spliced((first.placed, second.placed)), START_NS))
-        for first, second in zip(scene_parts(START_NS), scene_parts(START_NS + gap_ns), strict=True)
+        replace(first, recording=SplicedRecording((first.timed, second.timed)), start_ns=START_NS)
+        for first, second in zip(scene_recordings(START_NS), scene_recordings(START_NS + gap_ns), strict=True)
     ]
     with running_server(site_of()) as server:
         send_session(site_of(), server.endpoint, twice, PacedClock(START_NS, 6.0), CLOCK, "run", lambda: False)
@@ -182,7 +184,7 @@ def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize(("say_s", "said"), [(0.0, True), (5.0, False)], ids=["long", "short"])
-def test_start_that_waits_for_the_compiler_says_so(
+def test_start_that_waits_for_the_compiler_is_logged(
     say_s: float, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def compile_slowly() -> None:
@@ -263,11 +265,11 @@ def test_live_frames_far_from_the_servers_time_are_rejected() -> None:
         link.close(bye=True)
 
 
-def test_trouble_of_a_device_is_seen_by_everyone() -> None:
+def test_problem_of_a_device_reaches_subscribers() -> None:
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, "?kinds=arrays")
         link = connected(server, LIVE)
-        link.tell("input device 'UMC1820' is not connected")
+        link.report("input device 'UMC1820' is not connected")
 
         def told() -> bool:
             link.service()
@@ -281,7 +283,7 @@ def test_trouble_of_a_device_is_seen_by_everyone() -> None:
 
 
 @pytest.mark.parametrize("query", ["", "?kinds=event"])
-def test_server_ends_while_someone_listens(query: str) -> None:
+def test_server_stops_while_a_client_listens(query: str) -> None:
     began_ns = CLOCK.now_ns()
     with running_server(site_of()) as server:
         subscriber = Subscriber(server, query)
@@ -297,7 +299,7 @@ def refused(changes: Changes, directory: Path | None = None) -> str:
     return str(caught.value)
 
 
-def test_addresses_that_are_taken() -> None:
+def test_taken_addresses_are_errors_with_their_cures() -> None:
     with running_server(site_of()) as server:
         port = int(server.url.rpartition(":")[2])
         assert refused({"server.http.port": port}) == (
@@ -313,7 +315,7 @@ def test_addresses_that_are_taken() -> None:
         pass  # the failed start has given its port back
 
 
-def test_method_of_the_command_line_is_the_sites() -> None:
+def test_method_of_the_command_line_replaces_the_sites() -> None:
     with running_server(site_of(), method="averaged") as server:
         assert httpx.get(f"{server.url}/api/v1/site").json()["method"] == "averaged"
         play(server)
@@ -322,14 +324,14 @@ def test_method_of_the_command_line_is_the_sites() -> None:
     assert {event["method"] for event in told} == {"averaged"}
 
 
-def test_host_that_is_not_ours(tmp_path: Path) -> None:
+def test_address_of_another_machine_is_an_error(tmp_path: Path) -> None:
     add_token(tmp_path / "tokens.yaml", "tests", "viewer")
     said = refused({"server.http.host": "192.0.2.1", "server.http.tokens": "tokens.yaml"}, tmp_path)
     assert said.startswith("server.http: cannot listen on 192.0.2.1:0: ")
     assert said.endswith("; write an address of this machine")
 
 
-def test_address_of_version_six() -> None:
+def test_server_listens_on_an_ipv6_address() -> None:
     with running_server(site_of({"server.http.host": "::1"})) as server:
         assert server.url.startswith("http://[::1]:")
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
@@ -346,12 +348,12 @@ def test_database_outlives_the_server(tmp_path: Path) -> None:
         assert server.parts.event_log.published == 0
 
 
-def test_database_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_database_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"server\.events_db: cannot use"):
         Server(site_of({"server.events_db": str(tmp_path)}), CLOCK)
 
 
-def test_events_are_handed_on_too() -> None:
+def test_events_are_handed_to_the_embedding_program() -> None:
     taken: list[dict[str, Any]] = []
     server = Server(site_of(), CLOCK, on_event=taken.append)
     thread = Thread(target=server.run)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from livessl.server.sinks import SinkError, Sinks
-from livessl.site.models import SinkConfig
+from livessl.site.server_models import SinkConfig
 
 EVENT = {"kind": "event", "id": "lab-1", "position_m": [1.0, 2.0, 3.0], "reason": "für immer"}
 
@@ -25,12 +25,12 @@ def test_events_are_appended_line_by_line(tmp_path: Path) -> None:
     assert json.loads(seen_while_open[1]) == EVENT
 
 
-def test_a_sink_that_cannot_be_opened_is_told_with_its_key(tmp_path: Path) -> None:
+def test_sink_that_cannot_be_opened_is_an_error_with_its_key(tmp_path: Path) -> None:
     with pytest.raises(SinkError, match=r"server\.sinks: cannot append to .*missing"):
         Sinks([SinkConfig(type="jsonl", path=str(tmp_path / "missing" / "events.jsonl"))])
 
 
-def test_a_full_disk_hinders_neither_the_other_sinks_nor_the_server(tmp_path: Path) -> None:
+def test_full_disk_hinders_neither_the_other_sinks_nor_the_server(tmp_path: Path) -> None:
     full, good = Path("/dev/full"), tmp_path / "events.jsonl"
     if not full.exists():
         pytest.skip("there is no /dev/full on this system")

@@ -29,7 +29,7 @@ def event(number: int, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> 
 
 
 def filled(count: int, path: Path | None = None) -> Store:
-    """Event k began k seconds after the start."""
+    """Return a store of events of which number k began k seconds after the start."""
     store = Store(path)
     for k in range(count):
         store.add(event(k, k / count, ("door",) if k % 3 == 0 else ()), START_NS + k * NS)
@@ -72,14 +72,14 @@ def test_newest_come_first() -> None:
         ({"limit": 2, "zone": "door"}, [9, 6]),
     ],
 )
-def test_queries(query: dict[str, Any], expected: list[int]) -> None:
+def test_query_finds_what_matches(query: dict[str, Any], expected: list[int]) -> None:
     assert ids(filled(10), **query) == expected
 
 
 @pytest.mark.parametrize("limit", [1, 3, 5, 7, 100])
 @pytest.mark.parametrize("zone", [None, "door"])
 def test_pages_leave_nothing_out_and_repeat_nothing(limit: int, zone: str | None) -> None:
-    """Even while new events come and an old one is told again."""
+    """Even while new events come and an old one is stored again."""
     store = filled(20)
     expected = ids(store, limit=1000, zone=zone)
     seen: list[int] = []
@@ -102,7 +102,7 @@ def test_last_page_has_no_next() -> None:
     assert cursor is not None
 
 
-def test_event_told_again_replaces_itself() -> None:
+def test_event_stored_again_replaces_itself() -> None:
     store = filled(3)
     store.add({**event(1), "confidence": 0.99}, START_NS)
     assert store.count() == 3
@@ -111,8 +111,8 @@ def test_event_told_again_replaces_itself() -> None:
     assert found["confidence"] == 0.99
 
 
-def test_event_told_again_keeps_its_place_among_equals() -> None:
-    """A cursor that was told before stays right."""
+def test_event_stored_again_keeps_its_place_among_equals() -> None:
+    """A cursor from before stays valid."""
     store = Store()
     for k in range(3):
         store.add(event(k), START_NS)
@@ -123,7 +123,7 @@ def test_event_told_again_keeps_its_place_among_equals() -> None:
     assert ids(store, before=cursor) == [1, 0]
 
 
-def test_time_decides_not_the_order_of_telling() -> None:
+def test_order_is_by_time_and_not_by_storing() -> None:
     store = Store()
     for k in (3, 0, 2, 1):
         store.add(event(k), START_NS + k * NS)
@@ -134,17 +134,17 @@ def test_time_decides_not_the_order_of_telling() -> None:
 
 
 @pytest.mark.parametrize("cursor", [Cursor(START_NS, 7), Cursor(-5, 1), Cursor(0, 0)])
-def test_cursor_is_told_and_understood(cursor: Cursor) -> None:
+def test_cursor_is_read_back_from_its_text(cursor: Cursor) -> None:
     assert Cursor.parse(str(cursor)) == cursor
 
 
 @pytest.mark.parametrize("text", ["", "7", "7-", "-7", "a-b", "7-7 ", "٧-٧", f"{2**63}-1", f"1-{10**30}"])
-def test_text_that_is_no_cursor(text: str) -> None:
+def test_text_that_is_no_cursor_is_an_error(text: str) -> None:
     with pytest.raises(ValueError, match="expected the next_cursor of the page before"):
         Cursor.parse(text)
 
 
-def test_file_that_another_program_holds(tmp_path: Path) -> None:
+def test_file_that_another_program_holds_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "events.db"
     store = filled(1, path)
     with closing(sqlite3.connect(path)) as other:
@@ -160,8 +160,8 @@ def test_file_that_another_program_holds(tmp_path: Path) -> None:
     store.close()
 
 
-def test_slow_query_does_not_hold_up_an_event(tmp_path: Path) -> None:
-    """The reader's lock is held throughout, as by a query that takes its time."""
+def test_slow_query_does_not_delay_an_event(tmp_path: Path) -> None:
+    """The reader's lock is held throughout, as by a slow query."""
     store = filled(1, tmp_path / "events.db")
     adding = Thread(target=lambda: store.add(event(1), START_NS + NS))
     with store._reading.lock:
@@ -198,7 +198,7 @@ def test_file_persists(tmp_path: Path) -> None:
     again.close()
 
 
-def test_path_that_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_path_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "notes.db").write_text("dear diary, " * 500, encoding="utf-8")
     for path in (tmp_path / "nowhere" / "events.db", tmp_path, tmp_path / "notes.db"):
         with pytest.raises(StoreError) as caught:
@@ -208,7 +208,7 @@ def test_path_that_cannot_be_used(tmp_path: Path) -> None:
         assert said.endswith("; name a file in a writable folder")
 
 
-def test_any_thread_may_ask_and_add() -> None:
+def test_any_thread_may_query_and_add() -> None:
     store = Store()
 
     def add(offset: int) -> None:
@@ -231,7 +231,7 @@ def test_quotes_in_a_zone_are_only_quotes() -> None:
     assert store.get("' OR 1=1 --") is None
 
 
-def test_settled_events_take_the_place_of_provisional_ones(tmp_path: Path) -> None:
+def test_final_events_take_the_place_of_early_ones(tmp_path: Path) -> None:
     path = tmp_path / "events.db"
     store = Store(path)
     assert store.finalized("lab") == (None, None)
@@ -250,18 +250,19 @@ def test_settled_events_take_the_place_of_provisional_ones(tmp_path: Path) -> No
     again.close()
 
 
-def test_a_file_of_before_there_were_clocks_is_read(tmp_path: Path) -> None:
+def test_database_of_an_older_version_is_read(tmp_path: Path) -> None:
+    """Its table of the final pass has this very column, and it has no table of clocks."""
+    with closing(sqlite3.connect(tmp_path / "events.db")) as db, db:
+        db.execute("CREATE TABLE settled (site TEXT PRIMARY KEY, raster INTEGER)")
+        db.execute("INSERT INTO settled VALUES ('lab', 1000)")
     store = Store(tmp_path / "events.db")
-    store._writing.rows("DROP TABLE clocks")
-    store._writing.rows("INSERT INTO settled VALUES ('lab', 1000)")
-    store._writing.db.commit()
+    assert store.finalized("lab") == (1000, None)
+    store.finalize("lab", [(event(1), START_NS)], [], 2000, {"b": 0.15})
+    assert store.finalized("lab") == (2000, {"b": 0.15})
     store.close()
-    again = Store(tmp_path / "events.db")
-    assert again.finalized("lab") == (1000, None)
-    again.close()
 
 
-def test_settling_is_all_or_nothing(tmp_path: Path) -> None:
+def test_finalize_is_all_or_nothing(tmp_path: Path) -> None:
     store = filled(1, tmp_path / "events.db")
     large = {**event(6), "note": "x" * 500_000}
     pages = store._writing.rows("PRAGMA page_count")[0][0]

@@ -1,4 +1,4 @@
-"""Arrays that an operator has disabled: shown, acknowledged, not used, and not waited for."""
+"""Disabled arrays: they are shown and acknowledged, but neither used nor waited for."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ def test_disabled_array_is_shown_as_such() -> None:
 
 
 @pytest.mark.parametrize("body", [{}, {"enabled": "no"}, {"enabled": 0}, {"enabled": False, "why": "noise"}, [], None])
-def test_what_is_no_switch_is_refused(body: Any) -> None:
+def test_malformed_switch_is_refused(body: Any) -> None:
     with running_server(site_of()) as server:
         assert put(server.url, "north", body).status_code == 422
         assert array(server.url, "north")["enabled"]
 
 
-def test_no_array_of_that_name() -> None:
+def test_switch_of_an_unknown_array_is_refused() -> None:
     with running_server(site_of()) as server:
         answer = put(server.url, "east", {"enabled": False})
         assert (answer.status_code, answer.json()["detail"]) == (404, "no array 'east'; there are north, south")
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_a_file_remembers_it(tmp_path: Path, kept: bool) -> None:
+def test_database_remembers_a_disabled_array(tmp_path: Path, kept: bool) -> None:
     site = site_of({"server.events_db": str(tmp_path / "events.db")} if kept else {})
     with running_server(site) as server:
         put(server.url, "north", {"enabled": False})
@@ -62,7 +62,7 @@ def test_a_file_remembers_it(tmp_path: Path, kept: bool) -> None:
         assert array(server.url, "north")["enabled"] is not kept
 
 
-def test_what_the_store_does_not_take_is_not_done() -> None:
+def test_array_stays_enabled_if_the_database_is_full() -> None:
     with running_server(site_of()) as server:
         with patch.object(server.parts.store, "enable", side_effect=StoreError("server.events_db: disk full")):
             answer = put(server.url, "north", {"enabled": False})
@@ -74,7 +74,7 @@ def heard(world: World) -> set[str]:
     return {name for event in world.events() for name in event["heard_by"]}
 
 
-def test_disabled_sound_is_acknowledged_and_not_used() -> None:
+def test_frames_of_a_disabled_array_are_acknowledged_and_not_used() -> None:
     world, as_ever = World(1), World(1)
     assert world.server is not None
     world.server.array_states.enable("north", False)
@@ -84,8 +84,8 @@ def test_disabled_sound_is_acknowledged_and_not_used() -> None:
     assert max(node.link.kept for node in world.nodes.values()) <= 60
 
 
-def test_nobody_waits_for_a_disabled_array() -> None:
-    """Not for one that is away either: sound of the others is settled at once, and nodes forget it."""
+def test_no_result_waits_for_a_disabled_array() -> None:
+    """The disabled array is away, too: events of the others are final at once, and their nodes forget the frames."""
     for disabled in (True, False):
         world = World(1)
         world.run(20)
@@ -98,7 +98,7 @@ def test_nobody_waits_for_a_disabled_array() -> None:
         assert (world.nodes["b"].link.kept <= 60) is disabled
 
 
-def test_enabled_again_it_is_used_again() -> None:
+def test_array_enabled_again_is_used_again() -> None:
     world = World(1)
     assert world.server is not None
     world.server.array_states.enable("north", False)

@@ -1,4 +1,4 @@
-"""Secrets on disk: made once, readable by nobody else, and never shown by an error."""
+"""Keys and tokens on disk: they are made once, readable only by their owner, and never shown by an error."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import pytest
 import yaml
 
 from livessl.cli.main import main
-from livessl.site import keys
-from livessl.site.keys import Client, Role
+from livessl.errors import ConfigError
+from livessl.site import keys, tokens
+from livessl.site.checks import unprotected_addresses
 from livessl.site.load import load_site
-from livessl.site.models import ConfigError, open_doors
+from livessl.site.tokens import Client, Role
 from small_site import Changes, site_of, write_site
 
 KEYED: Changes = {"keys": "keys", "server.http.tokens": "tokens.yaml"}
@@ -28,18 +29,18 @@ def site(tmp_path: Path) -> Path:
 
 
 def keyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """What a `keys` command prints."""
+    """Return the output of a `keys` command."""
     assert main(["keys", *map(str, arguments)]) == 0
     return capsys.readouterr().out.strip()
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """What a `keys` command that is wrong use says."""
+    """Return the error of a `keys` command that is wrong use."""
     assert main(["keys", *map(str, arguments)]) == 2
     return capsys.readouterr().err
 
 
-def test_token_is_kept_as_a_hash_in_a_file_of_its_owner(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_token_is_stored_as_a_hash_in_a_private_file(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     token = keyed(capsys, "token", "--site", site, "--name", "wall")
     path = site.parent / "tokens.yaml"
     assert re.fullmatch(r"livessl_[A-Za-z0-9_-]{43}", token)
@@ -50,63 +51,67 @@ def test_token_is_kept_as_a_hash_in_a_file_of_its_owner(site: Path, capsys: pyte
     assert entry == {"name": "wall", "role": "viewer", "sha256": hashlib.sha256(token.encode()).hexdigest()}
 
 
-def test_tokens_are_told_apart_and_strangers_are_nobody(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tokens_identify_their_clients_and_others_identify_none(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = {role: keyed(capsys, "token", "--site", site, "--name", f"a-{role}", "--role", str(role)) for role in Role}
-    tokens = keys.read_tokens(site.parent / "tokens.yaml")
+    known = tokens.read_tokens(site.parent / "tokens.yaml")
     for role, token in made.items():
-        assert tokens.client(token) == Client(f"a-{role}", role)
-        assert tokens.client(token[:-1]) is None
-        assert tokens.client(token + "=") is None
+        assert known.client(token) == Client(f"a-{role}", role)
+        assert known.client(token[:-1]) is None
+        assert known.client(token + "=") is None
     for stranger in ("", "livessl_", "\udcff", "x" * 10_000):
-        assert tokens.client(stranger) is None
+        assert known.client(stranger) is None
     assert len(set(made.values())) == 3
 
 
 def test_every_known_hash_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever measures the time learns neither which token matched nor how far."""
+    """The time of a comparison reveals neither which token matched nor how much of it."""
     compared: list[bytes] = []
 
     def compare(known: bytes, presented: bytes) -> bool:
         compared.append(known)
         return known == presented
 
-    monkeypatch.setattr("livessl.site.keys.hmac.compare_digest", compare)
+    monkeypatch.setattr("hmac.compare_digest", compare)
     held = {hashlib.sha256(name.encode()).digest(): Client(name, Role.VIEWER) for name in "abc"}
-    assert keys.Tokens(held).client("a") == Client("a", Role.VIEWER)
+    assert tokens.Tokens(held).client("a") == Client("a", Role.VIEWER)
     assert compared == list(held)
 
 
-def test_revoked_token_is_nobody(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_revoked_token_has_no_client(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = site.parent / "tokens.yaml"
     first, second = (keyed(capsys, "token", "--site", site, "--name", name) for name in ("wall", "desk"))
     keyed(capsys, "revoke", "--site", site, "--token", "wall")
-    assert keys.read_tokens(path).client(first) is None
-    assert keys.read_tokens(path).client(second) is not None
-    assert "no token named 'wall'; there are desk" in refused(capsys, "revoke", "--site", site, "--token", "wall")
+    assert tokens.read_tokens(path).client(first) is None
+    assert tokens.read_tokens(path).client(second) is not None
+    assert "no token named 'wall'; tokens are desk" in refused(capsys, "revoke", "--site", site, "--token", "wall")
     keyed(capsys, "revoke", "--site", site, "--token", "desk")
-    with pytest.raises(ConfigError, match="make a token with `livessl keys token`"):  # none left: not open to all
-        keys.read_tokens(path)
+    with pytest.raises(
+        ConfigError, match="make a token with `livessl keys token`"
+    ):  # the last token was revoked, but the server stays closed
+        tokens.read_tokens(path)
 
 
-def test_name_of_a_token_is_taken_once(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_name_of_a_token_is_unique(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "token", "--site", site, "--name", "wall")
     said = refused(capsys, "token", "--site", site, "--name", "wall", "--role", "admin")
-    assert "a token named 'wall' is there already" in said
+    assert "a token named 'wall' exists already" in said
     assert "expected a name of 1 to 64 letters" in refused(capsys, "token", "--site", site, "--name", "a b")
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o666])
-def test_secrets_open_to_others_are_not_used(site: Path, mode: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_secrets_that_others_can_read_are_refused(site: Path, mode: int, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "token", "--site", site, "--name", "wall")
     keyed(capsys, "server", "--site", site)
     loaded = load_site(site)
     for path, read in (
-        (site.parent / "tokens.yaml", lambda: keys.read_tokens(site.parent / "tokens.yaml")),
+        (site.parent / "tokens.yaml", lambda: tokens.read_tokens(site.parent / "tokens.yaml")),
         (site.parent / "keys" / "server.secret", lambda: keys.server_keys(loaded)),
     ):
         read()
         path.chmod(mode)
-        with pytest.raises(ConfigError, match=rf"can be used by others \(mode {mode:o}\); chmod 600 it"):
+        with pytest.raises(
+            ConfigError, match=rf"expected a file that only its owner can use, got mode {mode:o}; chmod 600 it"
+        ):
             read()
 
 
@@ -121,19 +126,17 @@ def test_secrets_open_to_others_are_not_used(site: Path, mode: int, capsys: pyte
         ("SECRET", "make it with|valid dictionary"),
     ],
 )
-def test_wrong_tokens_file_says_where_but_not_what(tmp_path: Path, text: str, said: str) -> None:
+def test_error_in_a_tokens_file_names_the_place_but_not_the_value(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "tokens.yaml"
     path.touch(mode=0o600)
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=said) as caught:
-        keys.read_tokens(path)
+        tokens.read_tokens(path)
     assert "SECRET" not in str(caught.value)
     assert caught.value.__cause__ is None
 
 
-def test_node_is_enrolled_by_what_the_commands_tell(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_node_is_enrolled_with_the_printed_keys(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there = tmp_path / "node"
     there.mkdir()
     node_site = write_site(there, KEYED)
@@ -149,7 +152,7 @@ def test_node_is_enrolled_by_what_the_commands_tell(
     assert at_node.own.secret not in (at_node.own.public, at_server.own.secret)
     for path in (site.parent / "keys" / "server.secret", there / "keys" / "lab-pc.secret"):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert not list((site.parent / "keys").glob("lab-pc*"))  # the node's secret never was here
+    assert not list((site.parent / "keys").glob("lab-pc*"))  # the node's secret was never on the server
 
 
 def test_secrets_are_in_no_repr(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,9 +165,9 @@ def test_secrets_are_in_no_repr(site: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_no_pair_is_ever_overwritten(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = keyed(capsys, "server", "--site", site)
-    assert "server.secret: is there already and would be lost" in refused(capsys, "server", "--site", site)
+    assert "server.secret: exists already and would be lost" in refused(capsys, "server", "--site", site)
     keyed(capsys, "node", "lab-pc", "--site", site)
-    assert "lab-pc.secret: is there already" in refused(capsys, "node", "lab-pc", "--site", site, "--server", key)
+    assert "lab-pc.secret: exists already" in refused(capsys, "node", "lab-pc", "--site", site, "--server", key)
 
 
 def test_dismissed_node_is_not_enrolled(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,10 +176,10 @@ def test_dismissed_node_is_not_enrolled(site: Path, capsys: pytest.CaptureFixtur
     assert keys.enrolled(site.parent / "keys") == {"a": b"\x22" * 32, "b": b"\x11" * 32}
     keyed(capsys, "revoke", "--node", "a", "--site", site)
     assert keys.enrolled(site.parent / "keys") == {"b": b"\x11" * 32}
-    assert "no node 'a' is enrolled; there are b" in refused(capsys, "revoke", "--node", "a", "--site", site)
+    assert "no node 'a' is enrolled; nodes are b" in refused(capsys, "revoke", "--node", "a", "--site", site)
 
 
-def test_list_tells_who_may_but_no_secret(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_shows_clients_but_no_secret(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     token = keyed(capsys, "token", "--site", site, "--name", "wall", "--role", "operator")
     key = keyed(capsys, "enrol", "lab-pc", "ab" * 32, "--site", site) or "ab" * 32
     told = json.loads(keyed(capsys, "list", "--site", site, "--json"))
@@ -193,7 +196,7 @@ def test_list_tells_who_may_but_no_secret(site: Path, capsys: pytest.CaptureFixt
         (["token", "--name", "a"], "expected the file that holds the tokens, got none; add tokens: tokens.yaml"),
     ],
 )
-def test_site_without_keys_says_what_to_add(
+def test_commands_on_a_site_without_keys_name_the_key_to_add(
     tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert said in refused(capsys, *arguments, "--site", write_site(tmp_path))
@@ -208,7 +211,9 @@ def test_site_without_keys_says_what_to_add(
         (lambda folder: (folder / "nodes.yaml").write_text("- a"), "expected NAME: PUBLIC KEY a line"),
     ],
 )
-def test_server_keys_that_cannot_be_used(site: Path, spoil: Any, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_server_keys_are_refused(
+    site: Path, spoil: Any, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     keyed(capsys, "server", "--site", site)
     spoil(site.parent / "keys")
     with pytest.raises(ConfigError, match=said) as caught:
@@ -216,7 +221,7 @@ def test_server_keys_that_cannot_be_used(site: Path, spoil: Any, said: str, caps
     assert "TOPSECRET" not in str(caught.value)
 
 
-def test_node_without_the_servers_key_says_where_it_comes_from(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_public_key_of_the_server_names_its_source(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, "node", "lab-pc", "--site", site)
     assert "server.public: the server's public key cannot be read: No such file or directory; `livessl keys" in said
     with pytest.raises(ConfigError, match="make it with `livessl keys node lab-pc`"):
@@ -230,29 +235,29 @@ def test_site_without_keys_needs_none() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "", "lab-pc.local", "127.0.0.1.example"])
 def test_api_open_to_the_network_needs_tokens(host: str) -> None:
-    [fault] = open_doors(site_of({"server.http.host": host}))
+    [fault] = unprotected_addresses(site_of({"server.http.host": host}))
     assert fault.where == "server.http.host"
     assert "make a token with `livessl keys token`" in fault.what
-    assert open_doors(site_of({"server.http.host": host, "server.http.tokens": "tokens.yaml"})) == []
+    assert unprotected_addresses(site_of({"server.http.host": host, "server.http.tokens": "tokens.yaml"})) == []
 
 
 @pytest.mark.parametrize("bind", ["tcp://*:5570", "tcp://0.0.0.0:5570", "tcp://[::]:5570", "tcp://eth0:5570"])
 def test_socket_open_to_the_network_needs_keys(bind: str) -> None:
-    [fault] = open_doors(site_of({"server.bind": bind}))
+    [fault] = unprotected_addresses(site_of({"server.bind": bind}))
     assert fault.where == "server.bind"
     assert "`livessl keys server`" in fault.what
-    assert open_doors(site_of({"server.bind": bind, "keys": "keys"})) == []
+    assert unprotected_addresses(site_of({"server.bind": bind, "keys": "keys"})) == []
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost", "::1"])
-def test_this_machine_alone_needs_nothing(host: str) -> None:
+def test_loopback_addresses_need_no_protection(host: str) -> None:
     endpoint = f"tcp://{f'[{host}]' if ':' in host else host}:5570"
-    assert open_doors(site_of({"server.http.host": host, "server.bind": endpoint})) == []
-    assert open_doors(site_of({"server.bind": "ipc:///run/livessl"})) == []
+    assert unprotected_addresses(site_of({"server.http.host": host, "server.bind": endpoint})) == []
+    assert unprotected_addresses(site_of({"server.bind": "ipc:///run/livessl"})) == []
 
 
 @pytest.mark.parametrize("command", ["serve", "check"])
-def test_open_server_does_not_start_and_says_all_that_is_to_do(
+def test_unprotected_server_does_not_start_and_reports_all_faults(
     tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_site(tmp_path, {"server.http.host": "0.0.0.0", "server.bind": "tcp://*:5570"})
@@ -262,7 +267,7 @@ def test_open_server_does_not_start_and_says_all_that_is_to_do(
     assert "server.bind: 'tcp://*:5570' can be reached from other machines" in said
 
 
-def test_tokens_in_the_clear_are_told_of() -> None:
+def test_unencrypted_tokens_are_warned_about() -> None:
     public = {"server.http.host": "0.0.0.0", "server.http.tokens": "tokens.yaml"}
     [warning] = site_of(public).warnings
     assert warning.startswith("server.http: tokens and positions travel unencrypted; set certificate and private_key")

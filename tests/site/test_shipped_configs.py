@@ -1,4 +1,4 @@
-"""What lies in config/ and calibration/ is valid, and is what it says it is."""
+"""The files in config/ and calibration/ are valid and match their descriptions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from pydantic import BaseModel
 from livessl.core.geometry import circle, tetrahedron
 from livessl.core.types import FloatArray
 from livessl.site.load import load_site
-from livessl.site.models import GeometryFile, Site, SoundDeviceConfig
+from livessl.site.models import GeometryFile, Site
+from livessl.site.node_models import SoundDeviceConfig
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted((ROOT / "config").glob("*.yaml"))
@@ -38,7 +39,7 @@ def test_config_loads_and_every_array_has_a_node(path: Path) -> None:
     assert {name for node in site.nodes.values() for name in node.arrays} == set(site.arrays)
 
 
-def test_paper_is_the_papers_set_up() -> None:
+def test_paper_config_is_the_setup_of_the_paper() -> None:
     site = load_site(ROOT / "config" / "paper.yaml")
     assert site.room.size_m == (7.05, 5.64, 2.84)
     node = site.nodes["lab-pc"]
@@ -56,7 +57,7 @@ def test_paper_is_the_papers_set_up() -> None:
     ("name", "expected_m"),
     [("tetrahedron-0.5m.yaml", tetrahedron(0.5)), ("respeaker-4mic.yaml", circle(0.032, 4))],
 )
-def test_geometry_file_is_its_shape_to_a_tenth_of_a_millimetre(name: str, expected_m: FloatArray) -> None:
+def test_geometry_file_matches_its_shape_to_a_tenth_of_a_millimetre(name: str, expected_m: FloatArray) -> None:
     assert_allclose(geometry(name), expected_m, rtol=0, atol=1e-4)
 
 
@@ -69,7 +70,7 @@ def test_one_array_takes_its_shape_from_the_file() -> None:
 
 
 def documented_keys(model: type[BaseModel]) -> set[str]:
-    """Every key that a model of the site file takes, with those of the models inside it."""
+    """Return every key of a model of the site file, including those of nested models."""
     keys: set[str] = set()
     for name, field in model.model_fields.items():
         if field.exclude:
@@ -85,7 +86,7 @@ def _models_in(annotation: object) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
-def test_every_key_of_the_site_file_is_explained() -> None:
+def test_every_key_of_the_site_file_is_documented() -> None:
     text = (ROOT / "docs" / "site-file.md").read_text(encoding="utf-8")
     missing = sorted(key for key in documented_keys(Site) if not re.search(rf"\b{key}\b", text))
     assert missing == []

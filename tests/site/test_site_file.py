@@ -1,4 +1,4 @@
-"""The site file: every fault is told in one sentence, with its line and place, and all of them at once."""
+"""The site file: each fault is one sentence with its line and place, and all faults are reported at once."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from livessl.core.types import FloatArray
+from livessl.errors import ConfigError
 from livessl.site.build.grid import search_grid
 from livessl.site.build.pipeline import activity_parameters
 from livessl.site.load import load_site, parse_site
-from livessl.site.models import ConfigError, Site
+from livessl.site.models import Site
 from small_site import SMALL, Changes, site_of, small, text_of, write_site
 
 SQUARE_M = [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]]
 
 
 def faults_of(text: str) -> list[tuple[str, str]]:
-    """Where and what, of every fault of a text."""
+    """Return place and sentence of every fault of a text."""
     with pytest.raises(ConfigError) as caught:
         parse_site(text, "site.yaml")
     return [(fault.where, fault.what) for fault in caught.value.faults]
 
 
 def line_of(text: str, path: str) -> int | None:
-    """Number of the line on which what a dotted path leads to stands, or the last part of it that is there."""
+    """Return the number of the line of a dotted path, or of the longest part of it that the text has."""
     lines = text.splitlines()
     number = None
     for level, key in enumerate(path.split(".")):
@@ -53,10 +54,25 @@ JOINT = "joint.both"
 WEST: Changes = {"microphones_m": [[1.0, 1.0, 1.0], [1.0, 1.2, 1.0]]}
 PI: Changes = {"device": {"name": "pi", "sample_rate_hz": 16000}, "arrays": {"south": [1, 2, 3, 4]}}
 ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
-    "unknown key": ({"colour": "red"}, "colour", "unknown key; correct its spelling or take it away"),
-    "unknown key inside": ({f"{ARRAY}.positon_m": [1, 1, 1]}, f"{ARRAY}.positon_m", "unknown key"),
-    "our own key": ({"specs": []}, "specs", "unknown key"),
-    "another key of our own": ({"processed": []}, "processed", "unknown key"),
+    "unknown key": ({"colour": "red"}, "colour", "unknown key 'colour'; remove it"),
+    "unknown key inside": (
+        {f"{ARRAY}.positon_m": [1, 1, 1]},
+        f"{ARRAY}.positon_m",
+        "unknown key 'positon_m'; did you mean 'position_m'",
+    ),
+    "fault of an array that is named like a type": (
+        {"arrays.str": {"microphones_m": [[1, 1, 1], [1, 2, 1]], "colour": "red"}},
+        "arrays.str.colour",
+        "unknown key",
+    ),
+    "misspelt key": ({"temprature_c": 20}, "temprature_c", "unknown key 'temprature_c'; did you mean 'temperature_c'"),
+    "misspelt key of a device": (
+        {f"{NODE}.device.sample_rate": 16000},
+        f"{NODE}.device.sample_rate",
+        "unknown key 'sample_rate'; did you mean 'sample_rate_hz'",
+    ),
+    "key of the built site": ({"specs": []}, "specs", "unknown key"),
+    "another key of the built site": ({"processed": []}, "processed", "unknown key"),
     "missing key": ({"room": ...}, "room", "missing; add it"),
     "missing key inside": ({f"{NODE}.device.name": ...}, f"{NODE}.device.name", "missing; add it"),
     "missing device": ({f"{NODE}.device": ...}, f"{NODE}.device", "missing; add it"),
@@ -86,7 +102,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "absolute, and posed": (
         {ARRAY: {"microphones_m": [[1, 1, 1], [1, 2, 1], [2, 1, 1], [1, 1, 2]], "orientation_deg": {"yaw": 3}}},
         ARRAY,
-        "microphones_m are absolute; take position_m and orientation_deg away",
+        "microphones_m are absolute; remove position_m and orientation_deg, or use geometry",
     ),
     "no such shape": ({f"{ARRAY}.geometry": {"cube": {}}}, f"{ARRAY}.geometry.cube", "unknown key"),
     "two shapes": (
@@ -126,11 +142,16 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         ARRAY,
         r"microphone 2 at \(4.1632, 1.3, 1.3388\) is outside the room \(4, 5, 3\) m; correct the array's position",
     ),
+    "array in millimetres": (
+        {f"{ARRAY}.position_m": [1900, 1300, 1400]},
+        ARRAY,
+        r"outside the room \(4, 5, 3\) m; give metres, not millimetres",
+    ),
     "array under the floor": ({f"{ARRAY}.position_m": [1.0, 1.3, -0.5]}, ARRAY, "microphone 1 .* outside the room"),
     "grid too fine": (
         {"grid.spacing_m": 0.01},
         "grid.spacing_m",
-        r"a grid of 60,000,000 nodes .* allowed are 50,000,000; use a spacing of 0.011 m or more",
+        r"expected at most 50,000,000 grid points, got 60,000,000; use a spacing of 0.011 m or more",
     ),
     "grid inside out": (
         {"grid.bounds_m": [[0, 4], [5, 0], [0, 3]]},
@@ -143,7 +164,11 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "expected 4 channels, one for each microphone of 'north', got 3",
     ),
     "too many channels": ({f"{NODE}.arrays.south": [5, 6, 7, 8, 9]}, f"{NODE}.arrays.south", "expected 4 .* got 5"),
-    "channel 0": ({f"{NODE}.arrays.north": [0, 1, 2, 3]}, f"{NODE}.arrays.north.0", "greater than or equal to 1"),
+    "channel 0": (
+        {f"{NODE}.arrays.north": [0, 1, 2, 3]},
+        f"{NODE}.arrays.north.0",
+        "from 1 on, got 0; channels count from 1",
+    ),
     "channel of two arrays": (
         {f"{NODE}.arrays.south": [4, 6, 7, 8]},
         f"{NODE}.arrays.south",
@@ -153,12 +178,12 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "array of two nodes": (
         {"nodes.other": {"device": {"name": "other"}, "arrays": {"north": [1, 2, 3, 4]}}},
         "nodes.other.arrays.north",
-        "already captured by node 'lab-pc'; an array belongs to one node",
+        "already captured by node 'lab-pc'; remove it from one of the nodes",
     ),
     "node's unknown array": (
         {f"{NODE}.arrays.west": [9, 10, 11, 12]},
         f"{NODE}.arrays.west",
-        "no such array; arrays are north, south",
+        "expected one of the arrays north, south, got 'west'; correct the name or add the array",
     ),
     "node without arrays": ({f"{NODE}.arrays": {}}, f"{NODE}.arrays", "at least 1 item"),
     "band above Nyquist": (
@@ -189,7 +214,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "arrays.fused",
         "'fused' is the map of all arrays together; rename it",
     ),
-    "warnings of one's own": ({"warnings": ["beware"]}, "warnings", "unknown key; take it away"),
+    "warnings as a key": ({"warnings": ["beware"]}, "warnings", "unknown key 'warnings'; remove it"),
     "port of a node that is any": (
         {f"{NODE}.server": "tcp://127.0.0.1:*"},
         f"{NODE}.server",
@@ -205,9 +230,15 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "speed and temperature": (
         {"speed_of_sound_m_s": 343.0, "temperature_c": 20.0},
         "temperature_c",
-        "expected either speed_of_sound_m_s or temperature_c, got both; take one away",
+        "expected either speed_of_sound_m_s or temperature_c, got both; remove one",
     ),
-    "temperature of an oven": ({"temperature_c": 200}, "temperature_c", "less than 80, got 200"),
+    "temperature of an oven": ({"temperature_c": 200}, "temperature_c", "between -60 and 80 .*, got 200$"),
+    "temperature in Fahrenheit": (
+        {"temperature_c": 86},
+        "temperature_c",
+        r"between -60 and 80 .*, got 86; did you mean 30\.0, from Fahrenheit",
+    ),
+    "temperature of no number": ({"temperature_c": float("nan")}, "temperature_c", "between -60 and 80 .*, got nan"),
     "min_arrays": ({"fusion.min_arrays": 3}, "fusion.min_arrays", "at most the number of arrays, 2, got 3"),
     "unknown method": ({"fusion.method": "music"}, "fusion.method", "expected one of .*srp-phat.*, got 'music'"),
     "unknown device type": (
@@ -219,8 +250,12 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "device that is a name": ({f"{NODE}.device": "UMC"}, f"{NODE}.device", "expected a mapping such as .* got 'UMC'"),
     "joint array of one": ({JOINT: ["north"]}, JOINT, "at least 2 items"),
     "joint array of no list": ({JOINT: "north"}, JOINT, "valid tuple.*got 'north'"),
-    "joint array of nobody": ({JOINT: ["north", "west"]}, f"{JOINT}.west", "no such array; arrays are north, south"),
-    "joint array of one twice": ({JOINT: ["north", "north"]}, f"{JOINT}.north", "already joined in 'both'; take it"),
+    "joint array of nobody": (
+        {JOINT: ["north", "west"]},
+        f"{JOINT}.west",
+        "expected one of the arrays north, south, got 'west'; correct the name or add the array",
+    ),
+    "joint array of one twice": ({JOINT: ["north", "north"]}, f"{JOINT}.north", "already joined in 'both'; remove it"),
     "array in two joint ones": (
         {
             JOINT: ["north", "south"],
@@ -229,9 +264,13 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
             "joint.two": ["west", "north"],
         },
         "joint.two.north",
-        "already joined in 'both'; take it away here or there",
+        "already joined in 'both'; remove it from one of them",
     ),
-    "joint array that is called as one": ({"joint.south": ["north", "south"]}, "joint.south", "is called so already"),
+    "joint array that is called as one": (
+        {"joint.south": ["north", "south"]},
+        "joint.south",
+        "expected a name that no array has; rename it",
+    ),
     "joint array that is called as the map of all": ({"joint.fused": ["north", "south"]}, "joint.fused", "rename it"),
     "joint array of a bad name": ({"joint.the two": ["north", "south"]}, "joint.the two", "rename it"),
     "joint array of two nodes": (
@@ -279,7 +318,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
 
 
 @pytest.mark.parametrize("name", ONE_FAULT)
-def test_fault_is_told_once_with_its_line_and_place(name: str) -> None:
+def test_fault_is_reported_once_with_its_line_and_place(name: str) -> None:
     changes, path, what = ONE_FAULT[name]
     text = text_of(changes)
     [(where, said)] = faults_of(text)
@@ -297,21 +336,21 @@ def test_duplicate_key_names_the_second() -> None:
     text = text_of() + "room: {size_m: [1.0, 1.0, 1.0]}\n"
     last = len(text.splitlines())
     faults = dict(faults_of(text))
-    assert faults[f"site.yaml:{last}: room"] == "stands here twice and only the last would count; take one away"
+    assert faults[f"site.yaml:{last}: room"] == "expected each key once, got it twice; remove one"
 
 
-def test_spacing_that_is_suggested_does_pass() -> None:
+def test_suggested_spacing_is_accepted() -> None:
     changes: Changes = {"grid.spacing_m": 0.004}
     [(_, said)] = faults_of(text_of(changes))
     suggested = re.search(r"use a spacing of ([0-9.]+) m", said)
     assert suggested is not None
     spacing_m = float(suggested[1])
     site_of(changes | {"grid.spacing_m": spacing_m})
-    # and it is not needlessly coarse: half of it has eight times the nodes
+    # it is not needlessly coarse: half of it has eight times the grid points
     faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
 
 
-def test_several_faults_come_at_once() -> None:
+def test_several_faults_are_reported_at_once() -> None:
     changes: Changes = {
         "colour": "red",
         f"{ARRAY}.position_m": [9.0, 1.3, 1.4],
@@ -333,7 +372,7 @@ def test_several_faults_come_at_once() -> None:
     }
 
 
-def test_one_array_that_is_wrong_accuses_nobody_else() -> None:
+def test_one_faulty_array_causes_no_other_faults() -> None:
     changes: Changes = {f"{ARRAY}.position_m": "here", "fusion.min_arrays": 2, "arrays.south.position_m": [9, 9, 9]}
     for more in ({}, {JOINT: ["north", "south"]}):
         places = [where.rpartition(": ")[2] for where, _ in faults_of(text_of(changes | more))]
@@ -358,13 +397,13 @@ def test_one_array_that_is_wrong_accuses_nobody_else() -> None:
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_text_that_is_no_site(text: str, where: str, what: str) -> None:
+def test_text_that_is_not_a_site_is_refused(text: str, where: str, what: str) -> None:
     [(at, said)] = faults_of(text)
     assert at == where
     assert said.startswith(what) or what in said
 
 
-def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_file_is_refused(tmp_path: Path) -> None:
     for path, reason in (
         (tmp_path / "missing.yaml", "No such file or directory"),
         (tmp_path, "Is a directory"),
@@ -397,7 +436,7 @@ def test_file_is_named_with_its_line(tmp_path: Path) -> None:
         ("date: 2026-02-31\n", "cannot be read"),
     ],
 )
-def test_geometry_file_that_is_wrong(tmp_path: Path, content: str, what: str) -> None:
+def test_invalid_geometry_file_is_refused(tmp_path: Path, content: str, what: str) -> None:
     (tmp_path / "array.yaml").write_text(content, encoding="utf-8")
     path = write_site(tmp_path, {f"{ARRAY}.geometry": "array.yaml"})
     with pytest.raises(ConfigError) as caught:
@@ -415,7 +454,7 @@ def microphones(changes: Changes, directory: Path | None = None) -> FloatArray:
 
 
 def posed_square(directory: Path, **turn: float) -> FloatArray:
-    """Where the microphones come to lie, from the array's origin."""
+    """Return the microphones' positions relative to the array's origin."""
     (directory / "square.yaml").write_text(yaml.safe_dump({"microphones_m": SQUARE_M}), encoding="utf-8")
     array = {"geometry": "square.yaml", "position_m": [2.0, 2.0, 1.0], "orientation_deg": turn}
     return microphones({ARRAY: array}, directory) - [2.0, 2.0, 1.0]
@@ -444,7 +483,7 @@ def test_absolute_microphones_are_the_posed_ones() -> None:
     assert np.abs(microphones({}) - posed_m).max() > 0.01
 
 
-def test_shapes() -> None:
+def test_shapes_have_their_channels_in_order() -> None:
     def shape(**shape: Any) -> FloatArray:
         count = next(iter(shape.values())).get("count", 4)
         array = {"geometry": shape, "position_m": [2.0, 2.0, 1.0]}
@@ -464,7 +503,7 @@ def test_shapes() -> None:
     assert_allclose(line, np.array([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]]), atol=1e-12)
 
 
-def test_speed_of_sound() -> None:
+def test_speed_of_sound_is_given_or_follows_from_the_temperature() -> None:
     assert site_of().c_m_s == 343.0
     assert site_of({"speed_of_sound_m_s": 340.0}).c_m_s == 340.0
     # 331.3 sqrt(1 + 20 / 273.15) = 343.2
@@ -472,7 +511,7 @@ def test_speed_of_sound() -> None:
     assert site_of({"temperature_c": 0}).c_m_s == pytest.approx(331.3)
 
 
-def test_search_volume() -> None:
+def test_search_volume_is_the_room_or_the_bounds() -> None:
     assert search_grid(site_of()).shape == (16, 20, 12)
     box = search_grid(site_of({"grid.bounds_m": [[1, 2], [0, 5], [0, 3]]}))
     assert box.shape == (4, 20, 12)
@@ -482,13 +521,13 @@ def test_search_volume() -> None:
     assert plane.nodes_m()[:, 2] == pytest.approx(1.2)
 
 
-def test_bands() -> None:
+def test_array_may_have_a_band_of_its_own() -> None:
     site = site_of({f"{ARRAY}.band_hz": [200, 3000]})
     assert site.array("north").band_hz == (200.0, 3000.0)
     assert site.array("south").band_hz == (100.0, 6000.0)
 
 
-def test_zones() -> None:
+def test_zones_hold_positions_inside_and_on_their_surface() -> None:
     site = site_of({"zones.all": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})
     assert site.zones_of([0.5, 0.5, 1.0]) == ["door", "all"]
     assert site.zones_of([1.0, 1.0, 2.5]) == ["door", "all"]
@@ -505,10 +544,10 @@ HALL: Changes = {
     "nodes": {},
     "zones": {},
 }
-"""Six microphones around a whole ceiling as one array: a tenth of a metre is many periods of 6 kHz."""
+"""Six microphones around a whole ceiling as one array: a spacing of 0.1 m is many periods of 6 kHz."""
 
 
-def test_array_too_wide_for_the_grid_is_warned_of() -> None:
+def test_array_too_wide_for_the_grid_is_warned_about() -> None:
     [said] = site_of(HALL).warnings
     found = re.fullmatch(
         r"grid.spacing_m: array 'ceiling' is 12.5 m wide: up to 6000 Hz needs a spacing of about (\S+) m, got 0.1; "
@@ -522,34 +561,34 @@ def test_array_too_wide_for_the_grid_is_warned_of() -> None:
     assert "warnings" not in site_of(HALL).model_dump()
 
 
-def test_what_is_suggested_against_wide_arrays_helps() -> None:
+def test_suggested_band_removes_the_warning() -> None:
     assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [100, 1500]}}}).warnings == ()
     assert site_of({**HALL, "arrays": {"ceiling": {"microphones_m": CEILING, "band_hz": [4000, 16000]}}}).warnings == ()
 
 
-def test_joint_array_too_wide_for_the_grid_is_warned_of() -> None:
+def test_joint_array_too_wide_for_the_grid_is_warned_about() -> None:
     [said] = site_of({JOINT: ["north", "south"]}).warnings
     assert re.search("array 'both' is 2.8 m wide: .*; positions may be wrong: .* or take joint.both away", said)
 
 
-def test_usual_arrays_are_not_warned_of() -> None:
+def test_usual_arrays_cause_no_warning() -> None:
     half_a_metre = {"geometry": {"tetrahedron": {"edge_m": 0.5}}}
     assert site_of({"grid.spacing_m": 0.1, f"{ARRAY}.geometry": half_a_metre["geometry"]}).warnings == ()
     assert site_of().warnings == ()
 
 
-def test_node_of_an_array() -> None:
+def test_array_may_be_on_a_node_or_on_none() -> None:
     site = site_of({f"{NODE}.arrays.south": ...})
     assert site.node_of("north") == "lab-pc"
     assert site.node_of("south") is None
 
 
 @pytest.mark.parametrize("endpoint", ["tcp://*:5570", "tcp://127.0.0.1:*", "tcp://[::1]:1", "ipc:///run/livessl"])
-def test_good_endpoints(endpoint: str) -> None:
+def test_valid_endpoints_are_accepted(endpoint: str) -> None:
     assert site_of({"server.bind": endpoint}).server.bind == endpoint
 
 
-def test_channels_up_to_sixteen() -> None:
+def test_array_of_sixteen_channels_is_accepted() -> None:
     positions = [[1 + 0.1 * k, 1.0, 1.0] for k in range(16)]
     changes: Changes = {ARRAY: {"microphones_m": positions}, f"{NODE}.arrays.north": list(range(9, 25))}
     assert site_of(changes).array("north").microphones_m.shape == (16, 3)
@@ -609,7 +648,7 @@ def test_any_value_anywhere_is_fine_or_a_config_error(
     data = yaml.safe_load(yaml.safe_dump(WHOLE))
     for path, new in ((place, value), (other, scalar)):
         holder = data
-        with suppress(KeyError, IndexError, TypeError):  # the first change may have taken the second's place away
+        with suppress(KeyError, IndexError, TypeError):  # the first change may have removed the second's place
             for key in path[:-1]:
                 holder = holder[key]
             holder[path[-1]] = new

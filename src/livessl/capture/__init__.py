@@ -1,4 +1,4 @@
-"""Capture nodes: an audio device becomes frames on the wire, kept until the server has stored what came of them.
+"""Capture nodes: blocks of an audio device become frames on the wire, kept until the server needs them no more.
 
-Nothing here locates anything.
+Nothing in this package locates anything.
 """

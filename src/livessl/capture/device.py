@@ -1,4 +1,4 @@
-"""The device protocol: what a capture node needs of an audio device, whichever library drives it."""
+"""The protocol of audio devices: what a capture node needs of one, whichever library drives it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from livessl.core.types import Block
 
 
 class Device(Protocol):
-    """A running source of sound: a context manager, and an iterator of blocks while it is entered."""
+    """An audio device: a context manager that opens it, and an iterator of its blocks while it is open."""
 
     name: str
     sample_rate_hz: float
@@ -18,7 +18,7 @@ class Device(Protocol):
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with it now, in words."""
+        """The present problem of the device, in words; None if there is none."""
         ...
 
     def __enter__(self) -> Self: ...

@@ -1,4 +1,4 @@
-"""A capture node: one device (or the recordings that stand in for it), its arrays, the link to the server."""
+"""A capture node: one audio device, or recordings played in its place, its arrays, and the link to the server."""
 
 from __future__ import annotations
 
@@ -15,35 +15,38 @@ from livessl.core.stream.pipeline import Pipeline
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, BackfillRequest, Message
 from livessl.errors import RunError
-from livessl.recordings.assign import Part, pipelines_of
-from livessl.recordings.play import played_messages
-from livessl.recordings.recording import Placed
+from livessl.recordings.assign import AssignedRecording, make_pipelines
+from livessl.recordings.play import paced_messages
+from livessl.recordings.recording import TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.keys import node_keys
-from livessl.site.models import NodeConfig, Site
+from livessl.site.models import Site
+from livessl.site.node_models import NodeConfig
 
 DRAIN_NS: Final = 3_000_000_000
-"""How long a recording's end waits for a server that has fallen silent; for one that answers it waits on."""
+"""Longest wait, in ns, for the last acknowledgement of a server that does not answer; one that answers has no limit."""
 
 WAIT_NS: Final = 20_000_000
+"""Interval, in ns, at which a waiting node serves its link."""
 
 MAX_PENDING: Final = 400
-"""A replay faster than real time waits while so many messages are on their way."""
+"""Most unacknowledged messages of a replay that is faster than real time."""
 
 AHEAD_NS: Final = round((RECENT_S - 4.0) * 1e9)
-"""Recorded time by which such a replay is ahead of its server at most: what is asked for is then remembered yet."""
+"""Longest lead of such a replay over its server, in ns of recorded time: requested frames are still remembered then."""
 
 END_NS: Final = 1_000_000_000
-"""More than the run-up to a next sound, which is never settled: when only so much is left all sounds have been told."""
+"""Recorded time, in ns, at the end of a replay that need not be settled. It exceeds the pre-roll of a next sound, which
+is never settled; once only this much is left, every event has been published."""
 
 STUCK_NS: Final = 1_000_000_000
-"""It goes on all the same where nothing has been settled for so long: one array is silent, or a sound does not end."""
+"""Time in ns without anything settled, after which a replay goes on anyway: an array is silent, or a sound lasts on."""
 
 _log = logging.getLogger(__name__)
 
 
 class UndeliveredError(RunError):
-    """Sound that the server never acknowledged."""
+    """Sound that the server refused or never acknowledged."""
 
 
 Stop = Callable[[], bool]
@@ -51,7 +54,7 @@ Progress = Callable[[int], None]
 
 
 def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: str, stop: Stop) -> None:
-    """Run a node on its audio device until told to stop; whatever happens to device or server, carry on."""
+    """Run a node on its audio device until `stop()`, through any interruption of device or server."""
     config: NodeConfig = site.nodes[name]
     pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz)
     link = _link(site, name, config.server, [pipeline], clock, run_id, _spool(site, name))
@@ -64,7 +67,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
                 if device.problem != problem:
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
-                    link.tell(problem)
+                    link.report(problem)
                 link.send(pipeline.push(block))
     finally:
         link.close(bye=True)
@@ -73,24 +76,24 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
 def capture_recordings(
     site: Site,
     name: str,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     clock: Clock,
     run_id: str,
     stop: Stop,
     progress: Progress | None = None,
 ) -> None:
-    """Run a node on recordings at real speed, to their end.
+    """Run a node on recordings, at the pace of `clock`, to their end.
 
     Raises
     ------
     DeviceError
-        Where recordings of arrays that the site joins do not belong together.
+        If recordings of arrays that the site joins do not belong together.
     UndeliveredError
-        Where the server has not acknowledged everything.
+        If the server has not acknowledged everything.
     """
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
-    for end_ns in _sent(link, pipelines, placed, clock, stop):
+    for end_ns in _sent(link, pipelines, inputs, clock, stop):
         if progress is not None:
             progress(end_ns)
     _finish(link, clock, stop)
@@ -99,42 +102,42 @@ def capture_recordings(
 def send_session(
     site: Site,
     endpoint: str,
-    parts: Sequence[Part],
+    recordings: Sequence[AssignedRecording],
     pace: Clock,
     clock: Clock,
     run_id: str,
     stop: Stop,
     progress: Progress | None = None,
 ) -> None:
-    """Play a recorded session to a server at its original times, at the speed of the clock `pace`.
+    """Play a recorded session to a server, with its original times, at the pace of the clock `pace`.
 
     Raises
     ------
     DeviceError
-        Where recordings of arrays that the site joins do not belong together.
+        If recordings of arrays that the site joins do not belong together.
     UndeliveredError
-        Where the server refuses it, or has not acknowledged everything.
+        If no server answers, or it refuses the sound, or has not acknowledged everything.
     """
-    pipelines, placed = pipelines_of(site, parts)
+    pipelines, inputs = make_pipelines(site, recordings)
     link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
-        raise UndeliveredError(f"no server answers at {endpoint}; start it, or correct the address")
+        raise UndeliveredError(f"expected a server at {endpoint}, got no answer; start it, or correct the address")
     lead = _Lead(link, clock)
     end_ns = 0
-    for end_ns in _sent(link, pipelines, placed, pace, lambda: stop() or link.refused is not None):
+    for end_ns in _sent(link, pipelines, inputs, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while (link.pending > MAX_PENDING or lead.exceeds(AHEAD_NS, end_ns)) and not (stop() or link.refused):
             _pause(link, clock)
-    while lead.exceeds(END_NS, end_ns) and not (stop() or link.refused):  # it may ask about the last sounds yet
+    while lead.exceeds(END_NS, end_ns) and not (stop() or link.refused):  # the server may still request frames
         _pause(link, clock)
     _finish(link, clock, stop)
 
 
 class _Lead:
-    """How far a replay is ahead of its server, in recorded time."""
+    """The lead of a replay over its server, in recorded time."""
 
     def __init__(self, link: Link, clock: Clock) -> None:
         self._link = link
@@ -143,7 +146,7 @@ class _Lead:
         self._since_ns = clock.monotonic_ns()
 
     def exceeds(self, most_ns: int, end_ns: int) -> bool:
-        """Whether the server has more than `most_ns` before `end_ns` to settle yet, and is getting on with it."""
+        """Return True if the server has yet to settle more than `most_ns` before `end_ns`, and makes progress."""
         if self._link.settled != self._settled:
             self._settled, self._since_ns = self._link.settled, self._clock.monotonic_ns()
         if self._settled is None or end_ns - self._settled * FRAME_NS <= most_ns:
@@ -156,7 +159,7 @@ def _spool(site: Site, name: str) -> Spool:
     directory = None if spool.directory is None else site.file(spool.directory) / name
     kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s)
     if len(kept):
-        _log.info("the spool holds %d frames of an earlier run; they are sent again", len(kept))
+        _log.info("the spool holds %d frames of an earlier run; they are sent now", len(kept))
     return kept
 
 
@@ -173,18 +176,18 @@ def _link(
 ) -> Link:
     rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
 
-    def recent(ask: BackfillRequest) -> list[Message]:
-        return [message for pipeline in pipelines for message in pipeline.backfill(ask)]
+    def backfill(request: BackfillRequest) -> list[Message]:
+        return [message for pipeline in pipelines for message in pipeline.backfill(request)]
 
     hello = wire.Hello(name, run_id, rates, replay)
-    return Link(endpoint, hello, clock, node_keys(site, name), spool=spool, recent=recent)
+    return Link(endpoint, hello, clock, node_keys(site, name), spool=spool, backfill=backfill)
 
 
 def _sent(
-    link: Link, pipelines: Sequence[Pipeline], placed: Sequence[Placed], pace: Clock, stop: Stop
+    link: Link, pipelines: Sequence[Pipeline], inputs: Sequence[TimedRecording], pace: Clock, stop: Stop
 ) -> Iterator[int]:
-    """Send what the pipelines make of their recordings, block by block; yields the site time reached."""
-    for end_ns, batch in played_messages(pipelines, placed, pace):
+    """Send the messages of the pipelines, block by block; yield the site time reached."""
+    for end_ns, batch in paced_messages(pipelines, inputs, pace):
         if stop():
             return
         link.send(batch)
@@ -192,11 +195,11 @@ def _sent(
 
 
 def _finish(link: Link, clock: Clock, stop: Stop) -> None:
-    """Wait for the last acknowledgement, then say good-bye."""
-    heard_ns = clock.monotonic_ns()
-    while link.pending and not (stop() or link.refused) and clock.monotonic_ns() - heard_ns < DRAIN_NS:
+    """Wait for the last acknowledgement, then close the link with a good-bye."""
+    answered_ns = clock.monotonic_ns()
+    while link.pending and not (stop() or link.refused) and clock.monotonic_ns() - answered_ns < DRAIN_NS:
         if link.connected:
-            heard_ns = clock.monotonic_ns()
+            answered_ns = clock.monotonic_ns()
         _pause(link, clock)
     undelivered, refused = link.pending + link.dropped, link.refused
     link.close(bye=True)
@@ -204,7 +207,7 @@ def _finish(link: Link, clock: Clock, stop: Stop) -> None:
         raise UndeliveredError(f"the server at {link.endpoint} refused the sound: {refused}")
     if undelivered and not stop():
         raise UndeliveredError(
-            f"{undelivered} messages were never taken by the server at {link.endpoint}; is one running there?"
+            f"{undelivered} messages were never acknowledged by the server at {link.endpoint}; is one running there?"
         )
 
 

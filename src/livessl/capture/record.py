@@ -1,4 +1,4 @@
-"""Recording what an audio device delivers, for as long as wanted."""
+"""Recording of an audio device to a session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) -> None:
-    """Record a device until `over`; what is wrong with it meanwhile is logged."""
+    """Record a device until `over()`; problems of the device are logged."""
     problem = None
     with device, recorder:
         for block in device:

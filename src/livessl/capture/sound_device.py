@@ -1,11 +1,11 @@
-"""An audio interface through PortAudio, as an iterator of blocks. The only module that meets `sounddevice`.
+"""An audio interface as an iterator of blocks, through PortAudio. Only this module imports `sounddevice`.
 
-The library is imported where it is used, so that a machine without PortAudio can do everything else.
+The library is imported where it is used, so that everything else works on a machine without PortAudio.
 
-Real-time contract. PortAudio calls `SoundDevice._receive` on a thread of its own. It copies, stamps, enqueues and
-returns: it waits for nothing, takes no lock of ours, logs nothing and allocates nothing but the copy and the tuple
-that carries it. While a stream is open that thread alone writes `_next_index` and `_lost`; the iterating thread
-touches them only when no stream is.
+Real-time contract: PortAudio calls `SoundDevice._receive` on a thread of its own. The method copies, stamps, enqueues
+and returns. It does not wait, takes no lock of ours, does not log, and allocates only the copy and the tuple that
+carries it. While a stream is open, only that thread writes `_next_index` and `_lost`; the iterating thread accesses
+them only while no stream is open.
 """
 
 from __future__ import annotations
@@ -23,46 +23,48 @@ import numpy as np
 from livessl.clock import Clock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
-from livessl.site.models import SoundDeviceConfig
+from livessl.site.node_models import SoundDeviceConfig
 
 WAIT_S: Final = 0.25
-"""Longest silence of the iterator: the caller serves its network link at least so often."""
+"""Longest wait of the iterator, in seconds, so that the caller can serve its network link in between."""
 
 REOPEN_S: Final = 2.0
-"""Between two attempts to open a missing device. A scan of all devices may itself take some tenths of a second."""
+"""Time between two attempts to open a missing device, in seconds. A scan of all devices can take some tenths of a
+second."""
 
 STALLED_S: Final = 5.0
-"""An open stream that delivers nothing for so long is as good as gone: some drivers hang instead of failing. A sound
-server may well take 2 s to deliver its first block."""
+"""Time without a block, in seconds, after which an open stream is given up: some drivers hang instead of failing. A
+sound server may take 2 s to deliver its first block."""
 
 QUEUE_S: Final = 2.0
-"""Sound that may wait for the iterator, seconds: far more than any pause of a caller that is well."""
+"""Most sound that waits for the iterator, in seconds: far more than any pause of a healthy caller."""
 
 LATENCY_S: Final = 0.1
-"""Asked of the driver, seconds. It sizes the driver's buffer, hence how long the callback may be kept from running
-before samples are lost; blocks still arrive once a period."""
+"""Latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so how long the callback
+may be delayed before samples are lost; blocks still arrive once a period."""
 
 MAX_BACKLOG_S: Final = 1.0
-"""A time of conversion that says the driver held more than this is not believed."""
+"""Largest plausible age of samples in the driver's buffer, in seconds; a conversion time beyond it is ignored."""
 
 _INVALID_CHANNEL_COUNT: Final = -9998
 _INVALID_SAMPLE_RATE: Final = -9997
+"""PortAudio's error codes."""
 
 
 @dataclass(frozen=True, slots=True)
 class InputDevice:
-    """A device that can record.
+    """An input device.
 
     Parameters
     ----------
     name : str
-        As the driver calls it.
+        Name by the driver.
     host_api : str
         PortAudio's name of the driver family, such as ALSA.
     channels : int
-        Input channels it offers.
+        Number of input channels.
     default_sample_rate_hz : float
-        Rate it runs at unless told otherwise.
+        The driver's default sampling rate, Hz.
     """
 
     name: str
@@ -72,16 +74,16 @@ class InputDevice:
 
     @property
     def label(self) -> str:
-        """The name that tells it from its namesakes under other drivers: `HOSTAPI: name`."""
+        """`HOSTAPI: name`, unique among the entries of one device under several drivers."""
         return f"{self.host_api}: {self.name}"
 
     @property
     def is_hardware(self) -> bool:
-        """Whether samples come from the device itself (ALSA's `hw:`), not from a sound server or through a plug-in."""
+        """True if samples come directly from the device (ALSA's `hw:`), not through a sound server or a plug-in."""
         return "(hw:" in self.name
 
-    def answers_to(self, wanted: str) -> bool:
-        """Whether `wanted` is part of the name, case apart, or `HOSTAPI: part of the name`."""
+    def matches(self, wanted: str) -> bool:
+        """Return True if `wanted` is a part of the name, or `HOSTAPI: part of the name`, in upper or lower case."""
         folded, name = wanted.casefold(), self.name.casefold()
         host_api, _, part = folded.partition(": ")
         return folded in name or (part != "" and host_api == self.host_api.casefold() and part in name)
@@ -90,32 +92,32 @@ class InputDevice:
 class SoundDevice:
     """An audio interface, found by name; a context manager that opens it and an iterator of its blocks.
 
-    Each step waits at most 0.25 s (longer only while a missing device is looked for) and then yields a block of no
-    samples. A device that is absent or vanishes is waited for: empty blocks, `problem` set, an attempt to open it
-    about every 2 s. The first block after that has `overflow` set, and indices go on from where they were.
+    Each step waits at most 0.25 s (longer only during a scan for a missing device) and then yields a block without
+    samples. If the device is absent or disappears, the iterator yields empty blocks, sets `problem`, and tries to open
+    the device about every 2 s. The first block after that has `overflow` set, and sample indices continue.
 
-    PortAudio sees new devices only when all of it is started anew, which closes every stream of the process: have
-    one `SoundDevice` in a process.
+    PortAudio detects new devices only after a restart, which closes every stream of the process: use one `SoundDevice`
+    in a process.
 
     Parameters
     ----------
     config : SoundDeviceConfig
         Name, rate and block length.
     channels : int
-        How many channels to record: the highest that any array uses.
+        Number of channels to record: the highest channel that any array uses.
     clock : Clock
         Stamps the blocks.
 
     Attributes
     ----------
     name : str
-        As configured.
+        Name in the site file.
     sample_rate_hz : float
-        Nominal rate.
+        Nominal sampling rate, Hz.
     channels : int
         Channels of each block.
     problem : str or None
-        What is wrong now, in words.
+        The present problem in words; None if there is none.
     """
 
     def __init__(self, config: SoundDeviceConfig, channels: int, clock: Clock) -> None:
@@ -136,13 +138,13 @@ class SoundDevice:
         self._handed_index = 0
 
     def __enter__(self) -> SoundDevice:
-        """Open the device, or begin to wait for it.
+        """Open the device, or start waiting for it.
 
         Raises
         ------
         DeviceError
-            Where waiting would not help: PortAudio is not installed, the name fits several devices, the device has
-            too few channels or not the sampling rate.
+            If waiting would not help: PortAudio is not installed, the name matches several devices, or the device
+            has too few channels or does not offer the sampling rate.
         """
         self.problem = self._open(_portaudio())
         self._entered = True
@@ -158,7 +160,7 @@ class SoundDevice:
         return self
 
     def __next__(self) -> Block:
-        """Next block, or one of no samples after 0.25 s.
+        """Return the next block, or one without samples after 0.25 s.
 
         Raises
         ------
@@ -178,15 +180,15 @@ class SoundDevice:
         return Block(first_index, samples, stamp_ns, overflow)
 
     def _receive(self, samples: Float32Array, count: int, time: Any, status: Any) -> None:
-        """PortAudio's callback: see the contract at the head of the module.
+        """Enqueue a block; this is PortAudio's callback, see the contract at the head of the module.
 
-        The time of conversion that the driver of a hardware device gives rests on a count of the samples in its buffer,
-        and so knows how long they waited for this call, and that two blocks of one period came at once. A sound
-        server's is a guess: PulseAudio's drifts by 0.2 s in the first second, while its blocks arrive evenly. There,
-        and where the time is not sane, the last sample is taken to have come just now.
+        The driver of a hardware device counts the samples in its buffer, so its conversion time includes how long they
+        waited for this call, also when two blocks of one period come at once. The conversion time of a sound server is
+        a guess: PulseAudio's drifts by 0.2 s in the first second while its blocks arrive evenly. For a sound server,
+        and if the time is not plausible, the last sample is taken to have arrived now.
 
-        A copy is asked for by name, because one channel transposed is already contiguous, and the memory is
-        PortAudio's.
+        The copy is explicit because a single channel is contiguous even after transposition, and the memory belongs to
+        PortAudio.
         """
         first_index = self._next_index
         self._next_index = first_index + count
@@ -204,7 +206,7 @@ class SoundDevice:
         self._lost = False
 
     def _look_after(self) -> None:
-        """After a wait in vain: give up a dead stream, or look for the missing device when it is time."""
+        """Give up a dead stream, or look for a missing device; called when no block has come within `WAIT_S`."""
         self._idle_s += WAIT_S
         sd = _portaudio()
         if self._stream is not None:
@@ -219,7 +221,7 @@ class SoundDevice:
                 self.problem = self._open(sd)
             except sd.PortAudioError as error:
                 self.problem = f"PortAudio cannot be started: {_reason(error)}; trying again"
-            except DeviceError as error:  # no reason to stop: whoever plugged that in may take it out again
+            except DeviceError as error:  # not fatal while running: the right device may be plugged in later
                 self.problem = str(error)
 
     def _give_up(self, problem: str) -> None:
@@ -229,12 +231,12 @@ class SoundDevice:
         self.problem = problem
 
     def _open(self, sd: Any) -> str | None:
-        """Open the device if it is there; what is wrong otherwise.
+        """Open the device; return the problem if that fails for now, else None.
 
         Raises
         ------
         DeviceError
-            Where waiting would not help.
+            If waiting would not help.
         """
         stream: Any = None
         try:
@@ -274,12 +276,12 @@ class SoundDevice:
 
 
 def input_devices() -> list[InputDevice]:
-    """Every device that can record, in PortAudio's order.
+    """Return all input devices, in PortAudio's order.
 
     Raises
     ------
     DeviceError
-        Where PortAudio is not installed or cannot list the devices.
+        If PortAudio is not installed or cannot list the devices.
     """
     sd = _portaudio()
     try:
@@ -289,7 +291,7 @@ def input_devices() -> list[InputDevice]:
 
 
 def _portaudio() -> Any:
-    """The `sounddevice` module; importing it starts PortAudio."""
+    """Return the `sounddevice` module; its import starts PortAudio."""
     try:
         import sounddevice
     except OSError as error:
@@ -301,7 +303,7 @@ def _portaudio() -> Any:
 
 
 def _inputs(sd: Any) -> list[tuple[int, InputDevice]]:
-    """PortAudio's index and description of each device that can record."""
+    """Return PortAudio's index and a description of each input device."""
     host_apis = [str(host_api["name"]) for host_api in sd.query_hostapis()]
     return [
         (
@@ -319,16 +321,16 @@ def _inputs(sd: Any) -> list[tuple[int, InputDevice]]:
 
 
 def _find(devices: Sequence[tuple[int, InputDevice]], wanted: str, channels: int) -> tuple[int, InputDevice] | None:
-    """PortAudio's index and description of the one device that answers to a name; None if there is none.
+    """Return PortAudio's index and a description of the device that matches a name; None if there is none.
 
-    A name given in full wins over names that merely hold it, so that every device can be named.
+    A full name takes precedence over names that contain it, so that every device can be named.
 
     Raises
     ------
     DeviceError
-        Where several answer, or the one has too few channels.
+        If several devices match, or the device has too few channels.
     """
-    found = [(index, device) for index, device in devices if device.answers_to(wanted)]
+    found = [(index, device) for index, device in devices if device.matches(wanted)]
     in_full = [
         (index, device)
         for index, device in found
@@ -341,21 +343,21 @@ def _find(devices: Sequence[tuple[int, InputDevice]], wanted: str, channels: int
     if len(found) > 1:
         candidates = "; ".join(device.label for _, device in found)
         raise DeviceError(
-            f"device {wanted!r}: expected a name that fits one input device, got {len(found)}: {candidates}; "
+            f"device {wanted!r}: expected a name that matches one input device, got {len(found)}: {candidates}; "
             "give more of the name in device.name"
         )
     index, device = found[0]
     if device.channels < channels:
         raise DeviceError(
-            f"device {wanted!r} has {device.channels} input channels, arrays use channel {channels}; "
+            f"device {wanted!r}: expected at least {channels} input channels, got {device.channels}; "
             "correct the channels under arrays of this node, or use an interface with more inputs"
         )
     return index, device
 
 
 def _rescan(sd: Any) -> None:
-    """Start PortAudio anew, the only way it sees a device that came after it began."""
-    with suppress(sd.PortAudioError):  # not running, because the start before this one failed
+    """Restart PortAudio: only then does it detect devices that were connected after its start."""
+    with suppress(sd.PortAudioError):  # PortAudio is not running if the last start failed
         sd._terminate()
     sd._initialize()
 

@@ -1,8 +1,8 @@
-"""A node's frames, kept until the server needs them no more: bounded, in memory or in files that outlive the node.
+"""The frames of a node until the server needs them no more: in memory, or in files that outlive the process.
 
-On disk it is a folder of segments, written at their end only. A segment is a magic number and then records: length and
-CRC-32 of a message, little-endian, and the message as it goes over the wire. What was half written when the node was
-killed ends its segment; a segment of which nothing is needed any more is deleted.
+On disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:
+length and CRC-32 of a message, little-endian, and the message as it goes over the wire. A record that was half written
+when the node was killed ends its segment. A segment is deleted when none of its frames is needed any more.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from livessl.core.types import FRAME_NS, Frame
 from livessl.errors import RunError
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
-"""Sound kept in memory, where there is no folder or its disk is full: half a minute of six arrays."""
+"""Most bytes of frames in memory, without a folder or while its disk is full: half a minute of six arrays."""
 
 SEGMENT_BYTES: Final = 4 * 1024 * 1024
-"""A few seconds of sound: what is deleted at once, and what a node that starts again may send twice."""
+"""Size of a segment in bytes, a few seconds of sound: the unit of deletion, and the most that a restarted node sends
+twice."""
 
 _MAGIC: Final = b"LSSLspl1"
 _RECORD: Final = struct.Struct("<II")
@@ -34,12 +35,12 @@ _log = logging.getLogger(__name__)
 
 
 class SpoolError(RunError):
-    """The folder, or a file in it, cannot be used."""
+    """A folder of the spool, or a file in it, that cannot be used."""
 
 
 @dataclass(slots=True, eq=False)
 class Kept:
-    """One frame: in memory with its `data`, else in a segment."""
+    """One frame of the spool: in memory with its `data`, or in a segment."""
 
     array: str
     frame_index: int
@@ -50,23 +51,23 @@ class Kept:
 
 
 class Spool:
-    """Each array's frames in order of time; the oldest go first where there is no room.
+    """The frames of each array in order of time; when there is no more room, the oldest are removed.
 
-    A segment is handed to the system as it is written, not forced to the disk: it outlives the node, not the machine.
+    Segments are handed to the operating system, not forced to the disk: they survive the process, not a power failure.
 
     Parameters
     ----------
     directory : Path or None
-        Where they are kept; None keeps them in memory only.
+        Folder of the segments; None keeps the frames in memory.
     max_bytes : int
-        Of all messages together.
+        Most bytes of all messages together.
     max_age_s : float
-        Frames that are so much older than the newest go.
+        Frames that are older than the newest by more than this are removed.
 
     Raises
     ------
     SpoolError
-        Where the folder cannot be used.
+        If the folder cannot be used.
     """
 
     def __init__(
@@ -74,9 +75,9 @@ class Spool:
     ) -> None:
         self._directory = directory
         self._max_bytes = max_bytes
-        self._max_rasters = max_age_s * 1e9 / FRAME_NS
+        self._max_age_frames = max_age_s * 1e9 / FRAME_NS
         self._kept: dict[str, deque[Kept]] = {}
-        self._needed: Counter[int] = Counter()  # frames needed of each segment
+        self._needed: Counter[int] = Counter()  # number of needed frames in each segment
         self._segment = 0
         self._file: int | None = None
         self._written = self._bytes = self._bytes_in_memory = 0
@@ -96,30 +97,30 @@ class Spool:
         return sum(map(len, self._kept.values()))
 
     def frames(self) -> list[Kept]:
-        """All that is kept, in order of time."""
+        """Return all frames, in order of time."""
         return list(heapq.merge(*self._kept.values(), key=lambda kept: kept.frame_index))
 
     def append(self, frame: Frame) -> tuple[Kept, list[Kept]]:
-        """Keep a frame; what was made of it, and what had to go.
+        """Add a frame; return it as it is kept, and the frames that were removed.
 
-        What lies at or after it in time goes: its clock was set back, and the old time comes again.
+        Frames of the same array at or after its time are removed: their clock has been set back since.
         """
-        gone = self._clear_from(frame)
+        removed = self._clear_from(frame)
         data = wire.encode(frame)
         kept = self._on_disk(frame, data) or Kept(frame.array, frame.frame_index, len(data), data)
         self._add(kept)
         while self._has_too_much(frame.frame_index):
             oldest = min((frames for frames in self._kept.values() if frames), key=lambda frames: frames[0].frame_index)
-            gone.append(self._release(oldest.popleft()))
-        return kept, gone
+            removed.append(self._release(oldest.popleft()))
+        return kept, removed
 
     def read(self, kept: Kept) -> bytes:
-        """The message.
+        """Return the message of a frame.
 
         Raises
         ------
         SpoolError
-            Where its segment cannot be read, or does not hold any more what was written.
+            If its segment cannot be read, or has been changed.
         """
         if kept.data is not None:
             return kept.data
@@ -135,13 +136,13 @@ class Spool:
         return data
 
     def forget(self, array: str, before: int) -> None:
-        """No frame of an array before this frame index is needed any more."""
+        """Release the frames of an array before this frame index."""
         frames = self._kept.get(array)
         while frames and frames[0].frame_index < before:
             self._release(frames.popleft())
 
     def close(self) -> None:
-        """Release the files; what is in them stays."""
+        """Close the open segment; frames on disk stay there."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -149,14 +150,14 @@ class Spool:
 
     def _clear_from(self, frame: Frame) -> list[Kept]:
         frames = self._kept.setdefault(frame.array, deque())
-        gone = []
+        removed = []
         while frames and frames[-1].frame_index >= frame.frame_index:
-            gone.append(self._release(frames.pop()))
-        return gone
+            removed.append(self._release(frames.pop()))
+        return removed
 
     def _has_too_much(self, newest: int) -> bool:
         oldest = min(frames[0].frame_index for frames in self._kept.values() if frames)
-        too_old = newest - oldest > self._max_rasters
+        too_old = newest - oldest > self._max_age_frames
         return too_old or self._bytes > self._max_bytes or self._bytes_in_memory > MEMORY_BYTES
 
     def _add(self, kept: Kept) -> None:
@@ -187,7 +188,7 @@ class Spool:
         return self._directory / f"{segment:012d}.spool"
 
     def _on_disk(self, frame: Frame, data: bytes) -> Kept | None:
-        """Write a frame to the newest segment; None where there is no disk, or it takes no more."""
+        """Write a frame to the newest segment; return None if there is no folder, or its disk is full or fails."""
         if self._directory is None:
             return None
         record = _RECORD.pack(len(data), zlib.crc32(data)) + data
@@ -199,9 +200,13 @@ class Spool:
                 raise OSError(0, "only part of a frame was written")
         except OSError as error:
             if not self._disk_fails:
-                _log.error("spool %s: %s; frames are kept in memory now: free space", self._directory, error.strerror)
+                _log.error(
+                    "spool %s: %s; frames are kept in memory now; free space on its disk",
+                    self._directory,
+                    error.strerror,
+                )
             self._disk_fails = True
-            self.close()  # a torn record ends it: the next frame begins a new one
+            self.close()  # a torn record ends the segment: the next frame begins a new one
             return None
         offset, self._written = self._written, self._written + len(record)
         return Kept(frame.array, frame.frame_index, len(data), None, self._segment, offset)
@@ -215,13 +220,13 @@ class Spool:
         self._written = len(_MAGIC)
 
     def _recover(self, path: Path) -> None:
-        """Take in what a segment of an earlier run holds, up to where it was torn."""
+        """Add the frames of an earlier run's segment, up to a torn record."""
         if not path.stem.isdigit():
             return
         self._segment = int(path.stem)
         content = path.read_bytes()
         offset = len(_MAGIC) if content.startswith(_MAGIC) else len(content)
-        self._needed[self._segment] += 1  # by us, while we read it
+        self._needed[self._segment] += 1  # keeps the segment while it is read
         while (data := _record(content, offset)) is not None and (frame := _frame(data)) is not None:
             self._clear_from(frame)
             self._add(Kept(frame.array, frame.frame_index, len(data), None, self._segment, offset))
@@ -232,7 +237,7 @@ class Spool:
 
 
 def _record(content: bytes, offset: int) -> bytes | None:
-    """The message of the record that begins there; None where none does."""
+    """Return the message of the record at `offset`; None if there is no whole record."""
     if len(content) - offset < _RECORD.size:
         return None
     length, checksum = _RECORD.unpack_from(content, offset)
@@ -241,7 +246,7 @@ def _record(content: bytes, offset: int) -> bytes | None:
 
 
 def _frame(data: bytes) -> Frame | None:
-    """The frame; None where it is none of this version."""
+    """Return the frame that a message holds; None if it is not a frame of this version."""
     try:
         message = wire.decode(data)
     except wire.WireError:

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from livessl.clock import utc_ns
 from livessl.site import keys as keyring
-from livessl.site.models import check_endpoint
+from livessl.site.addresses import check_endpoint
 
 T = TypeVar("T")
 

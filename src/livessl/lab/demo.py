@@ -20,8 +20,9 @@ from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
 from livessl.lab import processes
 from livessl.server.api.encode import JsonObject
-from livessl.simulate.export import TRUTH_FILE, write_scene
-from livessl.simulate.scene import Scene, make_scene, synthesised_sounds
+from livessl.simulation.export import TRUTH_FILE, write_scene
+from livessl.simulation.of_site import scene_of
+from livessl.simulation.scene import Scene
 from livessl.site.load import load_site, parse_site
 from livessl.site.models import Site
 
@@ -77,16 +78,7 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
         node["device"] = {"type": "wav", "files": {array: f"{array}.wav"}}
     site = parse_site(yaml.safe_dump(data), str(SITE_FILE))
     rt60_s = load_site(SITE_FILE).nodes["north-pc"].device.rt60_s  # type: ignore[union-attr]
-    scene = make_scene(
-        site.room.size_m,
-        rt60_s=rt60_s,
-        sounds=synthesised_sounds(RATE_HZ, SEED),
-        count=events,
-        sample_rate_hz=RATE_HZ,
-        c_m_s=site.c_m_s,
-        keep_away_m=[spec.centre_m for spec in site.specs],
-        seed=SEED,
-    )
+    scene = scene_of(site, rt60_s=rt60_s, count=events, sample_rate_hz=RATE_HZ, seed=SEED)
     write_scene(directory, site, scene, seed=SEED, progress=progress)
     (directory / "site.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
     return site, scene

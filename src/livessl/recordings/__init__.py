@@ -1,4 +1,4 @@
-"""Recorded sound: files read as if a device delivered them, sessions on disk, and which file belongs to which array.
+"""Recorded sound: files read in blocks like a device, sessions on disk, and the assignment of files to arrays.
 
-It knows no network and no audio interface.
+This package uses no network and no audio interface.
 """

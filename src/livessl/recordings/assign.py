@@ -1,9 +1,9 @@
-"""Recordings that stand in for devices: whose they are, on which channels, and when they began."""
+"""Assignment of recordings to a site's arrays: the channels that each array uses, and when its recording begins."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -11,134 +11,171 @@ from livessl.core.joint_array import require_one_clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
-from livessl.recordings.recording import Looped, Placed, Recording, Spliced, Stacked, WavRecording
+from livessl.recordings.recording import (
+    FileRecording,
+    LoopedRecording,
+    Recording,
+    SplicedRecording,
+    StackedRecording,
+    TimedRecording,
+)
 from livessl.recordings.session import Session
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
 
-TOGETHER_NS: Final = 5_000_000_000
-"""Long against the difference between two processes' starts, short against a user's patience."""
+COMMON_START_NS: Final = 5_000_000_000
+"""Grid of common start times, in nanoseconds: longer than two processes take to start one after the other, and short
+enough for a user to wait."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """One array's recording: what is heard on which channels, and when it began."""
+class AssignedRecording:
+    """The recording of one array.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array, joint or not.
+    recording : Recording
+        It may have more channels than the array has microphones.
+    start_ns : int
+        Site time at which the recording begins.
+    channels : tuple of int
+        Channels of the recording, counted from 1, in the order of the array's microphones.
+    """
 
     array: str
-    placed: Placed
+    recording: Recording
+    start_ns: int
     channels: tuple[int, ...]
 
+    @property
+    def timed(self) -> TimedRecording:
+        """The recording and its start, without the array."""
+        return TimedRecording(self.recording, self.start_ns)
 
-def pipelines_of(site: Site, parts: Iterable[Part]) -> tuple[list[Pipeline], list[Placed]]:
-    """The pipelines that cut recordings into messages, and what each of them plays.
 
-    Recordings of arrays that the site joins are played side by side, as one device recorded them.
+def make_pipelines(site: Site, recordings: Iterable[AssignedRecording]) -> tuple[list[Pipeline], list[TimedRecording]]:
+    """Return the pipelines that turn recordings into messages, and the recording that feeds each pipeline.
+
+    Recordings of arrays that the site joins are stacked into one, as if one device had recorded them.
 
     Raises
     ------
     DeviceError
-        Where some of them are missing, or were not recorded so.
+        If some of a joint array's recordings are missing, or differ in start, length or sampling rate.
     """
-    given = {part.array: part for part in parts}
+    by_array = {assigned.array: assigned for assigned in recordings}
     pipelines: list[Pipeline] = []
-    placed: list[Placed] = []
+    inputs: list[TimedRecording] = []
     for spec in site.processed:
-        played = _played_together(site, spec.name, given)
-        if not played:
+        members = _members_of(site, spec.name, by_array)
+        if not members:
             continue
-        first = played[0].placed
+        first = members[0].timed
         channels: dict[str, list[int]] = {}
         before = 0
-        for part in played:
-            channels[part.array] = [before + number for number in part.channels]
-            before += part.placed.recording.channels
+        for member in members:
+            channels[member.array] = [before + number for number in member.channels]
+            before += member.recording.channels
         pipelines.append(make_pipeline(site, channels, first.recording.sample_rate_hz))
-        together = tuple(part.placed.recording for part in played)
-        placed.append(first if len(played) == 1 else Placed(Stacked(together), first.start_ns))
-    return pipelines, placed
+        stacked = StackedRecording(tuple(member.recording for member in members))
+        inputs.append(first if len(members) == 1 else TimedRecording(stacked, first.start_ns))
+    return pipelines, inputs
 
 
-def _played_together(site: Site, name: str, given: Mapping[str, Part]) -> list[Part]:
-    """The recordings that make up one array as it is processed; none where none is given."""
+def _members_of(site: Site, name: str, by_array: Mapping[str, AssignedRecording]) -> list[AssignedRecording]:
+    """Return the recordings that make up one processed array; an empty list if it has none."""
     members = site.members(name)
-    played = [given[member] for member in members if member in given]
-    if name in given and name in site.joint:
-        if played:
+    found = [by_array[member] for member in members if member in by_array]
+    if name in by_array and name in site.joint:
+        if found:
             raise DeviceError(
-                f"array {name!r}: expected its recording or {played[0].array!r}'s, got both; take one away"
+                f"array {name!r}: expected a recording of it or of {found[0].array!r}, got both; leave one out"
             )
-        return [given[name]]
-    if len(played) not in (0, len(members)):
-        missing = next(member for member in members if member not in given)
+        return [by_array[name]]
+    if len(found) not in (0, len(members)):
+        missing = next(member for member in members if member not in by_array)
         raise DeviceError(
             f"array {name!r}: joint processing expects a recording of each of {', '.join(members)}, got none of "
-            f"{missing!r}; add it, or take joint.{name} away"
+            f"{missing!r}; add it, or remove joint.{name}"
         )
-    if len(played) > 1:
-        _require_together(site, name, played)
-    return played
+    if len(found) > 1:
+        _require_one_device(site, name, found)
+    return found
 
 
-def _require_together(site: Site, name: str, played: Sequence[Part]) -> None:
-    nodes = {part.array: site.node_of(part.array) for part in played}
-    try:  # without a node, one file is known to have one clock
-        require_one_clock(name, {part.array: nodes[part.array] or part.placed.recording.name for part in played})
+def _require_one_device(site: Site, name: str, members: Sequence[AssignedRecording]) -> None:
+    """Raise unless the members of a joint array were recorded together: one clock, start, length and rate."""
+    nodes = {member.array: site.node_of(member.array) for member in members}
+    try:  # an array without a node is known to share a clock only with arrays in the same file
+        require_one_clock(name, {member.array: nodes[member.array] or member.recording.name for member in members})
     except ValueError as error:
         raise DeviceError(str(error)) from error
-    first_ns = played[0].placed.start_ns
+    first_ns = members[0].start_ns
     spans = [
-        (part.placed.start_ns - first_ns, part.placed.recording.duration_s, part.placed.recording.sample_rate_hz)
-        for part in played
+        (member.start_ns - first_ns, member.recording.duration_s, member.recording.sample_rate_hz) for member in members
     ]
     if len(set(spans)) > 1:
         each = ", ".join(
-            f"{part.placed.recording.name} ({start_ns / 1e9:g} s, {duration_s:g} s, {rate_hz:g} Hz)"
-            for part, (start_ns, duration_s, rate_hz) in zip(played, spans, strict=True)
+            f"{member.recording.name} ({start_ns / 1e9:g} s, {duration_s:g} s, {rate_hz:g} Hz)"
+            for member, (start_ns, duration_s, rate_hz) in zip(members, spans, strict=True)
         )
         raise DeviceError(
-            f"array {name!r}: joint processing expects recordings of one beginning, length and sampling rate, "
-            f"got {each}; record them through one device, or take joint.{name} away"
+            f"array {name!r}: joint processing expects recordings of one start, length and sampling rate, "
+            f"got {each}; record them through one device, or remove joint.{name}"
         )
 
 
-def parts_from_wavs(
-    site: Site, wavs: Mapping[str, Path], channels: Mapping[str, Sequence[int]] | None = None, start_ns: int = 0
-) -> list[Part]:
-    """Recordings that begin together at `start_ns`, but for each array's `wav_offset_s` in the site file.
+def assign_files(
+    site: Site, files: Mapping[str, Path], channels: Mapping[str, Sequence[int]] | None = None, start_ns: int = 0
+) -> list[AssignedRecording]:
+    """Return the recordings of arrays from files that begin at `start_ns` plus each array's `wav_offset_s`.
+
+    Parameters
+    ----------
+    site : Site
+    files : mapping of array name to Path
+        WAV or FLAC files.
+    channels : mapping of array name to channels, or None
+        Channels counted from 1; `recording_channels` chooses them for arrays that are not named.
+    start_ns : int
+        Site time.
 
     Raises
     ------
     DeviceError
-        With every file that does not fit, one a line.
+        One line for each file that does not fit.
     """
     wanted = channels or {}
-    strangers = sorted(set(wanted) - set(wavs))
-    if strangers:
+    unknown = sorted(set(wanted) - set(files))
+    if unknown:
         raise DeviceError(
-            f"channels of array {strangers[0]!r}: no recording of it is given; there are {', '.join(wavs)}"
+            f"channels of array {unknown[0]!r}: expected an array with a recording ({', '.join(files)}); "
+            "give its recording, or leave its channels out"
         )
-    return _parts(
+    return _assign(
         site,
-        [(name, path, start_ns + (round(_wav_offset_s(site, name) * 1e9))) for name, path in wavs.items()],
+        [(name, path, start_ns + round(_wav_offset_s(site, name) * 1e9)) for name, path in files.items()],
         wanted,
     )
 
 
 def _wav_offset_s(site: Site, array: str) -> float:
-    """Of a joint array, that of those it joins: they have one; 0 for an array that is not there."""
+    """Return an array's offset; all members of a joint array have the same one. 0 for an unknown array."""
     config = site.arrays.get(site.members(array)[0])
     return config.wav_offset_s if config else 0.0
 
 
-def parts_from_sessions(site: Site, sessions: Iterable[Session]) -> list[Part]:
-    """Sessions' recordings at their original times, as one: each node records its own.
+def assign_sessions(site: Site, sessions: Iterable[Session]) -> list[AssignedRecording]:
+    """Return the recordings of one or more sessions at their original times; each node records a session of its own.
 
     Raises
     ------
     DeviceError
-        With every file that does not fit, one a line.
+        One line for each file that does not fit.
     """
-    return _parts(
+    return _assign(
         site,
         [(piece.array, session.path(piece), piece.start_ns) for session in sessions for piece in session.pieces],
         {},
@@ -146,61 +183,49 @@ def parts_from_sessions(site: Site, sessions: Iterable[Session]) -> list[Part]:
 
 
 def common_start_ns(now_ns: int, nodes: int) -> int:
-    """When files that stand in for devices begin: on the grid of frames, so that frames are cut as they are offline.
+    """Return the site time at which recordings begin when they are played in place of devices.
 
-    With several nodes, each a process that knows nothing of the others, at the next full `TOGETHER_NS` of the clock:
-    nodes started together begin together.
+    It lies on the 50 ms grid of frames, so that frames are cut exactly as they are offline. With several nodes, which
+    are separate processes, it is the next multiple of `COMMON_START_NS`: nodes started together begin together.
     """
-    step_ns = FRAME_NS if nodes <= 1 else TOGETHER_NS
+    step_ns = FRAME_NS if nodes <= 1 else COMMON_START_NS
     return -(-now_ns // step_ns) * step_ns
 
 
-def span_ns(parts: Iterable[Part]) -> tuple[int, int | None]:
-    """Site time at which the first recording begins and the last one ends; None where one is repeated for ever."""
-    placed = [part.placed for part in parts]
-    begin_ns = min(item.start_ns for item in placed)
-    if any(item.recording.duration_s == float("inf") for item in placed):
+def span_ns(recordings: Iterable[AssignedRecording]) -> tuple[int, int | None]:
+    """Return the site times of the first start and of the last end; the end is None if a recording is looped."""
+    assigned = list(recordings)
+    begin_ns = min(item.start_ns for item in assigned)
+    if any(item.recording.duration_s == float("inf") for item in assigned):
         return begin_ns, None
-    return begin_ns, max(item.start_ns + round(item.recording.duration_s * 1e9) for item in placed)
+    return begin_ns, max(item.start_ns + round(item.recording.duration_s * 1e9) for item in assigned)
 
 
-def repeated(parts: Iterable[Part]) -> list[Part]:
-    """The same recordings, again and again."""
-    return [
-        Part(part.array, Placed(Looped(part.placed.recording), part.placed.start_ns), part.channels) for part in parts
-    ]
+def looped(recordings: Iterable[AssignedRecording]) -> list[AssignedRecording]:
+    """Return the same recordings, each repeated without end."""
+    return [replace(assigned, recording=LoopedRecording(assigned.recording)) for assigned in recordings]
 
 
 def recording_channels(site: Site, array: str, recording: Recording, wanted: Sequence[int] | None = None) -> list[int]:
-    """Which channels (from 1) of a recording are an array's microphones.
+    """Choose the channels (from 1) of a recording that are an array's microphones.
 
-    As wanted; else as many channels as microphones, in order; else the channels that the site file gives the array on
-    its node's device; else the first ones.
+    These are the `wanted` channels, if given; all channels, if there are as many as microphones; else the array's
+    channels on its node's device, if the recording has them; else the first channels.
 
     Raises
     ------
     DeviceError
-        Where channels or sampling rate do not fit the site.
+        If channels or sampling rate do not fit the site.
     """
     expected = len(site.array(array).microphones_m)
     node = site.node_of(array)
-    rate = site.nodes[node].device.sample_rate_hz if node else None
-    if rate is not None and rate != recording.sample_rate_hz:
-        raise DeviceError(
-            f"{recording.name}: expected {rate:g} Hz for array {array!r}, got {recording.sample_rate_hz:g} Hz; "
-            f"resample the file or correct nodes.{node}.device.sample_rate_hz"
-        )
-    high = site.array(array).band_hz[1]
-    if high >= recording.sample_rate_hz / 2:
-        raise DeviceError(
-            f"{recording.name}: array {array!r} uses up to {high:g} Hz and needs more than {2 * high:g} Hz, got "
-            f"{recording.sample_rate_hz:g} Hz; lower band_hz or use a recording with a higher rate"
-        )
+    _check_rate(site, array, node, recording)
     if wanted is not None:
         if not len(wanted) == len(set(wanted)) == expected or min(wanted) < 1 or max(wanted) > recording.channels:
+            from_zero = "; channels count from 1" if 0 in wanted else ""
             raise DeviceError(
                 f"{recording.name}: expected {expected} different channel numbers from 1 to {recording.channels} "
-                f"for array {array!r}, got {list(wanted)}"
+                f"for array {array!r}, got {list(wanted)}{from_zero}"
             )
         return list(wanted)
     if recording.channels < expected:
@@ -216,8 +241,26 @@ def recording_channels(site: Site, array: str, recording: Recording, wanted: Seq
     return list(range(1, expected + 1))
 
 
-def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping[str, Sequence[int]]) -> list[Part]:
-    stretches: dict[str, list[Placed]] = {}
+def _check_rate(site: Site, array: str, node: str | None, recording: Recording) -> None:
+    rate = site.nodes[node].device.sample_rate_hz if node else None
+    if rate is not None and rate != recording.sample_rate_hz:
+        raise DeviceError(
+            f"{recording.name}: expected {rate:g} Hz for array {array!r}, got {recording.sample_rate_hz:g} Hz; "
+            f"resample the file or correct nodes.{node}.device.sample_rate_hz"
+        )
+    high = site.array(array).band_hz[1]
+    if high >= recording.sample_rate_hz / 2:
+        raise DeviceError(
+            f"{recording.name}: array {array!r} uses up to {high:g} Hz and needs more than {2 * high:g} Hz, got "
+            f"{recording.sample_rate_hz:g} Hz; lower band_hz or use a recording with a higher rate"
+        )
+
+
+def _assign(
+    site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping[str, Sequence[int]]
+) -> list[AssignedRecording]:
+    """Open `files` (array, path, start in ns); several files of one array become one recording with gaps."""
+    segments: dict[str, list[TimedRecording]] = {}
     chosen: dict[str, tuple[int, ...]] = {}
     faults: list[str] = []
     for array, path, start_ns in files:
@@ -226,26 +269,27 @@ def _parts(site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping
             faults.append(f"{array}={path}: no such array; arrays are {', '.join(known)}")
             continue
         try:
-            recording = WavRecording(path)
+            recording = FileRecording(path)
             chosen[array] = tuple(recording_channels(site, array, recording, channels.get(array)))
         except DeviceError as error:
             faults.append(str(error))
             continue
-        first = stretches.setdefault(array, [Placed(recording, start_ns)])[0].recording
+        first = segments.setdefault(array, [TimedRecording(recording, start_ns)])[0].recording
         if recording.sample_rate_hz != first.sample_rate_hz:
             faults.append(
-                f"{path}: expected {first.sample_rate_hz:g} Hz as in {first.name}, of array {array!r}, too; "
+                f"{path}: expected {first.sample_rate_hz:g} Hz as in {first.name}, also of array {array!r}, "
                 f"got {recording.sample_rate_hz:g} Hz; resample one of them"
             )
         elif recording is not first:
-            stretches[array].append(Placed(recording, start_ns))
+            segments[array].append(TimedRecording(recording, start_ns))
     if faults:
         raise DeviceError("\n".join(faults))
-    return [Part(array, _spliced(placed), chosen[array]) for array, placed in stretches.items()]
+    whole = {array: _spliced(found) for array, found in segments.items()}
+    return [AssignedRecording(array, timed.recording, timed.start_ns, chosen[array]) for array, timed in whole.items()]
 
 
-def _spliced(stretches: Sequence[Placed]) -> Placed:
-    if len(stretches) == 1:
-        return stretches[0]
-    ordered = sorted(stretches, key=lambda stretch: stretch.start_ns)
-    return Placed(Spliced(tuple(ordered)), ordered[0].start_ns)
+def _spliced(segments: Sequence[TimedRecording]) -> TimedRecording:
+    if len(segments) == 1:
+        return segments[0]
+    ordered = sorted(segments, key=lambda segment: segment.start_ns)
+    return TimedRecording(SplicedRecording(tuple(ordered)), ordered[0].start_ns)

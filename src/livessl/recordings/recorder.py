@@ -1,4 +1,4 @@
-"""Recording sessions for replay: one file for each array and unbroken stretch, with the time of its first sample."""
+"""Recording of sessions for replay: one file for each array and each gapless segment, with its start time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ import soundfile
 from livessl.clock import Clock
 from livessl.core.stream.timeline import Timeline
 from livessl.core.types import Block
-from livessl.recordings.assign import Part
-from livessl.recordings.recording import played
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import paced_blocks
 from livessl.recordings.session import Piece, piece, write_session
 from livessl.site.models import Site
 
 FLAC_MAX_CHANNELS: Final = 8
+"""Most channels of a FLAC file, by its format."""
 
 Format = Literal["flac", "wav"]
 _WRITTEN: Final = {"flac": ("FLAC", "PCM_24"), "wav": ("RF64", "FLOAT")}
-"""libsndfile's names. RF64 is WAV without its limit of 4 GiB, which 16 channels reach in 23 minutes at 48 kHz."""
+"""Container and sample format of each kind, as libsndfile names them. RF64 is WAV without its limit of 4 GiB, which
+16 channels reach in 23 minutes at 48 kHz."""
 
 
 @dataclass(slots=True)
@@ -33,12 +35,12 @@ class _Open:
     array: str
     name: str
     first_index: int
-    place: int
-    """In the list of pieces."""
+    piece: int
+    """Index into the list of pieces."""
 
 
 class Recorder:
-    """Writes a device's blocks; a gap begins new files.
+    """Writes a device's blocks to a session; a gap begins new files.
 
     Parameters
     ----------
@@ -51,7 +53,7 @@ class Recorder:
     kind : {"flac", "wav"}
         24-bit FLAC, or float WAV. Arrays of more than eight microphones are always WAV, which FLAC cannot hold.
     pieces : list of Piece or None
-        What the session holds so far; recorders that write one session share it.
+        Pieces of the session so far; recorders that write one session share this list.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class Recorder:
         self._open: list[_Open] = []
         self._pieces: list[Piece] = [] if pieces is None else pieces
         self._next_index: int | None = None
-        self._stretch = 0
+        self._segment = 0
         directory.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Recorder:
@@ -81,11 +83,11 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._close_stretch()
+        self._close_segment()
 
     @property
     def recorded(self) -> bool:
-        """Whether there is anything to replay."""
+        """True if any sound has been recorded."""
         return bool(self._pieces)
 
     def push(self, block: Block) -> None:
@@ -93,19 +95,19 @@ class Recorder:
         if block.samples.shape[1] == 0:
             return
         if block.overflow or block.first_index != self._next_index:
-            self._close_stretch()
-            self._open_stretch(block)
+            self._close_segment()
+            self._open_segment(block)
         self._timeline.update(block.first_index, block.stamp_ns)
         for item in self._open:
             item.file.write(block.samples[self._channels[item.array]].T)
         self._next_index = block.first_index + int(block.samples.shape[1])
 
-    def _open_stretch(self, first: Block) -> None:
-        """Begin new files, and write down when: a crash later loses no start. One stamp must do until they end."""
+    def _open_segment(self, first: Block) -> None:
+        """Begin new files and write the session with provisional start times, so that a crash loses none."""
         self._timeline = Timeline(self._rate_hz)
         for array, channels in self._channels.items():
             kind = "wav" if len(channels) > FLAC_MAX_CHANNELS else self._kind
-            name = f"{array}-{self._stretch:03d}.{kind}"
+            name = f"{array}-{self._segment:03d}.{kind}"
             container, subtype = _WRITTEN[kind]
             file = soundfile.SoundFile(
                 self._directory / name,
@@ -117,33 +119,44 @@ class Recorder:
             )
             self._open.append(_Open(file, array, name, first.first_index, len(self._pieces)))
             self._pieces.append(piece(array, name, first.stamp_ns))
-        self._stretch += 1
+        self._segment += 1
         write_session(self._directory, self._site, self._pieces)
 
-    def _close_stretch(self) -> None:
-        """Finish the open files, and write down their start as all of their stamps tell it."""
+    def _close_segment(self) -> None:
+        """Finish the open files and write the session with a start time fitted to all of their stamps."""
         if not self._open:
             return
         for item in self._open:
             item.file.close()
-            self._pieces[item.place] = piece(item.array, item.name, self._timeline.time_ns(item.first_index))
+            self._pieces[item.piece] = piece(item.array, item.name, self._timeline.time_ns(item.first_index))
         self._open.clear()
         write_session(self._directory, self._site, self._pieces)
 
 
-def record_parts(
-    directory: Path, site: Site, parts: Sequence[Part], clock: Clock, over: Callable[[], bool], kind: Format = "flac"
+def record_playback(
+    directory: Path,
+    site: Site,
+    recordings: Sequence[AssignedRecording],
+    clock: Clock,
+    over: Callable[[], bool],
+    kind: Format = "flac",
 ) -> bool:
-    """Record what plays instead of a device, at the clock's speed, until it ends or `over`; True if there was any."""
+    """Record recordings that are played in place of a device, at the pace of `clock`, to their end or until `over()`.
+
+    Returns
+    -------
+    bool
+        True if any sound was recorded.
+    """
     pieces: list[Piece] = []
     recorders = [
-        Recorder(directory, site, {part.array: part.channels}, part.placed.recording.sample_rate_hz, kind, pieces)
-        for part in parts
+        Recorder(directory, site, {item.array: item.channels}, item.recording.sample_rate_hz, kind, pieces)
+        for item in recordings
     ]
     with ExitStack() as stack:
         for recorder in recorders:
             stack.enter_context(recorder)
-        for _, index, block in played([part.placed for part in parts], clock):
+        for _, index, block in paced_blocks([item.timed for item in recordings], clock):
             recorders[index].push(block)
             if over():
                 break

@@ -1,4 +1,4 @@
-"""Recordings, read as if a device delivered them: files, arrays in memory, and combinations of them."""
+"""Recordings that are read in blocks, as a device delivers them: files, samples in memory, and combinations."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from livessl.core.types import MAX_SAMPLE, Block, Float32Array
 from livessl.errors import DeviceError
 
 BLOCK_S: Final = 0.02
-"""Length of the blocks that recordings are read in: as an audio interface would deliver them."""
+"""Length of a recording's blocks in seconds: the default of an audio interface, `device.block_s`."""
 
 _SCAN_SAMPLES: Final = 1 << 18
+"""Samples of each channel that are checked at a time, so that a long file does not fill the memory."""
 
 
 class Recording(Protocol):
-    """Sound with a beginning and an end, read as fast as wanted."""
+    """Multichannel sound of a finite or infinite length, read in blocks as fast as the reader wants."""
 
     @property
     def name(self) -> str:
-        """What to call it in messages."""
+        """The name that messages use, such as the path of its file."""
         ...
 
     @property
     def sample_rate_hz(self) -> float:
-        """Samples a second."""
+        """Sampling rate in Hz."""
         ...
 
     @property
@@ -45,11 +46,11 @@ class Recording(Protocol):
         ...
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """The recording from its beginning, as if that had been at site time `start_ns`: ideal stamps."""
+        """Yield the recording from its beginning with ideal time stamps from `start_ns` on, in site time."""
         ...
 
 
-class WavRecording:
+class FileRecording:
     """A WAV or FLAC file, in any sample format that libsndfile reads.
 
     Parameters
@@ -60,7 +61,7 @@ class WavRecording:
     Raises
     ------
     DeviceError
-        Where it cannot be read, is empty, silent throughout, or holds NaN or samples beyond `MAX_SAMPLE`.
+        If the file cannot be read, is empty, is all zero, or holds NaN or samples beyond `MAX_SAMPLE`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +74,7 @@ class WavRecording:
             self._check(file)
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """Blocks of `BLOCK_S`; (channels, n) each."""
+        """Yield blocks of `BLOCK_S`, (channels, n) each; `start_ns` is the site time of the first sample."""
         with self._open() as file:
             yield from _blocks(
                 file.blocks(round(BLOCK_S * self.sample_rate_hz), dtype="float32", always_2d=True),
@@ -116,8 +117,17 @@ class WavRecording:
 
 
 @dataclass(frozen=True)
-class ArrayRecording:
-    """Sound in memory, such as a simulated scene's."""
+class MemoryRecording:
+    """Sound in memory, such as a simulated scene.
+
+    Parameters
+    ----------
+    name : str
+        The name that messages use.
+    sample_rate_hz : float
+    samples : ndarray (channels, n)
+        float32 in [-1, 1).
+    """
 
     name: str
     sample_rate_hz: float
@@ -134,75 +144,76 @@ class ArrayRecording:
         return float(self.samples.shape[1] / self.sample_rate_hz)
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """Blocks of `BLOCK_S`; (channels, n) each."""
+        """Yield blocks of `BLOCK_S`, (channels, n) each; `start_ns` is the site time of the first sample."""
         n = round(BLOCK_S * self.sample_rate_hz)
         pieces = (self.samples[:, first : first + n].T for first in range(0, self.samples.shape[1], n))
         yield from _blocks(pieces, self.sample_rate_hz, start_ns)
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A recording and when it begins, in site time."""
+class TimedRecording:
+    """A recording and the site time at which it begins."""
 
     recording: Recording
     start_ns: int
 
 
-def merged(placed: Sequence[Placed]) -> Iterator[tuple[int, int, Block]]:
-    """Blocks of several recordings in the order in which devices would deliver them.
+def merged_blocks(recordings: Sequence[TimedRecording]) -> Iterator[tuple[int, int, Block]]:
+    """Merge the blocks of several recordings in the order in which devices would deliver them.
 
     Yields
     ------
     end_ns : int
         Site time at which the block is complete.
-    line : int
-        Index into `placed`.
+    index : int
+        Index into `recordings`.
     block : Block
     """
 
-    def with_end(line: int, item: Placed) -> Iterator[tuple[int, int, Block]]:
-        for block in item.recording.blocks(item.start_ns):
-            length_ns = round(int(block.samples.shape[1]) / item.recording.sample_rate_hz * 1e9)
-            yield block.stamp_ns + length_ns, line, block
+    def with_end(index: int, timed: TimedRecording) -> Iterator[tuple[int, int, Block]]:
+        for block in timed.recording.blocks(timed.start_ns):
+            length_ns = round(int(block.samples.shape[1]) / timed.recording.sample_rate_hz * 1e9)
+            yield block.stamp_ns + length_ns, index, block
 
-    return heapq.merge(*(with_end(k, item) for k, item in enumerate(placed)), key=lambda entry: entry[:2])
+    return heapq.merge(*(with_end(k, timed) for k, timed in enumerate(recordings)), key=lambda entry: entry[:2])
 
 
-def played(placed: Sequence[Placed], clock: Clock) -> Iterator[tuple[int, int, Block]]:
-    """`merged`, each block not before it would be complete: an ideal schedule, so that lateness never adds up.
+def paced_blocks(recordings: Sequence[TimedRecording], clock: Clock) -> Iterator[tuple[int, int, Block]]:
+    """Yield `merged_blocks`, each no earlier than it would be complete on `clock`.
 
-    As long as there is nothing to hear, empty blocks come instead.
+    The schedule is ideal: a late block does not delay the next ones. While the next block is not yet due, empty blocks
+    come in its place, so that the caller can serve its connection.
     """
-    for end_ns, line, block in merged(placed):
+    for end_ns, index, block in merged_blocks(recordings):
         while not clock.sleep_until_ns(end_ns):
-            yield clock.now_ns(), line, Block(block.first_index, block.samples[:, :0], block.stamp_ns)
-        yield end_ns, line, block
+            yield clock.now_ns(), index, Block(block.first_index, block.samples[:, :0], block.stamp_ns)
+        yield end_ns, index, block
 
 
 @dataclass(frozen=True)
-class Looped:
-    """A recording again and again, without a gap."""
+class LoopedRecording:
+    """A recording repeated for ever, without a gap between the repetitions."""
 
     once: Recording
     duration_s: float = float("inf")
 
     @property
     def name(self) -> str:
-        """The recording's."""
+        """Name of the repeated recording."""
         return self.once.name
 
     @property
     def sample_rate_hz(self) -> float:
-        """The recording's."""
+        """Sampling rate in Hz."""
         return self.once.sample_rate_hz
 
     @property
     def channels(self) -> int:
-        """The recording's."""
+        """Number of channels."""
         return self.once.channels
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """Blocks without end."""
+        """Yield blocks without end."""
         index = 0
         while True:
             for block in self.once.blocks(start_ns):
@@ -211,88 +222,88 @@ class Looped:
 
 
 @dataclass(frozen=True)
-class Spliced:
-    """Stretches of one array's sound with gaps between them, as one recording: its sample index jumps at a gap."""
+class SplicedRecording:
+    """Segments of one array's sound with gaps between them, as one recording whose sample index jumps at each gap."""
 
-    stretches: tuple[Placed, ...]
+    segments: tuple[TimedRecording, ...]
 
     @property
     def name(self) -> str:
-        """The first stretch's."""
-        return self.stretches[0].recording.name
+        """Name of the first segment."""
+        return self.segments[0].recording.name
 
     @property
     def sample_rate_hz(self) -> float:
-        """The first stretch's."""
-        return self.stretches[0].recording.sample_rate_hz
+        """Sampling rate in Hz."""
+        return self.segments[0].recording.sample_rate_hz
 
     @property
     def channels(self) -> int:
-        """The first stretch's."""
-        return self.stretches[0].recording.channels
+        """Number of channels."""
+        return self.segments[0].recording.channels
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
-        last = self.stretches[-1]
-        return (last.start_ns - self.stretches[0].start_ns) / 1e9 + last.recording.duration_s
+        """Time from the first sample to the last, in seconds, gaps included."""
+        last = self.segments[-1]
+        return (last.start_ns - self.segments[0].start_ns) / 1e9 + last.recording.duration_s
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """Blocks of every stretch at its own time, the first one's being `start_ns`."""
-        for stretch in self.stretches:
-            offset_ns = stretch.start_ns - self.stretches[0].start_ns
+        """Yield the blocks of each segment at its own time; the first segment begins at `start_ns`."""
+        for segment in self.segments:
+            offset_ns = segment.start_ns - self.segments[0].start_ns
             skipped = round(offset_ns * self.sample_rate_hz / 1e9)
-            for block in stretch.recording.blocks(start_ns + offset_ns):
+            for block in segment.recording.blocks(start_ns + offset_ns):
                 yield Block(block.first_index + skipped, block.samples, block.stamp_ns)
 
 
 @dataclass(frozen=True)
-class Stacked:
-    """Recordings that one device made at one time, side by side: all channels of the first, then the second's, …."""
+class StackedRecording:
+    """Recordings that one device made at the same time, as one: the channels of the first, then of the second, …."""
 
     recordings: tuple[Recording, ...]
 
     @property
     def name(self) -> str:
-        """All their names."""
+        """Names of all recordings."""
         return " + ".join(recording.name for recording in self.recordings)
 
     @property
     def sample_rate_hz(self) -> float:
-        """The first one's."""
+        """Sampling rate in Hz."""
         return self.recordings[0].sample_rate_hz
 
     @property
     def channels(self) -> int:
-        """Number of all channels."""
+        """Total number of channels."""
         return sum(recording.channels for recording in self.recordings)
 
     @property
     def duration_s(self) -> float:
-        """The first one's."""
+        """Length in seconds."""
         return self.recordings[0].duration_s
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """Blocks of all channels.
+        """Yield blocks of all channels.
 
         Raises
         ------
         DeviceError
-            Where the recordings do not run together to the sample.
+            If a gap or the end comes in some of the recordings only.
         """
         for blocks in zip(*(recording.blocks(start_ns) for recording in self.recordings), strict=True):
             first = blocks[0]
             if len({(block.first_index, block.samples.shape[1]) for block in blocks}) > 1:
                 at_s = (min(block.stamp_ns for block in blocks) - start_ns) / 1e9
                 raise DeviceError(
-                    f"{self.name}: expected recordings that run together to the sample, got a gap or an end in one of "
+                    f"{self.name}: expected recordings whose samples match one to one, got a gap or the end in one of "
                     f"them only, {at_s:.3f} s after they begin; record them through one device"
                 )
             yield Block(first.first_index, np.concatenate([block.samples for block in blocks]), first.stamp_ns)
 
 
 def _blocks(pieces: Iterable[Float32Array], rate_hz: float, start_ns: int) -> Iterator[Block]:
-    """Blocks with ideal stamps from (n, channels) pieces."""
+    """Yield blocks with ideal time stamps from pieces (n, channels)."""
     index = 0
     for piece in pieces:
         stamp_ns = start_ns + round(index / rate_hz * 1e9)

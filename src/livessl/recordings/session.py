@@ -1,4 +1,4 @@
-"""A recorded session on disk: what was recorded, from when on, and the site it was recorded in."""
+"""A recorded session on disk: its files with their start times, and its site."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from livessl.clock import utc_ns, utc_text
-from livessl.site.load import load_site, read_yaml
-from livessl.site.models import ConfigError, Fault, Site
+from livessl.errors import ConfigError, Fault
+from livessl.site.findings import dotted, read_yaml, validation_findings
+from livessl.site.load import load_site
+from livessl.site.models import Site
 
 SESSION_FILE: Final = "session.yaml"
 SITE_FILE: Final = "site.yaml"
 VERSION: Final = 1
+"""Version of the session file; files of another version are refused."""
 
 
 class Piece(BaseModel):
-    """One file without gaps: one array's channels, in order."""
+    """One file of one array without gaps; its channels are in the order of the array's microphones."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -49,27 +52,27 @@ class _SessionFile(BaseModel):
 
 @dataclass(frozen=True)
 class Session:
-    """A folder of recordings and the site."""
+    """A folder with recordings and their site."""
 
     directory: Path
     pieces: tuple[Piece, ...]
 
     def path(self, piece: Piece) -> Path:
-        """Where a piece's file lies."""
+        """Return the path of a piece's file."""
         return self.directory / piece.file
 
     def site(self, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
-        """The site that it was recorded in; `joint` adds to its own."""
+        """Return the site of the recording, with the joint arrays of `joint` in addition to its own."""
         return load_site(self.directory / SITE_FILE, joint)
 
 
 def piece(array: str, file: str, start_ns: int) -> Piece:
-    """A piece that begins at a site time."""
+    """Return a piece that begins at a site time."""
     return Piece(array=array, file=file, start_utc=utc_text(start_ns))
 
 
 def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
-    """Write the session's two descriptions beside its recordings."""
+    """Write the session file and the site file into the folder of the recordings."""
     (directory / SITE_FILE).write_text(site_text(site), encoding="utf-8")
     described = _SessionFile(version=VERSION, pieces=pieces).model_dump()
     (directory / SESSION_FILE).write_text(yaml.safe_dump(described, sort_keys=False), encoding="utf-8")
@@ -81,7 +84,7 @@ def read_session(directory: Path) -> Session:
     Raises
     ------
     ConfigError
-        Where the folder holds no session, or one that cannot be understood.
+        If the folder does not hold a valid session.
     """
     path = directory / SESSION_FILE
     try:
@@ -99,16 +102,17 @@ def read_session(directory: Path) -> Session:
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError([Fault(str(path), f"not valid YAML: {error}")]) from error
     except ValidationError as error:
-        raise ConfigError(
-            [Fault(f"{path}: {'.'.join(map(str, item['loc']))}", item["msg"]) for item in error.errors()]
-        ) from error
+        findings = validation_findings(_SessionFile, error.errors())
+        raise ConfigError([Fault(f"{path}: {dotted(place)}", what) for place, what in findings]) from error
     if described.version != VERSION:
-        raise ConfigError([Fault(str(path), f"expected version {VERSION}, got {described.version}")])
+        raise ConfigError(
+            [Fault(str(path), f"expected version {VERSION}, got {described.version}; use the livessl that recorded it")]
+        )
     return Session(directory, tuple(described.pieces))
 
 
 def site_text(site: Site) -> str:
-    """The site as YAML that stands alone: array positions absolute, no geometry files, no word on secrets."""
+    """Return a site as YAML that needs no other files: positions are absolute, and keys and tokens are left out."""
     http = {"tokens", "certificate", "private_key"}
     data: dict[str, Any] = site.model_dump(
         mode="json", exclude_defaults=True, exclude={"keys": True, "server": {"http": http}}

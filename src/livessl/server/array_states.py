@@ -15,6 +15,7 @@ from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
+from livessl.site.build.pipeline import activity_parameters
 from livessl.site.models import Site
 
 REPORT_NS: Final = 500_000_000
@@ -57,6 +58,7 @@ class ArrayStates:
         publish: Callable[[JsonObject], None],
     ) -> None:
         self._site = site
+        self._activity = activity_parameters(site)
         self._clock = clock
         self._store = store
         self._site_time = site_time
@@ -130,7 +132,7 @@ class ArrayStates:
             otherwise = f"{state}: {reason}" if reason else state
             reason = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
         status = replace(status, state=state, reason=reason, counters=self._counters(status, fusion))
-        described = {**array_status(status, self._site.node_of(status.name)), "enabled": enabled}
+        described = {**array_status(status, self._site.node_of(status.name), self._activity), "enabled": enabled}
         return described if enabled else {**described, "state": DISABLED}
 
     def _state(self, status: ArrayStatus) -> tuple[ArrayState, str | None]:

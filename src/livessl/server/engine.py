@@ -16,7 +16,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.parallel import Parallel
 from livessl.server.publisher import Publisher
-from livessl.server.receiver import Greeted, Joined, Left, Source
+from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
 from livessl.site.models import Site
@@ -37,7 +37,7 @@ class Engine:
     ----------
     site : Site
     clock : Clock
-    receiver : Source
+    receiver : Inbox
     site_time : SiteTime
     array_states : ArrayStates
     event_log : EventLog
@@ -49,7 +49,7 @@ class Engine:
         self,
         site: Site,
         clock: Clock,
-        receiver: Source,
+        receiver: Inbox,
         site_time: SiteTime,
         array_states: ArrayStates,
         event_log: EventLog,
@@ -102,7 +102,7 @@ class Engine:
             if isinstance(item, Joined | Greeted | Left):
                 self._step(batch)
                 batch = []
-                self._meet(item)
+                self._handle(item)
             else:
                 batch.append(item)
         self._step(batch)
@@ -130,9 +130,10 @@ class Engine:
     def _switch(self, run: Run) -> None:
         """Begin another run; nodes must not forget frames because the run before it had made them final."""
         self._begin(run)
-        self._receiver.ingest.settled = run.fusion.settled_of
+        self._receiver.ingest.final_until = run.fusion.settled_of
 
-    def _meet(self, item: Joined | Greeted | Left) -> None:
+    def _handle(self, item: Joined | Greeted | Left) -> None:
+        """Take in that a node has joined, greeted again, or left."""
         if isinstance(item, Left):
             self._leave(item.hello)
             return
@@ -187,4 +188,4 @@ class Engine:
         run.fusion.exclude(self._array_states.disabled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
-            self._receiver.ingest.settled = run.fusion.settled_of
+            self._receiver.ingest.final_until = run.fusion.settled_of

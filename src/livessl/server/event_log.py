@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 class Answer(NamedTuple):
-    """What an event answers, at the precision at which it is published; an event that repeats it is no news."""
+    """The answer that an event gives, at its published precision; an event that repeats it is not published again."""
 
     start_us: int
     duration_s: float
@@ -94,7 +94,7 @@ class EarlyEvent:
 
 @dataclass(frozen=True, slots=True)
 class _Unsaved:
-    """What one final pass found and the store has not taken yet: see `Store.finalize`."""
+    """Results of one final pass that the store has not taken yet: the arguments of `Store.finalize`."""
 
     events: Sequence[tuple[JsonObject, int]]
     replaced: Sequence[str]
@@ -138,7 +138,7 @@ class EventLog:
 
     @property
     def is_saved(self) -> bool:
-        """Whether the store has taken all final events; until then no node may forget their frames."""
+        """True if the store has taken all final events; until then no node may forget their frames."""
         return not self._waiting
 
     def begin_live(self) -> Finalized:

@@ -1,4 +1,4 @@
-"""Everyone who subscribed: numbered messages, filters, and a bounded place for each client to fall behind in."""
+"""Fans numbered messages out to subscribers; each has a filter, and a bounded queue to fall behind in."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from typing import Any, Final
 from livessl.server.api.encode import API_VERSION, JsonObject, json_text
 
 LAGGING: Final = 32
-"""A client so many messages behind, a second of one sound, is told states only as they are now: what a newer message
-of the same sound, track, or of the arrays says again is left out."""
+"""Messages behind, about one second of one sound, from which on a client gets only the newest state of each sound, each
+track and the arrays: older states of the same subject are dropped from its queue."""
 
 BACKLOG: Final = 256
-"""Messages a client may lag by. Beyond it the oldest are dropped, events last, and the client told."""
+"""Most messages that wait for a client. Beyond it the oldest are dropped, events last, and a `gap` reports how many."""
 
 PAST: Final = 2048
-"""Messages kept for clients that come back: a minute or more of one sound that never ends. They are kept as compressed
-text: as objects those of 64 arrays would take some 50 MB."""
+"""Messages kept for clients that reconnect: one minute or more of a sound that never ends. They are kept as compressed
+text, because as objects those of 64 arrays would take about 50 MB."""
 
-_LOOKED_AT: Final = ("seq", "kind", "confidence", "zones")
-"""What is asked of a message before it is sent again."""
+_FILTERED_BY: Final = ("seq", "kind", "confidence", "zones")
+"""Fields of a kept message that decide whether a client gets it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """What a client asked for.
+    """A client's choice of messages.
 
     Parameters
     ----------
     kinds : frozenset of str or None
         Message kinds; None for all.
     min_confidence : float
-        Events and updates below it are left out.
+        Least confidence of events and updates.
     zone : str or None
         Only events, updates and tracks inside this zone.
     """
@@ -45,7 +45,7 @@ class Filter:
     zone: str | None = None
 
     def passes(self, message: Mapping[str, Any]) -> bool:
-        """Whether a client with this filter wants the message."""
+        """Return whether a message passes the filter."""
         if self.kinds is not None and message["kind"] not in self.kinds:
             return False
         if message.get("confidence", 1.0) < self.min_confidence:
@@ -54,16 +54,16 @@ class Filter:
 
 
 class Numbered:
-    """A numbered message on its way to the subscribers: one object for all of them, one text.
+    """A numbered message on its way to the subscribers, which share it and its text.
 
     Parameters
     ----------
     message : JsonObject
         With its version and number.
     published_ns : int or None
-        When it was told, by the clock that nobody sets, where its way to the clients is to be measured.
+        When it was published, by the monotonic clock, if its way to the clients is to be measured.
     packed : bytes or None
-        Its text, compressed; the message then holds only what it is chosen by.
+        Its text, compressed; `message` then holds only the fields that filters look at.
     """
 
     __slots__ = ("_packed", "_text", "message", "published_ns")
@@ -84,20 +84,20 @@ class Numbered:
         return self._text
 
     def packed(self) -> Numbered:
-        """The same for those who come back, small; its delay is not that of the way to a client."""
-        chosen_by: JsonObject = {name: self.message[name] for name in _LOOKED_AT if name in self.message}
-        return Numbered(chosen_by, packed=zlib.compress(self.text.encode(), 1))
+        """Return a small copy for clients that reconnect; its way to them is not measured."""
+        fields: JsonObject = {name: self.message[name] for name in _FILTERED_BY if name in self.message}
+        return Numbered(fields, packed=zlib.compress(self.text.encode(), 1))
 
     @property
     def subject(self) -> Hashable | None:
-        """What the message gives the state of: a later one of the same subject replaces it. Events are no states."""
+        """The subject whose state this is; a later message on it replaces this one. None for an event, which stays."""
         kind = self.message["kind"]
         return None if kind == "event" else (kind, self.message.get("event_id") or self.message.get("id"))
 
 
 @dataclass(slots=True, eq=False)
 class Subscription:
-    """One client's queue: everything, in order, as long as the client keeps up; then states only as they are now."""
+    """The queue of one client: every message in order while it keeps up, then only the newest states and the events."""
 
     wanted: Filter
     past: deque[Numbered] = field(default_factory=deque)
@@ -106,24 +106,24 @@ class Subscription:
     _news: asyncio.Event = field(default_factory=asyncio.Event)
     _missed: int = 0
 
-    def offer(self, seq: int, told: Numbered) -> bool:
-        """Queue a message; whether another one had to go for it."""
-        if not self.wanted.passes(told.message):
+    def offer(self, seq: int, numbered: Numbered) -> bool:
+        """Queue a message if it passes the filter; return whether another one was dropped for it."""
+        if not self.wanted.passes(numbered.message):
             return False
-        gone = len(self._waiting) >= LAGGING and self._make_room(told.subject)
-        self._waiting[seq] = told
-        if told.subject is not None:
-            self._newest[told.subject] = seq
+        gone = len(self._waiting) >= LAGGING and self._make_room(numbered.subject)
+        self._waiting[seq] = numbered
+        if numbered.subject is not None:
+            self._newest[numbered.subject] = seq
         self._news.set()
         return gone
 
     def _make_room(self, subject: Hashable | None) -> bool:
-        """Drop the older state of the same subject; of a full queue the oldest state, else the oldest event."""
+        """Drop the older state of the same subject, or the oldest message of a full queue; return whether it did."""
         older = None if subject is None else self._newest.get(subject)
         if older is not None:
             del self._waiting[older]
         elif len(self._waiting) >= BACKLOG:
-            states = (seq for seq, told in self._waiting.items() if told.subject is not None)
+            states = (seq for seq, numbered in self._waiting.items() if numbered.subject is not None)
             victim = next(states, next(iter(self._waiting)))
             self._forget(self._waiting.pop(victim), victim)
             self._missed += 1
@@ -133,11 +133,11 @@ class Subscription:
 
     @property
     def lags(self) -> bool:
-        """Whether there is more to send."""
+        """True if more messages wait."""
         return bool(self._waiting)
 
     async def next(self) -> Numbered:
-        """The next message, waiting for one; first of all the past that was asked for, then how many were missed."""
+        """Wait for the next message and return it: first the kept ones, then a `gap` if any were dropped."""
         if self.past:
             return self.past.popleft()
         while not self._waiting:
@@ -147,22 +147,22 @@ class Subscription:
             missed, self._missed = self._missed, 0
             reason = f"this client reads too slowly; {missed} messages were dropped, events last"
             return _gap(missed, reason)
-        seq, told = self._waiting.popitem(last=False)
-        self._forget(told, seq)
-        return told
+        seq, numbered = self._waiting.popitem(last=False)
+        self._forget(numbered, seq)
+        return numbered
 
-    def _forget(self, told: Numbered, seq: int) -> None:
-        if told.subject is not None and self._newest.get(told.subject) == seq:
-            del self._newest[told.subject]
+    def _forget(self, numbered: Numbered, seq: int) -> None:
+        if numbered.subject is not None and self._newest.get(numbered.subject) == seq:
+            del self._newest[numbered.subject]
 
 
 class Fanout:
-    """Numbers messages and hands them to every subscriber. All calls on the event loop's thread.
+    """Numbers messages and offers them to every subscriber. For the event loop's thread only.
 
     Parameters
     ----------
     first_seq : int
-        The number before the first. A server that starts again begins above all that it told before.
+        The number before the first. A restarted server must begin above all numbers that it gave before.
     """
 
     def __init__(self, first_seq: int = 0) -> None:
@@ -171,15 +171,20 @@ class Fanout:
         self._first_seq = first_seq
         self.last_seq = first_seq
         self.superseded = 0
-        """Messages that a slow client never got, for a newer one of the same thing or for want of room."""
+        """Messages dropped from the queues of slow clients."""
 
     @property
     def clients(self) -> int:
-        """How many subscribe."""
+        """Number of subscribers."""
         return len(self._subscriptions)
 
+    @property
+    def lags(self) -> bool:
+        """True if messages wait for any subscriber."""
+        return any(subscription.lags for subscription in self._subscriptions)
+
     def subscribe(self, wanted: Filter, since_seq: int | None = None) -> Subscription:
-        """Begin to receive, first everything after a number if one is given; end with `unsubscribe`."""
+        """Return a new subscription, to end with `unsubscribe`; with `since_seq` it begins after that number."""
         subscription = Subscription(wanted)
         if since_seq is not None:
             subscription.past.extend(self._after(since_seq, wanted))
@@ -187,7 +192,7 @@ class Fanout:
         return subscription
 
     def _after(self, since_seq: int, wanted: Filter) -> Iterator[Numbered]:
-        """What was told after a number, and before it what is gone, if anything is."""
+        """Yield the kept messages after a number; before them a `gap` if older ones are no longer kept."""
         oldest = self.last_seq - len(self._past) + 1
         if since_seq > self.last_seq:
             yield _gap(None, f"number {since_seq} has not been told; the last one is {self.last_seq}")
@@ -200,16 +205,16 @@ class Fanout:
         yield from (t for t in self._past if t.message["seq"] > since_seq and wanted.passes(t.message))
 
     def unsubscribe(self, subscription: Subscription) -> None:
-        """Receive no more."""
+        """End a subscription."""
         self._subscriptions.discard(subscription)
 
     def publish(self, message: JsonObject, published_ns: int | None = None) -> None:
         """Number a message and offer it to everyone."""
         self.last_seq += 1
-        told = Numbered({"v": API_VERSION, "seq": self.last_seq, **message}, published_ns)
-        self._past.append(told.packed())
+        numbered = Numbered({"v": API_VERSION, "seq": self.last_seq, **message}, published_ns)
+        self._past.append(numbered.packed())
         for subscription in self._subscriptions:
-            self.superseded += subscription.offer(self.last_seq, told)
+            self.superseded += subscription.offer(self.last_seq, numbered)
 
 
 def _gap(missed: int | None, reason: str) -> Numbered:

@@ -1,4 +1,9 @@
-"""The gate before the nodes' socket: CURVE, and ZeroMQ's authentication protocol (RFC 27) on a thread of its own."""
+"""The guard of the nodes' socket: CURVE, and a handler of ZeroMQ's authentication protocol ZAP (RFC 27) on a thread.
+
+pyzmq's `ThreadAuthenticator` does not serve here. Its callback gets the key but not the caller's address, which the
+list of refusals needs; it does not report that its thread has failed; and handshakes that fail before a key is shown
+would need a socket monitor, on a thread of its own, anyway.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +24,13 @@ ZAP_ENDPOINT: Final = "inproc://zeromq.zap.01"
 DOMAIN: Final = b"nodes"
 
 HANDSHAKE_MS: Final = 5000
-"""Who takes longer over the handshake than this is dropped."""
+"""Longest time, in milliseconds, that a handshake may take."""
 
 _BROKEN: Final = {
     int(zmq.Event.HANDSHAKE_FAILED_PROTOCOL): "without keys, or with another server's",
     int(zmq.Event.HANDSHAKE_FAILED_NO_DETAIL): "broke off the handshake",
 }
-"""What fails before any key is shown. ZeroMQ does not tell from where."""
+"""Reasons of handshakes that fail before a key is shown, by the monitor's event; it does not give their address."""
 
 _log = logging.getLogger(__name__)
 
@@ -37,48 +42,48 @@ def guard(
     refusals: Refusals,
     failed: Callable[[BaseException], None],
 ) -> None:
-    """Let only enrolled nodes connect to a socket, from before it is bound until its context ends.
+    """Let only enrolled nodes connect to a socket, until its context ends.
 
     Parameters
     ----------
     context : zmq.Context
     socket : zmq.Socket
-        The server's, not yet bound. Its messages then carry the node's name as their `User-Id`.
+        The server's, not yet bound. Its messages will carry the node's name as their `User-Id`.
     keys : ServerKeys
     refusals : Refusals
-        Told of everyone who is turned away.
+        Counts every refused handshake.
     failed : callable
-        Gets what ends the thread before its time: from then on nobody is let in.
+        Gets the error that ends the thread; from then on no node can connect.
     """
     socket.setsockopt(zmq.CURVE_SERVER, 1)
     socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
     socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
-    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without the thread below nobody is let in
+    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without the thread below no node can connect
     socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
     monitor = socket.get_monitor_socket(sum(_BROKEN))
-    asked: zmq.Socket[bytes] = context.socket(zmq.REP)
-    asked.setsockopt(zmq.LINGER, 0)
-    asked.bind(ZAP_ENDPOINT)
+    handler: zmq.Socket[bytes] = context.socket(zmq.REP)
+    handler.setsockopt(zmq.LINGER, 0)
+    handler.bind(ZAP_ENDPOINT)
     names = {key: name for name, key in keys.nodes.items()}
-    threading.Thread(target=_run, args=(asked, monitor, names, refusals, failed), name="guard", daemon=True).start()
+    threading.Thread(target=_run, args=(handler, monitor, names, refusals, failed), name="guard", daemon=True).start()
 
 
 def _run(
-    asked: zmq.Socket[bytes],
+    handler: zmq.Socket[bytes],
     monitor: zmq.Socket[bytes],
     names: Mapping[bytes, str],
     refusals: Refusals,
     failed: Callable[[BaseException], None],
 ) -> None:
     poller = zmq.Poller()
-    poller.register(asked, zmq.POLLIN)
+    poller.register(handler, zmq.POLLIN)
     poller.register(monitor, zmq.POLLIN)
-    with asked, monitor:
+    with handler, monitor:
         try:
             while True:
                 ready = dict(poller.poll())
-                if asked in ready:
-                    asked.send_multipart(_answer(asked.recv_multipart(), names, refusals))
+                if handler in ready:
+                    handler.send_multipart(_answer(handler.recv_multipart(), names, refusals))
                 if monitor in ready:
                     event = int(recv_monitor_message(monitor)["event"])
                     if event in _BROKEN:

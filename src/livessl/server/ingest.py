@@ -1,4 +1,4 @@
-"""Who is connected and what they have sent: greetings, sequence numbers, acknowledgements. It owns no socket."""
+"""The server's side of the link to the nodes: greetings, sequence numbers, acknowledgements. It owns no socket."""
 
 from __future__ import annotations
 
@@ -12,30 +12,32 @@ from livessl.core.types import BackfillRequest, Frame, Mark, Message
 from livessl.site.models import Site
 
 ACK_NS: Final = 250_000_000
-"""Every node hears from us at least this often."""
+"""Longest interval, in nanoseconds, between two acknowledgements to a node."""
 
 SOON_NS: Final = 20_000_000
-"""A node that sends what it has kept, or a recording, hears from us this often: it runs a little ahead of our word."""
+"""Interval, in nanoseconds, of acknowledgements to a node that sends a backlog or a recording: it sends only a little
+beyond what is acknowledged."""
 
 GONE_NS: Final = 2_000_000_000
-"""A node silent for so long no longer holds its name and its arrays."""
+"""Silence, in nanoseconds, after which another node may take a node's name and arrays."""
 
 THERE_NS: Final = 1_400_000_000
-"""A node that has nothing else to say greets once a second; a dead one is not there any more when its array is lost."""
+"""Silence, in nanoseconds, after which a node counts as dead: longer than the second between two greetings, shorter
+than the time after which its array is lost."""
 
 NOTICE_NS: Final = 60_000_000_000
-"""One notice a minute about senders of rubbish, not one a message."""
+"""Shortest interval, in nanoseconds, between two log lines about malformed messages."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class Peer:
-    """One node's run."""
+    """One run of a node."""
 
     routing_id: bytes
     hello: wire.Hello
-    heard_ns: int
+    last_ns: int
     sequences: dict[str, int] = field(default_factory=dict)
     received: dict[str, int] = field(default_factory=dict)
     live: dict[str, int] = field(default_factory=dict)
@@ -43,11 +45,11 @@ class Peer:
     ended: bool = False
 
     def is_backlog(self, message: Message) -> bool:
-        """Whether it is older than what the node calls live."""
+        """Return whether a message is older than what the node calls live."""
         return message.array in self.hello.backlog and message.frame_index < self.hello.backlog[message.array][1]
 
     def greet(self, hello: wire.Hello) -> None:
-        """Take in what the node says that it has kept: it has nothing older, and nothing at all where it says none."""
+        """Take in which frames the node has kept: none older than it states, and none at all if it states none."""
         for array, (oldest, _) in hello.backlog.items():
             self.received[array] = max(self.received.get(array, oldest - 1), oldest - 1)
         for array in self.live.keys() - hello.backlog.keys():
@@ -55,17 +57,18 @@ class Peer:
         self.hello = hello
 
     def take(self, frame: Frame) -> None:
-        """The frame is here, and with it all before it in the order that it belongs to."""
+        """Note that a frame is here, and with it all earlier frames of its backlog or of live sound."""
         waits = frame.array in self.hello.backlog and not self.is_backlog(frame)
         known = self.live if waits else self.received
         known[frame.array] = max(known.get(frame.array, frame.frame_index), frame.frame_index)
 
 
 @dataclass(slots=True)
-class Arrival:
-    """What one piece of data brought: `joined` with a new run, `greeted` where a known one has kept other frames.
+class Received:
+    """The result of one message.
 
-    `offer` is for a node that does not know yet that it may be asked; it goes out before the reply.
+    `joined` is set by a new run, `greeted` by a known one that has kept other frames than before. `offer` informs a
+    node that the server may request frames; it is sent before the reply.
     """
 
     message: Message | None = None
@@ -77,37 +80,39 @@ class Arrival:
 
 
 class Ingest:
-    """The server's side of the link, sans I/O: data in, messages and replies out.
+    """The protocol without I/O: data in, messages and replies out.
 
     Parameters
     ----------
     site : Site
-        Which arrays there are.
+        Knows the arrays and the nodes that they belong to.
     """
 
     def __init__(self, site: Site) -> None:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
-        self.settled: Mapping[str, int] = {}  # of each array, by its own clock; replaced, never changed
+        self.final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
+        """Frame index, by each array's own clock, before which all events are final: nodes may forget those frames."""
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
+        """Malformed messages since the start."""
         names = [spec.name for spec in site.processed]
         self.duplicates = dict.fromkeys(names, 0)
         self.sequence_gaps = dict.fromkeys(names, 0)
 
     def problem_of(self, array: str) -> str | None:
-        """What the node says is wrong with the device that an array is on."""
+        """Return what an array's node reports to be wrong with its device, None if nothing is."""
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
     def is_live(self, array: str, now_ns: int) -> bool:
-        """Whether the node that an array is on has said anything in the last moments."""
+        """Return whether an array's node has sent anything in the last `THERE_NS`."""
         return any(
-            array in peer.hello.arrays and not peer.ended and now_ns - peer.heard_ns < THERE_NS
+            array in peer.hello.arrays and not peer.ended and now_ns - peer.last_ns < THERE_NS
             for peer in self._peers.values()
         )
 
-    def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Arrival:
-        """Take in one message from one peer; `enrolled` is whose key it has shown, where the site uses keys."""
+    def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Received:
+        """Take in one message from one peer; `enrolled` is the node whose key it has shown, if the site uses keys."""
         try:
             message = wire.decode(data)
         except wire.WireError as error:
@@ -116,18 +121,18 @@ class Ingest:
             return self._greet(routing_id, message, now_ns, enrolled)
         peer = self._peers.get(routing_id)
         if peer is None or peer.ended:
-            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))
-        peer.heard_ns = now_ns
+            return Received(reply=wire.Ack(run_id="?", received={}, who_are_you=True))
+        peer.last_ns = now_ns
         if isinstance(message, wire.Bye):
             peer.ended = True
-            return Arrival(left=peer.hello)
+            return Received(left=peer.hello)
         if not isinstance(message, Frame | Mark):
             what = "an acknowledgement" if isinstance(message, wire.Ack) else "a request"
             return self._reject(wire.WireError(f"a node sent {what}; only servers do"), now_ns)
         return self._take(peer, message, now_ns)
 
-    def _take(self, peer: Peer, message: Message, now_ns: int) -> Arrival:
-        """Take in sound, or word of quiet."""
+    def _take(self, peer: Peer, message: Message, now_ns: int) -> Received:
+        """Take in a frame or a mark."""
         if message.array not in peer.hello.arrays:
             return self._reject(
                 wire.WireError(f"node {peer.hello.node!r} sent array {message.array!r}, which it did not announce"),
@@ -137,23 +142,23 @@ class Ingest:
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
         if isinstance(message, Frame) and message.requested:
-            return Arrival(message=message)  # it stands outside the node's own count of frames
+            return Received(message=message)  # it stands outside the node's own count of frames
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
-            return Arrival(message=message)
+            return Received(message=message)
         missing = self._missing_before(peer, message)
         if missing is None:
             self.duplicates[message.array] += 1
-            return Arrival()
+            return Received()
         self.sequence_gaps[message.array] += missing
         if missing:
-            return Arrival(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # it shall send them again
+            return Received(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # the node then sends them again
         if isinstance(message, Frame):
             peer.take(message)
-        return Arrival(message=message)
+        return Received(message=message)
 
     def _wrong_rate(self, peer: Peer, frame: Frame) -> str | None:
-        """What is wrong with a frame's sampling rate: sound of an earlier run may have another than was announced."""
+        """Return what is wrong with a frame's sampling rate; a backlog may have another rate than was announced."""
         rate_hz, sent = frame.sample_rate_hz, f"node {peer.hello.node!r} sent {frame.sample_rate_hz:g} Hz"
         high_hz, announced_hz = self._site.array(frame.array).band_hz[1], peer.hello.arrays[frame.array]
         if high_hz >= rate_hz / 2:
@@ -163,7 +168,7 @@ class Ingest:
         return None
 
     def _missing_before(self, peer: Peer, message: Message) -> int | None:
-        """How many frames should have come before a message of live sound; None where it was here before."""
+        """Return how many frames are missing before a message of live sound; None if the message is a duplicate."""
         array, number = message.array, message.sequence
         last = peer.sequences.get(array)
         is_frame = isinstance(message, Frame)
@@ -173,9 +178,9 @@ class Ingest:
         return 0 if last is None else max(0, number - last - is_frame)
 
     def acknowledgements(self, now_ns: int, *, soon: bool = True) -> list[tuple[bytes, wire.Ack]]:
-        """Replies due by now, `soon` also those to nodes that wait for them; forgets nodes that are long silent."""
+        """Return the acknowledgements that are due, with `soon` also those that hurry; forget long silent nodes."""
         self._peers = {
-            key: peer for key, peer in self._peers.items() if now_ns - peer.heard_ns < 30 * GONE_NS and not peer.ended
+            key: peer for key, peer in self._peers.items() if now_ns - peer.last_ns < 30 * GONE_NS and not peer.ended
         }
         due = []
         for peer in self._peers.values():
@@ -185,25 +190,25 @@ class Ingest:
                 due.append((peer.routing_id, self._ack(peer)))
         return due
 
-    def requests(self, asks: Iterable[BackfillRequest]) -> list[tuple[bytes, wire.Request]]:
-        """What to send to whom; nothing to nodes that are gone, or do not know requests."""
+    def requests(self, due: Iterable[BackfillRequest]) -> list[tuple[bytes, wire.Request]]:
+        """Return each request with its routing id; drop those to nodes that are gone or do not know requests."""
         found = []
-        for ask in asks:
-            peers = (p for p in self._peers.values() if ask.array in p.hello.arrays and p.hello.answers and not p.ended)
-            peer = next(peers, None)
+        for request in due:
+            able = (peer for peer in self._peers.values() if peer.hello.answers and not peer.ended)
+            peer = next((peer for peer in able if request.array in peer.hello.arrays), None)
             if peer is not None:
-                wanted = {ask.array: (ask.first, ask.last + 1)}
+                wanted = {request.array: (request.first, request.last + 1)}
                 found.append((peer.routing_id, wire.Request(peer.hello.run_id, wanted)))
         return found
 
     def live_nodes(self, now_ns: int) -> list[wire.Hello]:
-        """Nodes heard from lately."""
-        return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.heard_ns < GONE_NS]
+        """Return the greetings of the nodes that have sent anything in the last `GONE_NS`."""
+        return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.last_ns < GONE_NS]
 
-    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Arrival:
+    def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Received:
         refusal = self._pretence(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
         if refusal is not None:
-            return Arrival(reply=wire.Ack(hello.run_id, {}, refused=refusal))
+            return Received(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
         known = self._peers.get(routing_id)
         unaware = not hello.answers and (known is None or known.hello.answers)
@@ -211,7 +216,7 @@ class Ingest:
         peer = Peer(routing_id, hello, now_ns)
         if same_run is not None:
             moved = same_run.routing_id != routing_id or hello.backlog.items() - same_run.hello.backlog.items()
-            peer.sequences = {} if moved else same_run.sequences  # live sound begins anew where some was kept
+            peer.sequences = {} if moved else same_run.sequences  # live sound begins anew after a backlog
             peer.received, peer.live = same_run.received, same_run.live
         peer.greet(hello)
         others = {
@@ -224,17 +229,17 @@ class Ingest:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         reply = self._ack(peer)
         if same_run is None:
-            return Arrival(joined=hello, reply=reply, offer=offer)
+            return Received(joined=hello, reply=reply, offer=offer)
         before = same_run.hello
         news = hello.backlog != before.backlog or hello.answers != before.answers
-        return Arrival(greeted=hello if news else None, reply=reply, offer=offer)
+        return Received(greeted=hello if news else None, reply=reply, offer=offer)
 
     def _ack(self, peer: Peer) -> wire.Ack:
-        settled = [self.settled[array] for array in peer.hello.arrays if array in self.settled]
-        return wire.Ack(peer.hello.run_id, dict(peer.received), min(settled, default=None))
+        final = [self.final_until[array] for array in peer.hello.arrays if array in self.final_until]
+        return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
     def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """A key speaks for the node that it was enrolled for, and for the arrays that are that node's."""
+        """Return why a key does not fit its greeting; it is valid for its node, and for the arrays of that node."""
         if enrolled is None:
             return None
         if hello.node != enrolled:
@@ -268,7 +273,7 @@ class Ingest:
             if key != routing_id
             and not peer.ended
             and peer.hello.run_id != hello.run_id
-            and now_ns - peer.heard_ns < GONE_NS
+            and now_ns - peer.last_ns < GONE_NS
         ]
         for other in others:
             if other.hello.replay != hello.replay:
@@ -280,9 +285,9 @@ class Ingest:
                 return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
         return None
 
-    def _reject(self, error: wire.WireError, now_ns: int) -> Arrival:
+    def _reject(self, error: wire.WireError, now_ns: int) -> Received:
         self.malformed += 1
         if now_ns - self._notice_ns >= NOTICE_NS:
             self._notice_ns = now_ns
             _log.warning("message refused (%d so far): %s", self.malformed, error)
-        return Arrival()
+        return Received()

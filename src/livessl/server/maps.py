@@ -1,7 +1,7 @@
-"""Power maps for people: one thread draws the newest window's, and only while somebody looks.
+"""Power maps for people, drawn on demand by a thread of their own, so that they never delay localization.
 
-Whoever looks says which array's map: a reader once, by `newest`; a watcher until he leaves, by `watching`. The windows
-themselves cost nothing to show: they hold what was heard, not maps.
+A reader gets the map of one array once, by `newest`; a watcher gets those of every window, by `watching`. A window
+costs nothing until it is drawn: it holds the evidence that maps are drawn from, not maps.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from livessl.core.locate.estimators import PowerMaps
 from livessl.core.types import Float32Array, Window
 
 FUSED: Final = "fused"
-"""The map of all arrays; no array's name in the API."""
+"""Name of the map of all arrays together, where the API takes an array's name."""
 
 VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
-"""A view and the axis that its projection takes the maximum over."""
+"""Axis over which the projection of each view takes the maximum."""
 
 INTERVAL_NS: Final = 100_000_000
-"""Between two drawings: people see no more than ten a second, and the sound comes first."""
+"""Shortest interval between two drawings, in nanoseconds: ten a second are enough for people."""
 
 PATIENCE_S: Final = 5.0
-"""How long a reader waits for a drawing, tables of a fine grid included."""
+"""Longest wait of a reader for a drawing, in seconds: the first one of a fine grid computes its tables."""
 
 HEADER: Final = struct.Struct("<4sBBHq7f2H")
-"""Of a picture in bytes: magic, version, view, length of this header, time_ns, age in seconds, least and greatest
-power, bounds of rows and columns in metres, numbers of rows and columns. docs/api.md tells it to clients."""
+"""Header of a picture in bytes: magic, version, view, length of this header, time_ns, age in seconds, least and
+greatest power, bounds of rows and columns in metres, numbers of rows and columns; docs/api.md describes it."""
 
 _MAGIC: Final = b"LMAP"
 _VERSION: Final = 1
@@ -42,12 +42,12 @@ _VERSION: Final = 1
 _log = logging.getLogger(__name__)
 
 Draw = Callable[[Window, frozenset[str]], PowerMaps]
-"""Maps of a window, with those of the arrays named."""
+"""Draws the fused map of a window, and those of the arrays named."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A projection of a power map, quantised: what a watcher is sent.
+    """A projection of a power map, quantised to 256 levels for watchers.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Picture:
     bounds_m : (float, float, float, float)
         Lowest and highest coordinate of the rows, then of the columns.
     levels : bytes
-        One each node, row by row, the first row at the lowest coordinate.
+        One for each grid point, row by row, the first row at the lowest coordinate.
     """
 
     view: str
@@ -73,7 +73,7 @@ class Picture:
     levels: bytes
 
     def packed(self, now_ns: int) -> bytes:
-        """Header and levels, as old as it is at site time `now_ns`."""
+        """Return header and levels; the header holds the picture's age at site time `now_ns`."""
         age_s = (now_ns - self.time_ns) / 1e9
         shape = (self.rows, self.columns)
         return (
@@ -95,16 +95,16 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A window's maps, and its pictures by array and view: None where the array did not hear it."""
+    """The maps of a window, and its pictures by array and view; None for an array that did not detect its sound."""
 
     window: Window
     maps: PowerMaps
     pictures: Mapping[tuple[str, str], Picture | None]
     arrays: frozenset[str]
-    """What was asked for; of them those that heard nothing have no map."""
+    """Arrays whose maps were requested; those that did not detect the sound have none."""
 
     def power(self, array: str) -> Float32Array | None:
-        """The map (G,) of an array, or the fused one; None where the array did not hear the window."""
+        """Return the map (G,) of an array, or the fused one; None if the array did not detect the window's sound."""
         return self.maps.fused if array == FUSED else self.maps.arrays.get(array)
 
 
@@ -116,18 +116,18 @@ class _Watcher:
 
 
 def projection(power: Float32Array, shape: tuple[int, int, int], view: str) -> Float32Array:
-    """The largest values along the axis that a view leaves out, (rows, columns): y or z upwards."""
+    """Return the largest values along the axis that a view leaves out, (rows, columns); rows go up in y or z."""
     return np.asarray(power.reshape(shape).max(axis=VIEWS[view]).T)
 
 
 def bounds_of_view_m(maps: PowerMaps, view: str) -> tuple[float, float, float, float]:
-    """Lowest and highest coordinate of a projection's rows, then of its columns."""
+    """Return the lowest and highest coordinate of a projection's rows, then of its columns."""
     columns, rows = (bounds for axis, bounds in enumerate(maps.grid.bounds_m) if axis != VIEWS[view])
     return (*rows, *columns)
 
 
 class Maps:
-    """The newest window, and the thread that draws it for whoever looks.
+    """The newest window, and the thread that draws it on demand. Every thread may call it.
 
     Parameters
     ----------
@@ -140,19 +140,21 @@ class Maps:
         self._newest: tuple[Window, Draw] | None = None
         self._drawn: Drawn | None = None
         self._drawn_ns = -INTERVAL_NS
-        self._asked: set[str] = set()
+        self._requested: set[str] = set()
         self._watchers: set[_Watcher] = set()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="maps", daemon=True)
         self.failure: BaseException | None = None
+        """The error that has ended the thread, if it has ended."""
         self.drawings = 0
+        """Drawings since the start."""
 
     def start(self) -> None:
-        """Begin to draw when asked."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End."""
+        """End the thread."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -160,42 +162,42 @@ class Maps:
             self._thread.join(timeout=PATIENCE_S)
 
     def show(self, window: Window, draw: Draw) -> None:
-        """There is a newer window, and this draws it."""
+        """Make this the newest window; the thread calls `draw` if a reader or watcher wants it."""
         with self._changed:
             self._newest = (window, draw)
             if self._watchers:
                 self._changed.notify_all()
 
     def clear(self) -> None:
-        """What was heard belongs to another time."""
+        """Drop the newest window and its drawing, because another run begins."""
         with self._changed:
             self._newest = self._drawn = None
 
     @property
     def drawn(self) -> Drawn | None:
-        """What was drawn last."""
+        """The last drawing."""
         return self._drawn
 
     @property
     def watchers(self) -> int:
-        """How many watch."""
+        """Number of watchers."""
         return len(self._watchers)
 
     def newest(self, array: str) -> Drawn | None:
-        """Maps of the newest window, an array's own among them if it heard anything: waits for the drawing.
+        """Wait for the maps of the newest window and return them, an array's own included if it detected the sound.
 
-        None before the first window, and where the drawing does not come.
+        None before the first window. After `PATIENCE_S` without a drawing, the last one there is.
         """
         with self._changed:
             if self._is_missing({array}, set()):
-                self._asked.add(array)
+                self._requested.add(array)
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._newest is None or array not in self._asked, PATIENCE_S)
+                self._changed.wait_for(lambda: self._newest is None or array not in self._requested, PATIENCE_S)
             return self._drawn
 
     @contextmanager
     def watching(self, array: str, views: tuple[str, ...], notify: Callable[[], None]) -> Iterator[None]:
-        """While the context lasts, every window's pictures are drawn, and `notify` called on the drawing thread."""
+        """Have the pictures of every window drawn while the context lasts; the thread calls `notify` after each."""
         watcher = _Watcher(array, views, notify)
         with self._changed:
             self._watchers.add(watcher)
@@ -216,7 +218,7 @@ class Maps:
             raise
 
     def _wait_until_wanted(self) -> bool:
-        """Return when there is something to draw and it is time; whether to go on at all."""
+        """Wait until there is something to draw and it is time; return false if the thread shall end."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopping or self._is_missing(*self._wanted()))
             pause_s = (self._drawn_ns + INTERVAL_NS - self._clock.monotonic_ns()) / 1e9
@@ -225,12 +227,12 @@ class Maps:
             return not self._stopping
 
     def _wanted(self) -> tuple[set[str], set[tuple[str, str]]]:
-        """Arrays whose maps, and pictures that somebody waits for or watches."""
+        """Return the arrays whose maps, and the pictures, that readers or watchers want."""
         pictures = {(watcher.array, view) for watcher in self._watchers for view in watcher.views}
-        return self._asked | {array for array, _ in pictures}, pictures
+        return self._requested | {array for array, _ in pictures}, pictures
 
     def _is_missing(self, arrays: set[str], pictures: set[tuple[str, str]]) -> bool:
-        """Whether any of these is not drawn yet, though it could be."""
+        """Return whether any of these could be drawn and is not."""
         if self._newest is None or not arrays:
             return False
         drawn = self._drawn
@@ -249,9 +251,9 @@ class Maps:
         drawn = Drawn(window, maps, _pictures(window, maps, pictures), frozenset(arrays))
         with self._changed:
             if self._newest is None or self._newest[1] != draw:
-                return  # another time has begun meanwhile
+                return  # another run has begun meanwhile
             self._drawn = drawn
-            self._asked -= arrays
+            self._requested -= arrays
             self.drawings += 1
             for watcher in self._watchers:
                 watcher.notify()

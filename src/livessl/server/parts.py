@@ -11,7 +11,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
-from livessl.server.receiver import Source
+from livessl.server.receiver import Inbox
 from livessl.server.refusals import Refusals
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
@@ -22,11 +22,11 @@ from livessl.site.models import Site
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """What runs in a server, and what it shares."""
+    """Everything that runs in a server, and everything that its parts share."""
 
     site: Site
     clock: Clock
-    receiver: Source
+    receiver: Inbox
     refusals: Refusals
     engine: Engine
     site_time: SiteTime

@@ -1,4 +1,4 @@
-"""The nodes' socket and the thread that drains it: what they send, in order, into one bounded queue."""
+"""The nodes' socket, and the thread that moves what they send, in order, into one bounded queue."""
 
 from __future__ import annotations
 
@@ -25,25 +25,27 @@ from livessl.site.keys import server_keys
 from livessl.site.models import Site
 
 POLL_MS: Final = 20
-"""How long the thread waits for sound before it looks whether acknowledgements are due."""
+"""Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
 QUEUE_MESSAGES: Final = 1000
-"""Ten seconds of five arrays. When it is full the socket is left alone, and nodes keep their sound themselves."""
+"""Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
 
 BUSY_MESSAGES: Final = 100
-"""While so many wait, nodes are not asked for what they have kept: live sound would wait behind it."""
+"""While as many messages wait, acknowledgements do not hurry, so that live sound does not wait behind backlogs."""
 
 _log = logging.getLogger(__name__)
 
 
 class BindError(RunError):
-    """The server's address cannot be taken."""
+    """An address of the server cannot be taken."""
 
 
 def address_cure(number: int | None) -> str:
-    """What to do about an address that cannot be taken, by the system's error number."""
+    """Return the cure for an address that cannot be taken, by the system's error number."""
     if number == errno.EADDRINUSE:
         return "is another server running? Stop it or choose another port"
+    if number == errno.EACCES:
+        return "choose a port from 1024 on"
     return "write an address of this machine"
 
 
@@ -56,14 +58,14 @@ class Joined:
 
 @dataclass(frozen=True, slots=True)
 class Greeted:
-    """A node tells anew what it has kept: more after an interruption, nothing when all of it is sent."""
+    """A node has greeted again with another backlog: more after an interruption, none once all of it is sent."""
 
     hello: wire.Hello
 
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """A node has ended on purpose."""
+    """A node has said good-bye."""
 
     hello: wire.Hello
 
@@ -71,12 +73,12 @@ class Left:
 Item = Message | Joined | Greeted | Left
 
 
-class Source(Protocol):
-    """What a server needs of its nodes' side: the receiver, or in a simulation whatever stands in for it."""
+class Inbox(Protocol):
+    """The origin of the nodes' messages: a `Receiver`, or its stand-in in a simulation."""
 
     @property
     def ingest(self) -> Ingest:
-        """What is known of the connected nodes."""
+        """The protocol, which knows the connected nodes."""
         ...
 
     @property
@@ -86,7 +88,7 @@ class Source(Protocol):
 
     @property
     def refusals(self) -> Refusals:
-        """Who was turned away."""
+        """The peers and requests that were refused."""
         ...
 
     @property
@@ -109,11 +111,11 @@ class Source(Protocol):
         ...
 
     def stop(self) -> None:
-        """Stop to receive, and release the address."""
+        """End, and release the address."""
         ...
 
     def take(self, most: int, wait_s: float) -> list[Item]:
-        """Return what has arrived, in order; wait up to `wait_s` for the first item."""
+        """Return up to `most` items that have arrived, in order; wait up to `wait_s` for the first one."""
         ...
 
     def request(self, request: BackfillRequest) -> None:
@@ -122,7 +124,7 @@ class Source(Protocol):
 
 
 class Receiver:
-    """ROUTER socket, greetings, acknowledgements.
+    """The ROUTER socket and its thread.
 
     Parameters
     ----------
@@ -132,9 +134,9 @@ class Receiver:
     Raises
     ------
     BindError
-        Where the address is taken.
+        If the address is taken.
     ConfigError
-        Where the site uses keys that cannot be read.
+        If the site uses keys that cannot be read.
     """
 
     def __init__(self, site: Site, clock: Clock) -> None:
@@ -172,19 +174,24 @@ class Receiver:
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and give the address back."""
+        """End, and release the address."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
         self._socket.close()
         self._context.term()
 
+    @property
+    def queued(self) -> int:
+        """Number of items in the queue."""
+        return self._queue.qsize()
+
     def request(self, request: BackfillRequest) -> None:
         """Send a request for missing frames to the node of an array; from any thread."""
         self._requests.append(request)
 
     def take(self, most: int, wait_s: float) -> list[Item]:
-        """What has arrived, in order: waits for the first item, then takes what is there."""
+        """Return up to `most` items that have arrived, in order; wait up to `wait_s` for the first one."""
         items: list[Item] = []
         try:
             items.append(self._queue.get(timeout=wait_s))
@@ -217,20 +224,20 @@ class Receiver:
                 return
             routing_id, data = address.bytes, b"".join(part.bytes for part in parts)
             enrolled = str(parts[0].get("User-Id")) if self._guarded else None
-            arrival = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
-            if arrival.joined is not None:
-                self._put(Joined(arrival.joined))
-            if arrival.greeted is not None:
-                self._put(Greeted(arrival.greeted))
-            if arrival.left is not None:
-                self._put(Left(arrival.left))
-            if arrival.message is not None:
-                self.arrivals.note(arrival.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
-                self._put(arrival.message)
-            if arrival.offer is not None:
-                self._reply(routing_id, arrival.offer)
-            if arrival.reply is not None:
-                self._reply(routing_id, arrival.reply)
+            received = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
+            if received.joined is not None:
+                self._put(Joined(received.joined))
+            if received.greeted is not None:
+                self._put(Greeted(received.greeted))
+            if received.left is not None:
+                self._put(Left(received.left))
+            if received.message is not None:
+                self.arrivals.note(received.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+                self._put(received.message)
+            if received.offer is not None:
+                self._reply(routing_id, received.offer)
+            if received.reply is not None:
+                self._reply(routing_id, received.reply)
 
     def _put(self, item: Item) -> None:
         while not self._stop.is_set():
@@ -242,7 +249,7 @@ class Receiver:
                 return
 
     def _acknowledge(self) -> None:
-        soon = self._queue.qsize() < BUSY_MESSAGES
+        soon = self.queued < BUSY_MESSAGES
         for routing_id, ack in self.ingest.acknowledgements(self._clock.monotonic_ns(), soon=soon):
             self._reply(routing_id, ack)
 
@@ -254,5 +261,5 @@ class Receiver:
     def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request) -> None:
         try:
             self._socket.send_multipart([routing_id, wire.encode(reply)], zmq.NOBLOCK)
-        except zmq.ZMQError as error:  # it is gone or reads nothing; it will say hello again
-            _log.debug("no answer to %r: %s", routing_id, error)
+        except zmq.ZMQError as error:  # the node is gone or does not read; it will greet again
+            _log.debug("no reply to %r: %s", routing_id, error)

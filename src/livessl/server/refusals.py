@@ -1,4 +1,4 @@
-"""Who was turned away, at either door: counted without bound, remembered and logged with one."""
+"""Refused nodes and clients: all are counted, and a bounded number is remembered and logged."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from typing import Final
 from livessl.clock import Clock
 
 MAX_KNOWN: Final = 256
-"""Callers remembered by address. Whoever comes from more of them than that is only counted."""
+"""Most callers remembered by address and reason; the refusals of any further ones are only counted."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """One caller that was turned away for one reason, and how often."""
+    """The refusals of one caller for one reason.
+
+    `door` is `nodes` or `http`, `who` the address, `last_ns` the site time of the last refusal.
+    """
 
     door: str
     who: str
@@ -27,7 +30,7 @@ class Refused:
 
 
 class Refusals:
-    """Everyone who was refused since the start; from any thread.
+    """Everyone who was refused since the start. Every thread may call it.
 
     Parameters
     ----------
@@ -41,7 +44,10 @@ class Refusals:
         self._known: dict[tuple[str, str, str], Refused] = {}
 
     def note(self, door: str, who: str, reason: str) -> None:
-        """Somebody was refused: at the door `nodes` or `http`, from an address, for a reason of a fixed text."""
+        """Count a refusal; only the first one of a caller for a reason is logged.
+
+        `reason` is one of a few fixed texts, because it labels a metric.
+        """
         with self._lock:
             self._counts[door, reason] = self._counts.get((door, reason), 0) + 1
             key = (door, who, reason)
@@ -54,15 +60,15 @@ class Refusals:
             _log.warning("%s: %s was refused: %s (told once, counted in /metrics)", door, who, reason)
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """How many were refused, by door and reason."""
+        """Return the number of refusals by door and reason."""
         with self._lock:
             return dict(self._counts)
 
     def count(self, door: str) -> int:
-        """How many were refused at a door."""
+        """Return the number of refusals at a door."""
         return sum(count for (where, _), count in self.counts().items() if where == door)
 
     def known(self) -> list[Refused]:
-        """The callers that are remembered, the latest first."""
+        """Return the remembered callers, the latest first."""
         with self._lock:
             return sorted(self._known.values(), key=lambda refused: -refused.last_ns)

@@ -1,4 +1,4 @@
-"""Where events go besides subscribers and the store. Each kind is a name in `SINKS`, chosen in the site file."""
+"""Sinks: further places that get every event. Each kind has a name in `SINKS`, chosen in the site file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from livessl.errors import RunError
 from livessl.server.api.encode import JsonObject
-from livessl.site.models import SinkConfig
+from livessl.site.server_models import SinkConfig
 
 _log = logging.getLogger(__name__)
 
@@ -20,19 +20,19 @@ class SinkError(RunError):
 
 
 class Sink(Protocol):
-    """Takes events, one by one, on the engine's thread."""
+    """Takes events, one by one, on the fusion thread."""
 
     def take(self, event: JsonObject) -> None:
         """Deliver one event."""
         ...
 
     def close(self) -> None:
-        """Deliver what is held back, and end."""
+        """Deliver what is still buffered, and release what is open."""
         ...
 
 
 class JsonLines:
-    """One event a line, appended to a file that `tail -f` and every log shipper can follow."""
+    """Appends each event as a line of JSON to a file that `tail -f` and every log shipper can follow."""
 
     def __init__(self, config: SinkConfig) -> None:
         try:
@@ -51,18 +51,19 @@ class JsonLines:
 
 
 SINKS: Final[dict[str, Callable[[SinkConfig], Sink]]] = {"jsonl": JsonLines}
-"""Name in the site file, and what makes it."""
+"""Factory of each kind of sink, by its name in the site file."""
 
 
 class Sinks:
-    """All of a site's sinks; one that fails is reported and does not hinder the others."""
+    """All sinks of a site; one that fails is logged and counted, and does not hinder the others."""
 
     def __init__(self, configs: Sequence[SinkConfig]) -> None:
         self._sinks = [(config.type, SINKS[config.type](config)) for config in configs]
         self.failures = 0
+        """Events that a sink did not take."""
 
     def take(self, event: JsonObject) -> None:
-        """Deliver an event to each."""
+        """Deliver an event to every sink."""
         for name, sink in self._sinks:
             try:
                 sink.take(event)
@@ -71,9 +72,9 @@ class Sinks:
                 _log.error("sink %r did not take event %s: %s", name, event["id"], error)
 
     def close(self) -> None:
-        """End all."""
+        """Close every sink."""
         for name, sink in self._sinks:
             try:
                 sink.close()
             except OSError as error:
-                _log.error("sink %r did not end well: %s", name, error)
+                _log.error("sink %r was not closed cleanly: %s", name, error)

@@ -13,7 +13,7 @@ REPLAY_SILENT_NS: Final = 5_000_000_000
 
 
 class SiteTime:
-    """Whether the server runs live or replays a recording, and the site time of that run.
+    """The mode of the server, live or replay, and the site time of that run.
 
     The fusion thread changes it; every thread may read it.
 
@@ -30,7 +30,7 @@ class SiteTime:
         self.started_ns = clock.now_ns()
         """Site time at which the server started, nanoseconds."""
         self.replay_is_running = False
-        """Whether a replay still sends sound; after its end the mode stays `replay` until a live node joins."""
+        """True while a replay sends sound; after its end the mode stays `replay` until a live node joins."""
 
     @property
     def mode(self) -> Literal["live", "replay"]:
@@ -39,7 +39,7 @@ class SiteTime:
 
     @property
     def is_replay(self) -> bool:
-        """Whether the mode is `replay`."""
+        """True if the mode is `replay`."""
         return self._replayed_ns is not None
 
     def now_ns(self) -> int:
@@ -63,7 +63,7 @@ class SiteTime:
         self.note_sound()
 
     def end_replay(self) -> None:
-        """Stop to wait for the recording's sound; site time stays at its end."""
+        """Expect no more sound of the recording; site time stays at its end."""
         self.replay_is_running = False
 
     def advance(self, messages: Iterable[Message]) -> None:

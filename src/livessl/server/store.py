@@ -17,14 +17,14 @@ from livessl.errors import RunError
 from livessl.server.api.encode import JsonObject
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
-"""About 10 MB. A file has no such limit."""
+"""Most events kept in memory, about 10 MB; a file has no such limit."""
 
 BUSY_S: Final = 0.2
-"""How long an event waits for a file that another program holds: the engine's thread waits with it."""
+"""Longest wait, in seconds, for a file that another program holds; the fusion thread waits as long."""
 
 
 class Cursor(NamedTuple):
-    """The last event of a page: the next page begins after it."""
+    """Position of the last event of a page; the next page begins after it."""
 
     time_ns: int
     number: int
@@ -34,12 +34,12 @@ class Cursor(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Cursor:
-        """The cursor of a text.
+        """Return the cursor that `str` made this text of.
 
         Raises
         ------
         ValueError
-            Where none was ever told so.
+            If the text is not that of a cursor.
         """
         parts = re.fullmatch(r"(-?[0-9]{1,19})-([0-9]{1,19})", text, re.ASCII)
         cursor = None if parts is None else cls(*map(int, parts.groups()))
@@ -50,7 +50,10 @@ class Cursor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Which events: times in nanoseconds since the epoch, both ends included; `before` is a page's cursor."""
+    """A search for events: times in nanoseconds since the epoch, both ends included.
+
+    `before` is the cursor of the page before.
+    """
 
     since_ns: int | None = None
     until_ns: int | None = None
@@ -61,7 +64,7 @@ class Query:
 
 
 class Finalized(NamedTuple):
-    """How far the final pass has come.
+    """Progress of the final pass.
 
     Parameters
     ----------
@@ -76,13 +79,13 @@ class Finalized(NamedTuple):
 
 
 class StoreError(RunError):
-    """The file cannot be used, or takes no more."""
+    """The database cannot be read or written."""
 
 
 class Store:
-    """Keeps events; safe to call from any thread.
+    """Keeps events, and what a restarted server must know; every thread may call it.
 
-    A file is read over a connection of its own, so that no slow query holds up an event.
+    A file has one connection for writing and one for reading, so that no slow query delays an event.
 
     Parameters
     ----------
@@ -96,13 +99,14 @@ class Store:
             self._writing = self._reading = _Connection(path or ":memory:")
             with self._writing.lock, self._writing.db as db:
                 db.execute("PRAGMA journal_mode=WAL")
-                db.execute("PRAGMA secure_delete=ON")  # what is deleted is overwritten
+                db.execute("PRAGMA secure_delete=ON")  # deleted rows are overwritten
                 db.execute(
                     "CREATE TABLE IF NOT EXISTS events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, "
                     "time_ns INTEGER, confidence REAL, json TEXT)"
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
                 db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
+                # existing databases have these names: `settled` stands for final, `raster` for frame index
                 db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
                 db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
                 db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
@@ -114,12 +118,12 @@ class Store:
             ) from error
 
     def add(self, event: JsonObject, time_ns: int, *, early: bool = False) -> None:
-        """Keep an event in place of one of the same id; an early one stays early until its time is final.
+        """Keep an event in place of one of the same id; an early one counts as early until `finalize` passes its time.
 
         Raises
         ------
         StoreError
-            Where the file is locked, or its disk is full.
+            If the file is locked, or its disk is full.
         """
         with self._kept(f"event {event['id']!r} was") as db:
             self._insert(db, event, time_ns)
@@ -134,14 +138,25 @@ class Store:
         frame_index: int,
         clocks: JsonObject,
     ) -> None:
-        """Keep events that stay, in place of others; before a frame index all others stay too. All or nothing.
+        """Keep what the final pass found, all or nothing.
 
-        With them goes what is known of the clocks, by which the frame indices of arrays are those of the site.
+        Parameters
+        ----------
+        site : str
+            Name of the site.
+        events : sequence of (JsonObject, int)
+            Final events, each with its start in nanoseconds of site time.
+        replaced : iterable of str
+            Ids of early events to delete.
+        frame_index : int
+            All other events before it become final as they are.
+        clocks : JsonObject
+            What is known of the arrays' clocks, which relates their frame indices to those of the site.
 
         Raises
         ------
         StoreError
-            Where the file is locked, or its disk is full.
+            If the file is locked, or its disk is full.
         """
         with self._kept(f"{len(events)} events were") as db:
             db.executemany("DELETE FROM events WHERE id = ?", [(old,) for old in replaced])
@@ -165,17 +180,17 @@ class Store:
         return Finalized(int(frame_index), None if clocks is None else json.loads(clocks))
 
     def disabled(self, site: str) -> frozenset[str]:
-        """The arrays of the site that are not to be used."""
+        """Return the names of the site's disabled arrays."""
         rows = self._reading.rows("SELECT array FROM disabled WHERE site = ?", (site,))
         return frozenset(array for (array,) in rows)
 
     def enable(self, site: str, array: str, enabled: bool) -> None:
-        """Remember whether an array is to be used.
+        """Remember whether an array is enabled.
 
         Raises
         ------
         StoreError
-            Where the file is locked, or its disk is full.
+            If the file is locked, or its disk is full.
         """
         sql = (
             "DELETE FROM disabled WHERE site = ? AND array = ?"
@@ -219,12 +234,12 @@ class Store:
             raise StoreError(f"server.events_db: {what} not kept: {error}; free space or release the file") from error
 
     def expire(self, before_ns: int) -> int:
-        """Delete what began before a time, so that the file holds nothing of it any more; returns how many.
+        """Delete the events that began before a time, and overwrite them in the file; return their number.
 
         Raises
         ------
         StoreError
-            Where the file is locked.
+            If the file is locked.
         """
         try:
             with self._writing.lock:
@@ -238,12 +253,12 @@ class Store:
         return gone
 
     def get(self, event_id: str) -> JsonObject | None:
-        """The event of that id."""
+        """Return the event of that id, None if there is none."""
         rows = self._reading.rows("SELECT json FROM events WHERE id = ?", (event_id,))
         return dict(json.loads(rows[0][0])) if rows else None
 
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
-        """Events newest first by their time, and the cursor of the next page or None."""
+        """Return events, newest first by their time, and the cursor of the next page or None."""
         conditions: dict[str, tuple[Any, ...]] = {
             "time_ns >= ?": (query.since_ns,),
             "time_ns <= ?": (query.until_ns,),
@@ -251,16 +266,16 @@ class Store:
             "(time_ns, number) < (?, ?)": query.before or (None,),
             "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": (query.zone,),
         }
-        asked = {text: values for text, values in conditions.items() if values != (None,)}
-        where = f"WHERE {' AND '.join(asked)} " if asked else ""
+        used = {text: values for text, values in conditions.items() if values != (None,)}
+        where = f"WHERE {' AND '.join(used)} " if used else ""
         sql = f"SELECT time_ns, number, json FROM events {where}ORDER BY time_ns DESC, number DESC LIMIT ?"  # noqa: S608 - fixed texts
-        rows = self._reading.rows(sql, (*(value for values in asked.values() for value in values), query.limit + 1))
+        rows = self._reading.rows(sql, (*(value for values in used.values() for value in values), query.limit + 1))
         page = rows[: query.limit]
-        following = Cursor(*page[-1][:2]) if len(rows) > query.limit else None
-        return [json.loads(text) for _, _, text in page], following
+        next_page = Cursor(*page[-1][:2]) if len(rows) > query.limit else None
+        return [json.loads(text) for _, _, text in page], next_page
 
     def count(self) -> int:
-        """How many events are kept."""
+        """Return the number of events."""
         return int(self._reading.rows("SELECT count(*) FROM events")[0][0])
 
     def close(self) -> None:
@@ -271,7 +286,7 @@ class Store:
 
 
 class _Connection:
-    """A connection to the database, and the lock that whoever uses it holds."""
+    """A connection to the database, and the lock that guards its use."""
 
     def __init__(self, path: Path | str) -> None:
         self.lock = threading.Lock()
@@ -279,6 +294,6 @@ class _Connection:
         self.db = sqlite3.connect(path, timeout=BUSY_S, check_same_thread=False, uri=uri)
 
     def rows(self, sql: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """All rows of a query."""
+        """Return all rows of a query."""
         with self.lock:
             return self.db.execute(sql, values).fetchall()

@@ -1,4 +1,4 @@
-"""The site file: models, reading, checks, secrets, and `build`, which makes core objects of it.
+"""The site file: its models, reading, checks, keys and tokens, and `build`, which makes core objects from it.
 
-It opens no device and no socket.
+This package opens no device and no socket.
 """

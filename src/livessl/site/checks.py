@@ -1,4 +1,4 @@
-"""What is wrong with a site beyond its types: its parts held side by side, arrays against room, grid and nodes."""
+"""Checks of a whole site: arrays against room, grid and nodes, names, and what other machines can reach."""
 
 from __future__ import annotations
 
@@ -11,75 +11,32 @@ import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import microphone_pairs
-from livessl.core.joint_array import joined
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
+from livessl.errors import Fault
+from livessl.site.addresses import is_loopback
 from livessl.site.build.grid import search_grid
-from livessl.site.models import METHODS, Bounds, Site, is_loopback
+from livessl.site.fields import Bounds
+from livessl.site.findings import Finding, Place, unknown_array
+from livessl.site.models import METHODS, Site
+from livessl.site.node_models import NodeConfig
 
 COINCIDENT_M: Final = 1e-3
-"""Two microphones nearer than this are a slip of the pen: no capsule is that small."""
+"""Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
 
-MOST_NODES: Final = 50_000_000
-"""Of a grid: the search would take more, but every node is looked at once when a node joins, some tens of ns each."""
+MAX_GRID_POINTS: Final = 50_000_000
+"""Most points of a grid. The search could handle more, but a grid point takes some tens of ns when an array joins."""
 
-SAMPLED_NODES: Final = 500
-"""Nodes, about, at which the grid is held against an array: enough for a median."""
-
-Place = tuple[str | int, ...]
-"""Where something stands in the file: keys and indices from its top down."""
-
-Finding = tuple[Place, str]
-"""What is wrong somewhere."""
+SAMPLED_GRID_POINTS: Final = 500
+"""Approximate number of grid points at which `_wide_arrays` compares the grid with an array: enough for a median."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
-def processed_specs(site: Site) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
-    """The arrays as they are processed; where a joint one is wrong, those that it joins stay apart."""
-    known = {spec.name: spec for spec in site.specs}
-    wrong = [*_joint_faults(site)]
-    at_fault = {path[1] for path, _ in wrong}
-    joint: list[ArraySpec] = []
-    for name, members in site.joint.items():
-        if name in at_fault or not set(members) <= set(known):
-            continue
-        nodes = {member: site.node_of(member) for member in members}
-        clocks = {member: f"node {node!r}" if node else "no node" for member, node in nodes.items()}
-        try:
-            joint.append(joined([known[member] for member in members], clocks, name))
-        except ValueError as error:
-            wrong.append((("joint", name), str(error).removeprefix(f"array {name!r}: ")))
-    taken = {member for spec in joint for member in site.joint[spec.name]}
-    return (*(spec for spec in site.specs if spec.name not in taken), *joint), wrong
-
-
-def _joint_faults(site: Site) -> Iterator[Finding]:
-    """What is wrong with joint arrays before their microphones are looked at."""
-    used: dict[str, str] = {}
-    for name, members in site.joint.items():
-        if name in site.arrays:
-            yield ("joint", name), "expected another name: an array is called so already; rename it"
-        for member in members:
-            here: Place = ("joint", name, member)
-            if member not in site.arrays:
-                yield here, f"no such array; arrays are {', '.join(site.arrays)}"
-            elif member in used:
-                yield here, f"already joined in {used[member]!r}; take it away here or there"
-            used[member] = name
-        offsets_s = {site.arrays[member].wav_offset_s for member in members if member in site.arrays}
-        if len(offsets_s) > 1:
-            each = ", ".join(f"{offset_s:g}" for offset_s in sorted(offsets_s))
-            yield ("joint", name), f"expected arrays of one wav_offset_s, since they are recorded together, got {each}"
-
-
 def cross_faults(site: Site) -> Iterator[Finding]:
-    """Faults that only show when parts of the file are held side by side."""
+    """Yield faults that only show when parts of the file are compared with each other."""
     if site.speed_of_sound_m_s is not None and site.temperature_c is not None:
-        yield (
-            ("temperature_c",),
-            "expected either speed_of_sound_m_s or temperature_c, got both; take one away",
-        )
+        yield ("temperature_c",), "expected either speed_of_sound_m_s or temperature_c, got both; remove one"
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
     if site.fusion.method not in METHODS:
@@ -96,11 +53,40 @@ def cross_faults(site: Site) -> Iterator[Finding]:
     for place, bounds in ((("grid", "bounds_m"), site.grid.bounds_m), *boxes.items()):
         yield from ((place, what) for what in _outside(site, bounds))
     for spec in site.specs:
-        yield from _array_faults(site, spec)
+        yield from ((("arrays", spec.name), what) for what in _array_faults(site, spec))
     for name in {spec.name for spec in site.processed} & set(site.joint):
-        yield from ((("joint", name), what) for what in _touching(site, site.joint[name]))
+        yield from ((("joint", name), what) for what in _coincident_members(site, site.joint[name]))
     yield from _grid_faults(site)
     yield from _node_faults(site)
+
+
+def warnings_of(site: Site) -> tuple[str, ...]:
+    """Return warnings about settings that are valid but unlikely to work as expected."""
+    return (*_wide_arrays(site), *_privacy_gaps(site))
+
+
+def unprotected_addresses(site: Site) -> list[Fault]:
+    """Return addresses that other machines can reach although no tokens or keys protect them."""
+    faults = []
+    http, bind = site.server.http, site.server.bind
+    if not is_loopback(http.host) and http.tokens is None:
+        faults.append(
+            Fault(
+                "server.http.host",
+                f"{http.host!r} can be reached from other machines, and anyone there could look: set "
+                "server.http.tokens: tokens.yaml and make a token with `livessl keys token`, or use 127.0.0.1",
+            )
+        )
+    scheme, _, rest = bind.partition("://")
+    if scheme == "tcp" and not is_loopback(rest.rpartition(":")[0]) and site.keys is None:
+        faults.append(
+            Fault(
+                "server.bind",
+                f"{bind!r} can be reached from other machines, and anyone there could send: set keys: keys and make "
+                "them with `livessl keys server` and `livessl keys node`, or use tcp://127.0.0.1:PORT",
+            )
+        )
+    return faults
 
 
 def _name_faults(site: Site) -> Iterator[Finding]:
@@ -121,32 +107,26 @@ def _outside(site: Site, bounds: Bounds | None) -> Iterator[str]:
             )
 
 
-def _array_faults(site: Site, spec: ArraySpec) -> Iterator[Finding]:
+def _array_faults(site: Site, spec: ArraySpec) -> Iterator[str]:
     positions = spec.microphones_m
-    for i in range(len(positions)):
-        for k in range(i + 1, len(positions)):
-            if np.linalg.norm(positions[i] - positions[k]) < COINCIDENT_M:
-                yield (
-                    ("arrays", spec.name),
-                    f"microphones {i + 1} and {k + 1} are at one place {_xyz(positions[i])}; correct one of them",
-                )
+    for i, k in combinations(range(len(positions)), 2):
+        if np.linalg.norm(positions[i] - positions[k]) < COINCIDENT_M:
+            yield f"microphones {i + 1} and {k + 1} are at one place {_xyz(positions[i])}; correct one of them"
     size = np.array(site.room.size_m)
-    outside = [k for k, position in enumerate(positions) if (position < 0).any() or (position > size).any()]
-    if outside:
-        k = outside[0]
-        yield (
-            ("arrays", spec.name),
-            f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; "
-            "correct the array's position or room.size_m",
-        )
+    outside = ((positions < 0) | (positions > size)).any(axis=1)
+    if outside.any():
+        k = int(outside.argmax())
+        in_mm = bool(((positions >= 0) & (positions <= 1000 * size)).all() and (positions.max(axis=1) > 100).all())
+        cure = "give metres, not millimetres" if in_mm else "correct the array's position or room.size_m"
+        yield f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; {cure}"
 
 
-def _touching(site: Site, members: Sequence[str]) -> Iterator[str]:
+def _coincident_members(site: Site, members: Sequence[str]) -> Iterator[str]:
     for one, other in combinations(members, 2):
         between_m = site.array(one).microphones_m[:, None] - site.array(other).microphones_m
-        apart_m = np.linalg.norm(between_m, axis=2)
-        if apart_m.min() < COINCIDENT_M:
-            i, k = np.unravel_index(apart_m.argmin(), apart_m.shape)
+        distances_m = np.linalg.norm(between_m, axis=2)
+        if distances_m.min() < COINCIDENT_M:
+            i, k = np.unravel_index(distances_m.argmin(), distances_m.shape)
             yield (
                 f"microphone {i + 1} of {one!r} and microphone {k + 1} of {other!r} are at one place "
                 f"{_xyz(site.array(one).microphones_m[i])}; correct one of them"
@@ -155,29 +135,69 @@ def _touching(site: Site, members: Sequence[str]) -> Iterator[str]:
 
 def _grid_faults(site: Site) -> Iterator[Finding]:
     grid = search_grid(site)
-    if grid.size > MOST_NODES:
-        fits = site.grid.spacing_m * (grid.size / MOST_NODES) ** (1 / max(1, len(grid.free_axes)))
+    if grid.size > MAX_GRID_POINTS:
+        fits = site.grid.spacing_m * (grid.size / MAX_GRID_POINTS) ** (1 / max(1, len(grid.free_axes)))
         yield (
             ("grid", "spacing_m"),
-            f"a grid of {grid.size:,} nodes takes too long to set up, allowed are {MOST_NODES:,}; use a spacing of "
+            f"expected at most {MAX_GRID_POINTS:,} grid points, got {grid.size:,}; use a spacing of "
             f"{np.ceil(fits * 1000) / 1000:g} m or more, or smaller bounds_m",
         )
 
 
-def wide_arrays(site: Site) -> Iterator[str]:
-    """What is said of arrays whose peaks the grid steps over.
+def _node_faults(site: Site) -> Iterator[Finding]:
+    claimed: dict[str, str] = {}
+    for node_name, node in site.nodes.items():
+        if site.privacy == "positions-only" and node.spool.directory is not None:
+            yield (
+                ("nodes", node_name, "spool", "directory"),
+                "with privacy: positions-only no sound may be stored on a disk; remove it to keep frames in memory",
+            )
+        used: dict[int, str] = {}
+        for name, channels in node.arrays.items():
+            here: Place = ("nodes", node_name, "arrays", name)
+            if name not in site.arrays:
+                yield here, unknown_array(name, site.arrays)
+                continue
+            if name in claimed:
+                yield here, f"already captured by node {claimed[name]!r}; remove it from one of the nodes"
+            claimed[name] = node_name
+            for channel in channels:
+                if channel in used:
+                    yield here, f"channel {channel} is already used by {used[channel]!r}; correct one of them"
+                used[channel] = name
+            spec = next((spec for spec in site.specs if spec.name == name), None)
+            if spec is not None:
+                yield from ((here, what) for what in _capture_faults(node, spec, channels))
 
-    That is where, at half of all nodes and pairs or more, the delay changes by over half a period from a node to a
-    corner of its cell.
+
+def _capture_faults(node: NodeConfig, spec: ArraySpec, channels: Sequence[int]) -> Iterator[str]:
+    if len(channels) != len(spec.microphones_m):
+        yield (
+            f"expected {len(spec.microphones_m)} channels, one for each microphone of {spec.name!r}, "
+            f"got {len(channels)}"
+        )
+    rate, high = node.device.sample_rate_hz, spec.band_hz[1]
+    if rate is not None and high >= rate / 2:
+        yield (
+            f"band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, the device has {rate:g} Hz; "
+            "lower band_hz or raise sample_rate_hz"
+        )
+
+
+def _wide_arrays(site: Site) -> Iterator[str]:
+    """Yield a warning for each array whose peaks are narrower than the grid.
+
+    These are arrays for which, at half of all grid points and pairs or more, the delay changes by over half a period
+    from a grid point to a corner of its cell.
     """
     grid = search_grid(site)
-    nodes = grid.nodes_m(slice(0, grid.size, grid.size // SAMPLED_NODES | 1))
+    points_m = grid.nodes_m(slice(0, grid.size, grid.size // SAMPLED_GRID_POINTS | 1))
     reach_m = grid.spacing_m * len(grid.free_axes) ** 0.5 / 2.0
     for spec in site.processed:
         if reach_m == 0.0 or uses_envelope(spec.band_hz):
             continue
         pairs, high = microphone_pairs(len(spec.microphones_m)), spec.band_hz[1]
-        kept = float(np.median(alias_free_hz(nodes, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        kept = float(np.median(alias_free_hz(points_m, spec.microphones_m, pairs, reach_m, site.c_m_s)))
         cure = f"take joint.{spec.name} away" if spec.name in site.joint else "make arrays smaller"
         if kept < high:
             yield (
@@ -187,8 +207,8 @@ def wide_arrays(site: Site) -> Iterator[str]:
             )
 
 
-def leaks(site: Site) -> Iterator[str]:
-    """What is let in or kept although the file seems to say otherwise."""
+def _privacy_gaps(site: Site) -> Iterator[str]:
+    """Yield a warning for data that is readable, or kept, although the file seems to prevent it."""
     http, days = site.server.http, site.store.retention_days
     if http.tokens is not None and http.certificate is None and not is_loopback(http.host):
         yield (
@@ -197,43 +217,6 @@ def leaks(site: Site) -> Iterator[str]:
         )
     if days is not None and site.server.sinks:
         yield f"store.retention_days: {days:g} days do not reach server.sinks; rotate those files yourself"
-
-
-def _node_faults(site: Site) -> Iterator[Finding]:
-    claimed: dict[str, str] = {}
-    for node_name, node in site.nodes.items():
-        used: dict[int, str] = {}
-        if site.privacy == "positions-only" and node.spool.directory is not None:
-            yield (
-                ("nodes", node_name, "spool", "directory"),
-                "with privacy: positions-only no sound is kept on a disk; take it away, and it is kept in memory",
-            )
-        for name, channels in node.arrays.items():
-            here: Place = ("nodes", node_name, "arrays", name)
-            if name not in site.arrays:
-                yield here, f"no such array; arrays are {', '.join(site.arrays)}"
-                continue
-            if name in claimed:
-                yield here, f"already captured by node {claimed[name]!r}; an array belongs to one node"
-            claimed[name] = node_name
-            spec = next((spec for spec in site.specs if spec.name == name), None)
-            if spec is not None and len(channels) != len(spec.microphones_m):
-                yield (
-                    here,
-                    f"expected {len(spec.microphones_m)} channels, one for each microphone of {name!r}, "
-                    f"got {len(channels)}",
-                )
-            for channel in channels:
-                if channel in used:
-                    yield here, f"channel {channel} is already used by {used[channel]!r}"
-                used[channel] = name
-            rate = node.device.sample_rate_hz
-            if spec is not None and rate is not None and spec.band_hz[1] >= rate / 2:
-                yield (
-                    here,
-                    f"band_hz up to {spec.band_hz[1]:g} Hz needs a sample rate above {2 * spec.band_hz[1]:g} Hz, "
-                    f"the device has {rate:g} Hz; lower band_hz or raise sample_rate_hz",
-                )
 
 
 def _xyz(position: Sequence[float] | FloatArray) -> str:

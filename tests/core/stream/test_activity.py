@@ -124,6 +124,15 @@ def test_sound_must_exceed_the_background_by_the_floor_factor() -> None:
         assert causal([NOISE] * 50 + [times * NOISE])[-1] == sound
 
 
+def test_least_power_is_where_the_rule_begins_to_hold() -> None:
+    for parameters in (ActivityParameters(), ActivityParameters(floor_factor=9.0), ActivityParameters(min_power=0.5)):
+        least = parameters.least_power(NOISE)
+        for times, active in ((0.999, False), (1.001, True)):
+            activity = CausalActivity(parameters)
+            activity.prime(NOISE)
+            assert activity.push(times * least) == active
+
+
 def test_primed_background_applies_from_the_first_frame() -> None:
     activity = CausalActivity(ActivityParameters())
     activity.prime(NOISE)

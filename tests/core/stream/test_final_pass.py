@@ -189,3 +189,16 @@ def test_excluded_array_is_neither_used_nor_awaited() -> None:
     assert isinstance(output, FinalResults)
     assert [event.heard_by for event in output.events] == [("north",)]
     assert when == 16 + HANG_OVER
+
+
+def test_only_active_frames_of_excluded_arrays_are_changed() -> None:
+    state = state_of()
+    active, quiet, south = frame("north", 1), frame("north", 2, active=False), frame("south", 1)
+    assert state.without_excluded(active) is active
+    state.exclude({"north"})
+    changed = state.without_excluded(active)
+    assert isinstance(changed, Frame)
+    assert not changed.active
+    assert state.without_excluded(quiet) is quiet
+    assert state.without_excluded(mark("north", 1)) == mark("north", 1)
+    assert state.without_excluded(south) is south

@@ -8,7 +8,7 @@ import soundfile
 
 from livessl.lab.evaluate.campaign import Job, read_clips
 from livessl.lab.evaluate.paper import Settings
-from livessl.simulate.scene import synthesised_sounds
+from livessl.simulation.scene import synthesised_sounds
 
 RATE_HZ = 16000.0
 CLASSES = ("door_slam", "dropped_keys")

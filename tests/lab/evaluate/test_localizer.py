@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
+from livessl.cli.evaluate import add_arguments, evaluate
 from livessl.core.geometry import speed_of_sound_m_s
 from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.lab.evaluate.campaign import Job, compute, read_clips, run_campaign
-from livessl.lab.evaluate.command import add_arguments, run
 from livessl.lab.evaluate.localizer import METHODS, LocalizerSettings, development_fit, rivals_fit
 from livessl.lab.evaluate.localizer_report import area_under_roc, read_columns, summary, write_localizer_report
 from livessl.lab.evaluate.scenarios import ARRAYS, ROOM_C, ROOMS, SCENARIOS, Case
@@ -191,4 +191,4 @@ def test_what_cannot_be_asked_is_refused(tmp_path: Path, option: list[str], said
     add_arguments(parser)
     asked = ["localizer", "--events", str(write_sounds(tmp_path)), "--out", str(tmp_path / "out"), *option]
     with pytest.raises(ValueError, match=said):
-        run(parser.parse_args(asked), 1, lambda done, total: None)
+        evaluate(parser.parse_args(asked), 1, lambda done, total: None)

@@ -10,12 +10,12 @@ import pytest
 import soundfile
 
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
+from livessl.cli.evaluate import add_arguments, evaluate
 from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
-from livessl.lab.evaluate.command import add_arguments, run
 from livessl.lab.evaluate.scenarios import SESSIONS
 from livessl.lab.evaluate.sessions import APART_M, BEFORE_S, SessionPosition, SessionSettings
 from livessl.lab.evaluate.sessions_report import summary
-from livessl.simulate.scene import synthesised_sounds
+from livessl.simulation.scene import synthesised_sounds
 
 RT60_S = 0.2
 
@@ -81,7 +81,7 @@ def test_a_talker_is_tracked_by_the_command_itself(tmp_path: Path) -> None:
     add_arguments(parser)
     asked = ["localizer", "--scenario", "walking", "--events", str(sounds(tmp_path / "sounds")), "--classes", "speech"]
     asked += ["--positions", "1", "--rt", f"{RT60_S:g}", "--snr", "30", "--seed", "8", "--out", str(tmp_path / "out")]
-    written = run(parser.parse_args(asked), 1, lambda done, total: None)
+    written = evaluate(parser.parse_args(asked), 1, lambda done, total: None)
     assert all(path.stat().st_size for path in written)
     assert (tmp_path / "out" / "figures" / "walks.png").exists()
     found = summed(tmp_path / "out", "walking")

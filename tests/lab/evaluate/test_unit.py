@@ -19,7 +19,7 @@ from livessl.lab.evaluate.campaign import read_clips
 from livessl.lab.evaluate.maps import PairMatrices, PairTables, reach_samples
 from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, pair, tetrahedron_in_cube
 from livessl.lab.evaluate.unit import Position, active_segment, recorded, t30_s
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 RATE_HZ = 16000.0
 GRID = Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), 1.0)

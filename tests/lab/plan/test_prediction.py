@@ -15,7 +15,7 @@ from livessl.core.geometry import Grid, line, posed, tetrahedron
 from livessl.core.steering import alias_free_hz, delay_gradients_s_m, steering_delays_s
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction
-from livessl.simulate.room import absorption
+from livessl.simulation.room import absorption
 
 RATE_HZ = 44100.0
 ROOM_M = (8.0, 10.0, 4.0)

@@ -17,8 +17,8 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.site.keys import add_token
-from small_site import running_server, scene_parts, site_of
+from livessl.site.tokens import add_token
+from small_site import running_server, scene_recordings, site_of
 
 TOO_STRICT = [positive_data_acceptance]
 """It does not know that a text is a time, nor that a volume has no picture."""
@@ -39,7 +39,9 @@ def headers(token: tuple[str, Path]) -> dict[str, str]:
 def api(token: tuple[str, Path], headers: dict[str, str]) -> Iterator[Any]:
     """What a server that has heard something says of itself."""
     with running_server(site_of({"server.http.tokens": "tokens.yaml"}, token[1])) as server:
-        send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), SystemClock(), "run", lambda: False)
+        send_session(
+            site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), SystemClock(), "run", lambda: False
+        )
         server.wait_idle()
         yield schemathesis.openapi.from_url(f"{server.url}/api/v1/openapi.json", headers=headers)
         assert server.parts.failure is None

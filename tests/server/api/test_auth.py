@@ -19,10 +19,11 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from livessl.clock import SystemClock
+from livessl.errors import ConfigError
 from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
-from livessl.server.app import MAX_HEAD_BYTES, REFRESH_S, Server
-from livessl.site.keys import Role, add_token, revoke_token
-from livessl.site.models import ConfigError
+from livessl.server.app import REFRESH_S, Server
+from livessl.server.http import MAX_HEAD_BYTES
+from livessl.site.tokens import Role, add_token, revoke_token
 from small_site import running_server, site_of, wait_until, write_site
 
 TOKENED = {"server.http.tokens": "tokens.yaml"}

@@ -1,18 +1,18 @@
-"""The dashboard of a server that wants a token: it asks once, and then works as any other."""
+"""The dashboard of a server that requires access tokens: it asks for one, and then works like any other."""
 
 from __future__ import annotations
 
-import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import Browser, expect
 
-from conftest import require
-from livessl.site.keys import RoleName, add_token
+from browser import faultless_page, running_browser
+from livessl.site.tokens import RoleName, add_token
 from small_site import Changes, running_server, site_of
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SECURED: Changes = {
     "server.http.tokens": "tokens.yaml",
     "privacy": "positions-only",
@@ -22,27 +22,29 @@ SECURED: Changes = {
 pytestmark = [pytest.mark.browser]
 
 
-def test_dashboard_asks_once_for_the_token(tmp_path: Path) -> None:
-    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with running_browser() as browser:
+        yield browser
+
+
+def test_dashboard_asks_once_for_the_token(browser: Browser, tmp_path: Path) -> None:
     token = add_token(tmp_path / "tokens.yaml", "wall", "viewer")
-    with running_server(site_of(SECURED, tmp_path)) as server, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page()
-        faults: list[str] = []
-        page.on("pageerror", lambda error: faults.append(str(error)))
+    with running_server(site_of(SECURED, tmp_path)) as server, faultless_page(browser) as page:
         page.goto(server.url)
         dialog, connection = page.get_by_test_id("token-dialog"), page.get_by_test_id("connection")
+        field = page.get_by_role("textbox", name="Access token")
 
         expect(dialog).to_be_visible()
-        expect(dialog).to_contain_text("This server tells only those who have a token.")
+        expect(dialog).to_contain_text("Enter your access token.")
         expect(connection).to_have_attribute("data-state", "down")
 
-        page.get_by_role("textbox", name="Token").fill("livessl_wrong")
+        field.fill("livessl_wrong")
         page.keyboard.press("Enter")
-        expect(dialog).to_contain_text("The server does not know this token.", timeout=10_000)
+        expect(dialog).to_contain_text("This token is not valid.", timeout=10_000)
 
-        page.get_by_role("textbox", name="Token").fill(f" {token} ")
-        page.get_by_role("button", name="Show me").click()
+        field.fill(f" {token} ")
+        page.get_by_role("button", name="Sign in").click()
         expect(connection).to_have_attribute("data-state", "live", timeout=10_000)
         expect(dialog).to_be_hidden()
         expect(page.get_by_test_id("array-north")).to_be_visible()
@@ -52,44 +54,37 @@ def test_dashboard_asks_once_for_the_token(tmp_path: Path) -> None:
         expect(connection).to_have_attribute("data-state", "live", timeout=10_000)
         expect(dialog).to_be_hidden()
 
-        stranger = browser.new_context().new_page()  # another tab's session: it has to have a token of its own
-        stranger.goto(server.url)
-        expect(stranger.get_by_test_id("token-dialog")).to_be_visible()
-        browser.close()
-    assert faults == []
+        with faultless_page(browser) as other_tab:  # each tab needs the token itself
+            other_tab.goto(server.url)
+            expect(other_tab.get_by_test_id("token-dialog")).to_be_visible()
 
 
-def test_dashboard_of_an_open_server_asks_for_nothing() -> None:
-    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
-    with running_server(site_of()) as server, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page()
+def test_dashboard_of_an_open_server_asks_for_no_token(browser: Browser) -> None:
+    with running_server(site_of()) as server, faultless_page(browser) as page:
         page.goto(server.url)
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
         expect(page.get_by_test_id("token-dialog")).to_be_hidden()
         expect(page.get_by_test_id("privacy")).to_be_hidden()
-        browser.close()
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_operators_disable_an_array_with_one_click(tmp_path: Path, role: RoleName) -> None:
-    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
+def test_only_operators_can_disable_an_array(browser: Browser, tmp_path: Path, role: RoleName) -> None:
     token = add_token(tmp_path / "tokens.yaml", "desk", role)
-    with running_server(site_of(SECURED, tmp_path)) as server, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page()
+    with running_server(site_of(SECURED, tmp_path)) as server, faultless_page(browser) as page:
         page.goto(server.url)
-        page.get_by_role("textbox", name="Token").fill(token)
+        page.get_by_role("textbox", name="Access token").fill(token)
         page.keyboard.press("Enter")
         card, switch = page.get_by_test_id("array-north"), page.get_by_test_id("switch-north")
         expect(card).to_be_visible()
         if role == "viewer":
             expect(switch).to_be_hidden()
-        else:
-            switch.click()
-            expect(card).to_have_attribute("data-state", "disabled", timeout=10_000)
-            expect(card).to_contain_text("an operator has disabled it, and its sound is not used")
-            expect(switch).to_have_text("Enable")
-            switch.click()
-            expect(card).to_have_attribute("data-state", "starting", timeout=10_000)
-        browser.close()
+            return
+        switch.click()
+        expect(card).to_have_attribute("data-state", "disabled", timeout=10_000)
+        answer = httpx.get(f"{server.url}/api/v1/arrays", headers={"Authorization": f"Bearer {token}"}).json()
+        [reason] = [array["reason"] for array in answer["arrays"] if array["name"] == "north"]
+        assert "operator" in reason
+        expect(card).to_contain_text(reason)
+        expect(switch).to_have_text("Enable")
+        switch.click()
+        expect(card).to_have_attribute("data-state", "starting", timeout=10_000)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.clock_offsets import ClockOffset
 from livessl.core.types import ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
@@ -177,7 +178,7 @@ def status_of(**changes: Any) -> ArrayStatus:
 
 
 def test_array_status() -> None:
-    told = array_status(status_of(), "lab-pc")
+    told = array_status(status_of(), "lab-pc", ActivityParameters())
     assert told == {
         "name": "north",
         "state": "healthy",
@@ -187,6 +188,7 @@ def test_array_status() -> None:
         "age_s": 0.012,
         "level_dbfs": -30.0,
         "noise_floor_dbfs": -60.0,
+        "activity_threshold_dbfs": -54.0,
         "channel_levels_dbfs": [-30.0, None],
         "sample_rate_hz": 16000.0,
         "drift_ppm": 12.35,
@@ -200,7 +202,7 @@ def test_array_status() -> None:
 
 def test_clock_offset_of_an_array() -> None:
     offset = ClockOffset(-0.13764, 0.00123, 7, "lab-pc")
-    told = array_status(status_of(clock_offset=offset, corrected_frames=-3), "door-pc")
+    told = array_status(status_of(clock_offset=offset, corrected_frames=-3), "door-pc", ActivityParameters())
     assert told["clock_offset"] == {
         "offset_s": -0.1376,
         "std_s": 0.0012,
@@ -210,11 +212,39 @@ def test_clock_offset_of_an_array() -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("noise_power", "activity", "threshold_dbfs"),
+    [
+        (1e-6, ActivityParameters(floor_factor=4.0), -54.0),
+        (1e-6, ActivityParameters(floor_factor=100.0), -40.0),
+        (1e-6, ActivityParameters(min_power=1e-3), -30.0),
+        (0.0, ActivityParameters(), -90.0),
+        (None, ActivityParameters(), None),
+    ],
+    ids=["default factor", "larger factor", "least level above the noise", "digital silence", "noise unknown"],
+)
+def test_activity_threshold_of_an_array(
+    noise_power: float | None, activity: ActivityParameters, threshold_dbfs: float | None
+) -> None:
+    reported = array_status(status_of(noise_power=noise_power), "lab-pc", activity)
+    assert reported["activity_threshold_dbfs"] == threshold_dbfs
+
+
 def test_array_not_heard_from_has_nulls() -> None:
     unknown = dict.fromkeys(("age_s", "power", "noise_power", "sample_rate_hz", "drift_ppm", "clock"))
-    told = array_status(status_of(state=ArrayState.STARTING, channel_power=(), **unknown), None)
+    told = array_status(status_of(state=ArrayState.STARTING, channel_power=(), **unknown), None, ActivityParameters())
     assert told["channel_levels_dbfs"] == []
-    for name in ("node", "age_s", "level_dbfs", "noise_floor_dbfs", "sample_rate_hz", "drift_ppm", "clock"):
+    unknown_fields = (
+        "node",
+        "age_s",
+        "level_dbfs",
+        "noise_floor_dbfs",
+        "activity_threshold_dbfs",
+        "sample_rate_hz",
+        "drift_ppm",
+        "clock",
+    )
+    for name in unknown_fields:
         assert told[name] is None, name
     assert strict_json(told) == told
 

@@ -15,8 +15,8 @@ from websockets.sync.client import connect
 
 from conftest import require
 from livessl.clock import SystemClock
+from livessl.errors import ConfigError
 from livessl.server.app import Server
-from livessl.site.models import ConfigError
 from small_site import running_server, site_of
 
 FILES = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}

@@ -25,11 +25,11 @@ from websockets.typing import Origin
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock, utc_ns, utc_text
 from livessl.core.types import FRAME_NS
-from livessl.server import app
+from livessl.server import http
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
-from livessl.site.keys import add_token
-from small_site import SMALL, running_server, scene, scene_parts, site_of, wait_until
+from livessl.site.tokens import add_token
+from small_site import SMALL, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 RUNS = count()
@@ -55,14 +55,16 @@ def server() -> Iterator[Server]:
     with running_server(site_of({"zones.room": {"bounds_m": [[0, 4], [0, 5], [0, 3]]}})) as server:
         node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
-        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events")
         yield server
 
 
 def play(server: Server) -> None:
     """Let the server hear the scene as a replay."""
-    send_session(site_of(), server.endpoint, scene_parts(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False)
+    send_session(
+        site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, f"run-{next(RUNS)}", lambda: False
+    )
     server.wait_idle()
 
 
@@ -136,11 +138,23 @@ def test_arrays(client: httpx.Client) -> None:
         assert array["age_s"] >= 0
         assert len(array["channel_levels_dbfs"]) == 4
         assert array["level_dbfs"] < -40
+        # four times the noise's power, the default factor; both levels are rounded to 0.1 dB
+        assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 6.02, abs=0.1)
         assert array["sample_rate_hz"] == 16000.0
         assert array["drift_ppm"] == 0.0
         assert array["counters"]["frames"] > 10
         assert array["counters"]["marks"] > 0
         assert set(array["counters"]) >= {"late", "rejected", "lost_frames", "overflows", "duplicates", "sequence_gaps"}
+
+
+def test_activity_threshold_follows_the_site_file() -> None:
+    with (
+        running_server(site_of({"activity.floor_factor": 100.0})) as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        play(server)
+        for array in get(client, "arrays")["arrays"]:
+            assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 20.0, abs=0.1)
 
 
 def test_arrays_not_heard_from(fresh: httpx.Client) -> None:
@@ -504,7 +518,7 @@ def test_subscriber_who_says_too_much_is_cut_off(server: Server) -> None:
 
 
 def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(app, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(http, "MAX_CONNECTIONS", 2)
     with running_server(site_of()) as server:
         assert httpx.get(f"{server.url}/api/v1/health").status_code == 200
         with live(server):
@@ -516,7 +530,7 @@ def test_answers_say_where_their_time_went() -> None:
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
         node_site = site_of({"nodes.lab-pc.server": server.endpoint})
         start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # live: what was kept for long is no news
-        capture_recordings(node_site, "lab-pc", scene_parts(start_ns), CLOCK, "run-1", lambda: False)
+        capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
         wait_until(lambda: server.parts.event_log.published == 2, "both events")
         told = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
         now_ns = CLOCK.now_ns()

@@ -78,6 +78,10 @@ class ActivityParameters:
         """Number of quiet frames kept after the last active one."""
         return round(self.hang_over_s / FRAME_S)
 
+    def least_power(self, floor_power: float) -> float:
+        """Return the least power, full scale squared, at which a frame can be active over a background."""
+        return max(self.floor_factor * floor_power, self.min_power)
+
 
 class CausalActivity:
     """The rule, applied frame by frame to a stream."""
@@ -102,8 +106,7 @@ class CausalActivity:
         """Return whether the next frame, of mean power `power`, is active."""
         parameters = self._parameters
         self._maximum = max(self._maximum * self._keep, power)
-        least = max(parameters.floor_factor * self.floor_power, parameters.min_power)
-        reference = max(self._maximum, least / parameters.threshold)
+        reference = max(self._maximum, parameters.least_power(self.floor_power) / parameters.threshold)
         self._latest.append(power)
         self._smoothed.append(sum(self._latest) / len(self._latest))
         return bool(is_active(np.asarray(power), reference, parameters.threshold))

@@ -22,8 +22,8 @@ from livessl.core.locate.estimators import Sound, SrpPhat
 from livessl.core.locate.peak_search import PeakSearch, Rule
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
-from livessl.simulate.room import impulse_responses
-from livessl.simulate.sounds import voice
+from livessl.simulation.room import impulse_responses
+from livessl.simulation.sounds import voice
 
 ROOM_M: Final = (8.0, 10.0, 4.0)
 RATE_HZ: Final = 44_100.0

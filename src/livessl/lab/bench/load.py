@@ -15,7 +15,7 @@ from livessl.capture.link import Link
 from livessl.clock import Clock, SystemClock
 from livessl.core.correlate.band import band_power
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, Frame
-from livessl.simulate.scene import Scene, Source, render, synthesised_sounds
+from livessl.simulation.scene import Scene, Source, render, synthesised_sounds
 from livessl.site.load import parse_site
 from livessl.site.models import Site
 

@@ -29,7 +29,7 @@ from livessl.lab.evaluate.paper import Settings
 from livessl.lab.evaluate.sessions import SCHEMA as SESSIONS_SCHEMA
 from livessl.lab.evaluate.sessions import SessionPosition, SessionSettings
 from livessl.lab.evaluate.unit import Clips, Position, Row
-from livessl.simulate.scene import read_sounds
+from livessl.simulation.scene import read_sounds
 
 HIGH_PASS_HZ: Final = 100.0
 """As in Allen and Berkley's rooms; the correlations begin there, so only the activity sees it."""

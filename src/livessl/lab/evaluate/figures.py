@@ -30,7 +30,7 @@ from livessl.lab.evaluate.paper import (
     tetrahedron_in_cube,
 )
 from livessl.lab.evaluate.statistics import Interval, Results
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Distinct for colour-blind readers (Okabe and Ito)."""

@@ -22,11 +22,10 @@ from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
-from livessl.lab.evaluate.command import HALVES, LOCALIZER
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M
-from livessl.lab.evaluate.scenarios import ARRAYS, ROOMS, SCENARIOS, TWO, Case
+from livessl.lab.evaluate.scenarios import ARRAYS, HALVES, LOCALIZER, ROOMS, SCENARIOS, TWO, Case
 from livessl.lab.evaluate.unit import PEAK, Clips, Row, convolved
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 METHODS: Final = ("srp-phat", "onset")
 RT60S_S: Final = (0.0, 0.4, 1.0, 2.0)

@@ -13,11 +13,10 @@ import pyarrow.parquet as pq
 
 from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M
 from livessl.core.types import BoolArray, FloatArray, Status
-from livessl.lab.evaluate.command import HALVES
 from livessl.lab.evaluate.figures import LocalizerCurve, ScenarioPoint, draw_localizer, draw_scenario
 from livessl.lab.evaluate.localizer import METHODS, development_fit
 from livessl.lab.evaluate.report import Block, Heading, Picture, Table, as_markdown
-from livessl.lab.evaluate.scenarios import ROOMS, SCENARIOS, Case
+from livessl.lab.evaluate.scenarios import HALVES, ROOMS, SCENARIOS, Case
 from livessl.lab.evaluate.statistics import INTERVAL, RESAMPLES, write_csv
 
 NINETY_PERCENT: Final = 6.251

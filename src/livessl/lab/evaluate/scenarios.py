@@ -16,6 +16,12 @@ from livessl.core.geometry import speed_of_sound_m_s
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.evaluate.paper import C_M_S, ROOM_M, pair
 
+HALVES: Final = ("development", "test")
+"""The halves of the clips: constants are fitted on the first, results are reported on the second."""
+
+LOCALIZER: Final = "localizer"
+"""Name of the experiment that compares `onset` with the paper's standard."""
+
 ROOMS: Final = "rooms"
 """What is run where no scenario is named."""
 

@@ -16,13 +16,12 @@ import numpy as np
 import pyarrow as pa
 
 from livessl.core.types import Block, Event, Float32Array, FloatArray, Output, Track, TrackState
-from livessl.lab.evaluate.command import HALVES
 from livessl.lab.evaluate.localizer import METHODS
 from livessl.lab.evaluate.paper import C_M_S, ROOM_M
-from livessl.lab.evaluate.scenarios import ARRAYS, SESSIONS, TWO, SessionCase
+from livessl.lab.evaluate.scenarios import ARRAYS, HALVES, SESSIONS, TWO, SessionCase
 from livessl.lab.evaluate.unit import PEAK, Clips, Row, convolved
-from livessl.simulate.moving import place_on_way, render_moving
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.moving import place_on_way, render_moving
+from livessl.simulation.room import impulse_responses
 from livessl.site.build.fusion import make_fusion
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.load import parse_site

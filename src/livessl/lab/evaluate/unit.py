@@ -17,7 +17,7 @@ from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, IntArray
 from livessl.lab.evaluate.maps import PairMatrices, PairTables, reach_samples
 from livessl.lab.evaluate.paper import Experiment, Settings, System, experiment_of
-from livessl.simulate.room import impulse_responses
+from livessl.simulation.room import impulse_responses
 
 Row = dict[str, Any]
 

@@ -13,7 +13,7 @@ from livessl.core.geometry import Grid
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction
-from livessl.simulate.room import absorption
+from livessl.simulation.room import absorption
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 

@@ -29,8 +29,9 @@ from livessl.server.maps import FUSED, VIEWS, bounds_of_view_m, projection
 from livessl.server.parts import Parts
 from livessl.server.store import Cursor, StoreError
 from livessl.server.store import Query as EventQuery
+from livessl.site.addresses import is_loopback
 from livessl.site.build.grid import search_grid
-from livessl.site.models import Site, is_loopback
+from livessl.site.models import Site
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 

@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl.server.refusals import Refusals
-from livessl.site.keys import Client, Role, Tokens
+from livessl.site.tokens import Client, Role, Tokens
 
 DOOR: Final = "http"
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 import orjson
 
 from livessl.clock import utc_text
+from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
 from livessl.site.models import Site
@@ -157,8 +158,9 @@ def where(
     return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
 
 
-def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
-    """An array's state."""
+def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:
+    """Return an array's state, with the threshold that its node's activity detection applies."""
+    noise = status.noise_power
     return {
         "name": status.name,
         "state": str(status.state),
@@ -167,7 +169,8 @@ def array_status(status: ArrayStatus, node: str | None) -> JsonObject:
         "active": status.active,
         "age_s": None if status.age_s is None else round(status.age_s, 3),
         "level_dbfs": dbfs(status.power),
-        "noise_floor_dbfs": dbfs(status.noise_power),
+        "noise_floor_dbfs": dbfs(noise),
+        "activity_threshold_dbfs": None if noise is None else dbfs(activity.least_power(noise)),
         "channel_levels_dbfs": [dbfs(power) for power in status.channel_power],
         "sample_rate_hz": status.sample_rate_hz,
         "drift_ppm": None if status.drift_ppm is None else round(status.drift_ppm, 2),

@@ -1,37 +1,39 @@
-// The token, where the server wants one: kept as long as the tab, sent with every request, asked for when it is refused.
+// Requests to the server, with an access token where the server requires one; the browser tab keeps the token.
 
-const KEY = "livessl-token";
+const STORAGE_KEY = "livessl-token";
+/** Longest wait for an answer, in milliseconds. */
 const TIMEOUT_MS = 8000;
 
-let whenRefused = () => {};
+let tokenNeeded = () => {};
 
-/** Have `listener(known)` called whenever the server wants a token; `known` tells whether one was sent in vain. */
-export function onRefused(listener) {
-  whenRefused = listener;
+/** Call `listener(sent)` whenever the server rejects a request for lack of a valid token; `sent`: a token was sent. */
+export function onTokenNeeded(listener) {
+  tokenNeeded = listener;
 }
 
-/** Send this token from now on. */
+/** Send this token with every request from now on. */
 export function useToken(token) {
-  sessionStorage.setItem(KEY, token);
+  sessionStorage.setItem(STORAGE_KEY, token);
 }
 
-/** What a WebSocket is opened with: browsers let it send no headers, but name protocols. */
+/** The protocols to open a WebSocket with: one carries the token, because browsers add no headers to a WebSocket. */
 export function protocols() {
-  const token = sessionStorage.getItem(KEY);
+  const token = sessionStorage.getItem(STORAGE_KEY);
   return token === null ? [] : ["livessl", `livessl.token.${token}`];
 }
 
-/** Fetch, with the token if there is one. */
-export const get = (url) => ask(url, {});
+/** Read a resource. */
+export const get = (url) => request(url, {});
 
-/** Change what is there, with the token if there is one. */
+/** Replace a resource by `value`, sent as JSON. */
 export const put = (url, value) =>
-  ask(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+  request(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
 
-async function ask(url, { headers: others, ...options }) {
-  const token = sessionStorage.getItem(KEY);
+async function request(url, { headers: others, ...options }) {
+  const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
-  const response = await fetch(url, { ...options, cache: "no-store", headers, signal: AbortSignal.timeout(TIMEOUT_MS) });
-  if (response.status === 401) whenRefused(token !== null);
+  const signal = AbortSignal.timeout(TIMEOUT_MS);
+  const response = await fetch(url, { ...options, cache: "no-store", headers, signal });
+  if (response.status === 401) tokenNeeded(token !== null);
   return response;
 }

@@ -1,14 +1,13 @@
-// The readout of the newest estimate: where, how sure, from whom, and how old that is.
+// The readout of the latest estimate: where, how certain, from which arrays, and how old it is.
 
-import { percent } from "./events.js";
-import { ago, number, position, write } from "./format.js";
+import { find, write } from "./dom.js";
+import { ago, bearing, number, percent, position, width } from "./format.js";
 import { largestSigma } from "./geometry.js";
-import { OLD_MS } from "./plan.js";
+import { OLD_MS } from "./model.js";
 
-/** An update this young means that the sound is still going on. */
-const SOUNDING_MS = 1000;
-
-const find = (id) => document.getElementById(id);
+/** Age, in milliseconds, below which an update means that its sound is still in progress. */
+const IN_PROGRESS_MS = 1000;
+const AXES = ["x", "y", "z"];
 
 export class Readout {
   constructor() {
@@ -16,59 +15,79 @@ export class Readout {
     this.head = find("estimate-head");
     this.where = find("estimate-where");
     this.instead = find("estimate-instead");
-    this.numbers = ["x", "y", "z"].map((axis) => find(`estimate-${axis}`));
-    this.sigma = find("estimate-sigma");
-    this.meter = find("estimate-meter");
-    this.confidence = find("estimate-confidence");
-    this.level = find("estimate-level");
-    this.arrays = find("estimate-arrays");
+    this.numbers = AXES.map((axis) => find(`estimate-${axis}`));
     this.shown = null;
   }
 
-  /** Show an update or an event message that was heard; the hooks carry its numbers unrounded. */
-  show(message, bornMs, nowMs, link) {
-    this.shown = { message, bornMs };
+  /** Show an update or event message; the element's data attributes hold its numbers unrounded. */
+  show({ message, marker }, nowMs, link) {
+    this.shown = { message, bornMs: marker.bornMs };
     const event = message.kind === "event";
-    const placed = message.position_m && message.status !== "direction-only" && message.status !== "refused";
-    const { dataset } = this.root;
-    dataset.kind = message.kind;
-    dataset.eventId = event ? message.id : message.event_id;
-    dataset.status = event ? message.status : "";
-    ["x", "y", "z"].forEach((axis, i) => {
-      dataset[axis] = message.position_m ? String(message.position_m[i]) : "";
-      write(this.numbers[i], message.position_m ? number(message.position_m[i]) : "–");
+    const placed = Boolean(message.position_m) && !["direction-only", "refused"].includes(message.status);
+    const sigma = placed ? largestSigma(message.covariance_m2) : null;
+    const arrays = message.arrays?.length ? message.arrays : message.heard_by ?? [];
+    this.#fill({
+      kind: message.kind,
+      eventId: event ? message.id : message.event_id,
+      status: event ? message.status : "",
+      positionM: message.position_m,
+      sigma: sigma === null ? "–" : `± ${number(sigma)} m`,
+      confidence: message.confidence,
+      level: Number.isFinite(message.level_dbfs) ? `${number(message.level_dbfs, 1)} dBFS` : "–",
+      arrays: arrays.join(" + ") || "none",
     });
     this.where.hidden = !placed;
-    this.instead.hidden = Boolean(placed);
-    if (!placed) write(this.instead, instead(message));
-    const sigma = placed ? largestSigma(message.covariance_m2) : null;
-    write(this.sigma, sigma === null ? "–" : `± ${number(sigma)} m`);
-    this.meter.style.width = `${Math.round(100 * Math.min(1, Math.max(0, message.confidence ?? 0)))}%`;
-    write(this.confidence, percent(message.confidence));
-    write(this.level, Number.isFinite(message.level_dbfs) ? `${number(message.level_dbfs, 1)} dBFS` : "–");
-    write(this.arrays, (message.arrays?.length ? message.arrays : message.heard_by ?? []).join(" + ") || "none");
+    this.instead.hidden = placed;
+    if (!placed) write(this.instead, insteadOfPosition(message));
     this.tick(nowMs, link);
   }
 
+  /** Show nothing, as before the first sound. */
+  clear(link) {
+    this.shown = null;
+    this.#fill({
+      kind: "", eventId: "", status: "", positionM: null, sigma: "–", confidence: null, level: "–", arrays: "–",
+    });
+    this.where.hidden = false;
+    this.instead.hidden = true;
+    this.root.dataset.state = "waiting";
+    this.tick(0, link);
+  }
+
+  /** Show the age. */
   tick(nowMs, link) {
-    if (!this.shown) {
-      write(this.head, link === "live" ? "waiting for the first sound" : "no contact with the server");
+    if (this.shown === null) {
+      write(this.head, link === "live" ? "Waiting for the first sound" : "Not connected to the server");
       return;
     }
     const { message, bornMs } = this.shown;
     const age = nowMs - bornMs;
-    const sounding = message.kind === "update" && age < SOUNDING_MS && link === "live";
-    this.root.dataset.state = sounding ? "sounding" : age > OLD_MS || link !== "live" ? "old" : "fresh";
-    const what = message.kind === "update" ? "last heard" : message.status === "located" ? "event" : message.status.replace("-", " ");
-    write(this.head, sounding ? "sounding now" : `${what}, ${ago(age)}`);
+    const update = message.kind === "update";
+    const inProgress = update && age < IN_PROGRESS_MS && link === "live";
+    this.root.dataset.state = inProgress ? "sounding" : age > OLD_MS || link !== "live" ? "old" : "fresh";
+    const status = update || message.status === "located" ? "" : ` (${message.status.replace("-", " ")})`;
+    write(this.head, inProgress ? "Sound in progress" : `Last ${update ? "update" : `event${status}`}: ${ago(age)}`);
+  }
+
+  #fill({ kind, eventId, status, positionM, sigma, confidence, level, arrays }) {
+    Object.assign(this.root.dataset, { kind, eventId, status });
+    AXES.forEach((axis, i) => {
+      this.root.dataset[axis] = positionM ? String(positionM[i]) : "";
+      write(this.numbers[i], positionM ? number(positionM[i]) : "–");
+    });
+    write(find("estimate-sigma"), sigma);
+    find("estimate-meter").style.width = width(confidence);
+    write(find("estimate-confidence"), percent(confidence));
+    write(find("estimate-level"), level);
+    write(find("estimate-arrays"), arrays);
   }
 }
 
-function instead(message) {
-  const bearing = message.contributions?.[0];
-  if (message.status === "direction-only" && bearing) {
-    const where = `azimuth ${number(bearing.azimuth_deg, 0)}°, elevation ${number(bearing.elevation_deg, 0)}° seen from array ${bearing.array}`;
-    return message.reason ? `${where} (${message.reason})` : where;
+/** What to show of a result that has no reliable position. */
+function insteadOfPosition(message) {
+  const first = message.contributions?.[0];
+  if (message.status === "direction-only" && first) {
+    return message.reason ? `${bearing(first)} (${message.reason})` : bearing(first);
   }
   return message.reason ?? (message.position_m ? position(message.position_m) : "no position");
 }

@@ -1,87 +1,68 @@
-// The socket to the server: kept open for ever, its silence measured, and the server's clock told from the browser's.
+// The WebSocket to the server: it reconnects for ever and measures how long the server has been silent.
 
 import { protocols } from "./access.js";
 
-/** The server speaks twice a second at least, so this much silence means that something is wrong. */
+/** Silence, in milliseconds, after which the page counts as stale: the server sends at least two messages a second. */
 const STALE_MS = 2000;
-/** After this much silence the socket is given up and opened anew. */
+/** Silence, in milliseconds, after which the connection is closed and opened again. */
 const DEAD_MS = 5000;
+/** How often, in milliseconds, the silence is checked. */
+const TICK_MS = 250;
+/** Waits before the attempts to reconnect, in milliseconds; the last one repeats. */
 const BACK_OFF_MS = [500, 800, 1300, 2100, 3400, 5000];
-
-/**
- * The clock of the server as seen from here.
- *
- * A message takes some time to arrive, never less than none: of many differences, the greatest is the nearest.
- */
-export class ServerClock {
-  #samples = [];
-
-  reset() {
-    this.#samples = [];
-  }
-
-  /** Learn from a message stamped `serverMs` that arrived at `localMs`. */
-  learn(serverMs, localMs) {
-    this.#samples.push([localMs, serverMs - localMs]);
-    this.#samples = this.#samples.filter(([at]) => Math.abs(localMs - at) < 60000).slice(-120);
-  }
-
-  /** Server time in milliseconds at the browser's `localMs`; the browser's own until anything is known. */
-  at(localMs) {
-    return this.#samples.length ? localMs + Math.max(...this.#samples.map(([, offset]) => offset)) : localMs;
-  }
-}
 
 /**
  * One WebSocket that reconnects for ever.
  *
- * `onMessage(message)` gets each parsed object, `onState(state, silentMs)` is called on every change and every tick;
- * state is "live", "stale" (open, but silent) or "down"; silentMs is null before the first contact ever.
- * `onUnopened()` is called when the server did not let us in, for a reason that browsers do not tell.
+ * `onMessage(message)` gets each parsed message. `onState(state, silentMs)` is called at every tick and change; `state`
+ * is "live", "stale" (open, but silent) or "down", and `silentMs` is null before the first message ever. `onRejected()`
+ * is called when a connection closes before its first message; browsers do not reveal why.
  */
-
 export class Live {
-  constructor(url, { onMessage, onState, onUnopened }) {
+  constructor(url, { onMessage, onState, onRejected }) {
     this.url = url;
     this.onMessage = onMessage;
     this.onState = onState;
-    this.onUnopened = onUnopened;
-    this.state = "down";
+    this.onRejected = onRejected;
     this.socket = null;
-    this.heardAt = null;
+    this.state = "down";
     this.openedAt = 0;
+    this.lastMessageAt = null;
     this.failures = 0;
     this.retry = null;
   }
 
   start() {
     this.#open();
-    setInterval(() => this.tick(), 250);
-    for (const name of ["online", "pageshow"]) addEventListener(name, () => this.hurry());
-
+    setInterval(() => this.#tick(), TICK_MS);
+    for (const name of ["online", "pageshow"]) addEventListener(name, () => this.reconnectNow());
     document.addEventListener("visibilitychange", () => {
-      this.tick();
-      if (!document.hidden) this.hurry();
+      this.#tick();
+      if (!document.hidden) this.reconnectNow();
     });
   }
 
-  /** Milliseconds since anything came, or null before the first contact. */
-  get silentMs() {
-    return this.heardAt === null ? null : performance.now() - this.heardAt;
+  /** Connect at once if there is no connection, without the rest of the wait. */
+  reconnectNow() {
+    if (this.socket === null) this.#open();
   }
 
-  tick() {
-    const since = performance.now() - Math.max(this.openedAt, this.heardAt ?? 0);
-    if (this.socket !== null && since > DEAD_MS) {
-      this.#abandon();
+  /** Whether a message has arrived on the current connection. */
+  get #answered() {
+    return this.lastMessageAt !== null && this.lastMessageAt >= this.openedAt;
+  }
+
+  #tick() {
+    const now = performance.now();
+    if (this.socket !== null && now - Math.max(this.openedAt, this.lastMessageAt ?? 0) > DEAD_MS) {
+      this.#drop();
       return;
     }
-    const open = this.socket !== null && this.socket.readyState === WebSocket.OPEN;
-    const heard = open && this.heardAt !== null && this.heardAt >= this.openedAt;
-    const answered = open && this.heardAt !== null && this.heardAt >= this.openedAt;
-    if (!answered) this.state = "down";
-    else this.state = this.silentMs < STALE_MS ? "live" : "stale";
-    this.onState(this.state, this.silentMs);
+    const silentMs = this.lastMessageAt === null ? null : now - this.lastMessageAt;
+    const open = this.socket?.readyState === WebSocket.OPEN;
+    if (!open || !this.#answered) this.state = "down";
+    else this.state = silentMs < STALE_MS ? "live" : "stale";
+    this.onState(this.state, silentMs);
   }
 
   #open() {
@@ -91,27 +72,31 @@ export class Live {
     const socket = new WebSocket(this.url, protocols());
     this.socket = socket;
     socket.onmessage = ({ data }) => {
-      if (socket !== this.socket) return;
-      this.heardAt = performance.now();
-      this.failures = 0;
-      let message;
-      try {
-        message = JSON.parse(data);
-      } catch {
-        console.warn("livessl: a message that is not JSON was ignored");
-        return;
-      }
-      if (this.state !== "live") this.tick();
-      this.onMessage(message);
+      if (socket === this.socket) this.#take(data);
     };
     socket.onclose = () => {
       if (socket !== this.socket) return;
-      if (!(this.heardAt >= this.openedAt)) this.onUnopened();
-      this.#abandon();
+      if (!this.#answered) this.onRejected();
+      this.#drop();
     };
   }
 
-  #abandon() {
+  #take(text) {
+    this.lastMessageAt = performance.now();
+    this.failures = 0;
+    let message;
+    try {
+      message = JSON.parse(text);
+    } catch {
+      console.warn("livessl: ignored a message that is not JSON");
+      return;
+    }
+    if (this.state !== "live") this.#tick();
+    this.onMessage(message);
+  }
+
+  /** Close the connection and try again after a wait. */
+  #drop() {
     const socket = this.socket;
     this.socket = null;
     if (socket !== null) socket.close();
@@ -119,11 +104,6 @@ export class Live {
     this.failures += 1;
     clearTimeout(this.retry);
     this.retry = setTimeout(() => this.#open(), wait);
-    this.tick();
-  }
-
-  /** Try now, rather than after the wait. */
-  hurry() {
-    if (this.socket === null) this.#open();
+    this.#tick();
   }
 }

@@ -1,4 +1,4 @@
-"""Core objects made of a site: the one place where configuration becomes grids, pipelines and fusions.
+"""Core objects made from a site: the one place where configuration becomes arrays, grids, pipelines and fusions.
 
-The models and checks of a site do not depend on it.
+The models of the site file do not depend on it.
 """

@@ -1,10 +1,10 @@
-"""The fusion of a site: estimator, parameters and clock offsets. It loads everything that locates."""
+"""The fusion of a site: estimator, parameters and clock offsets. It imports everything that locates."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from livessl.core.locate.estimators import ESTIMATORS
+from livessl.core.locate.estimators import ESTIMATORS, Estimator
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
@@ -18,8 +18,13 @@ from livessl.site.models import Site
 
 
 def make_clock_offsets(site: Site) -> ClockOffsets:
-    """Return the offsets of this site's clocks before anything is known: one for each node, or array without a node."""
+    """Return clock offsets, all still unknown: one clock for each node, and one for each array without a node."""
     return ClockOffsets({spec.name: site.node_of(spec.name) or spec.name for spec in site.processed}, site.c_m_s)
+
+
+def make_estimator(site: Site, method: str | None = None) -> Estimator:
+    """Return a new estimator of a site's arrays: the site's method, or another of `METHODS`."""
+    return ESTIMATORS[method or site.fusion.method](site.processed, search_grid(site), site.c_m_s)
 
 
 def make_fusion(
@@ -102,7 +107,7 @@ def _site_state(
     return SiteState(
         site.site,
         site.processed,
-        ESTIMATORS[method or f.method](site.processed, search_grid(site), site.c_m_s),
+        make_estimator(site, method),
         parameters,
         clock_offsets=clock_offsets,
         for_each=for_each,

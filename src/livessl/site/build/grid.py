@@ -7,6 +7,6 @@ from livessl.site.models import Site
 
 
 def search_grid(site: Site) -> Grid:
-    """The shared grid: the bounds given, or the whole room."""
+    """Return the grid of the given bounds, or else of the whole room."""
     x, y, z = site.room.size_m
     return Grid(site.grid.bounds_m or ((0.0, x), (0.0, y), (0.0, z)), site.grid.spacing_m)

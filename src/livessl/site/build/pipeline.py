@@ -1,4 +1,4 @@
-"""The pipeline of a device, or of a recording in its place. It loads nothing that locates."""
+"""The pipeline of a device, or of a recording that is played in its place. It imports nothing that locates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from livessl.site.models import Site
 
 
 def activity_parameters(site: Site) -> ActivityParameters:
-    """The activity rule's numbers, for the core."""
+    """Return the parameters of the activity detection, as the core takes them."""
     a = site.activity
     return ActivityParameters(
         threshold=a.threshold,

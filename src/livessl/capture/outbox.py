@@ -1,0 +1,213 @@
+"""A node's messages on their way to the server: which go next, and which the server may not have. It knows no socket.
+
+A frame is in one of these places, and always in the spool until the server needs it no more:
+
+- live: it waits to be sent, before everything else;
+- backlog: it was cut while the server was away or the connection too slow, and is sent in the bandwidth that is left;
+- sent: it was handed over, and the server has not acknowledged it yet.
+
+Marks describe the present state of an array, so while the server is away only the newest of each array waits.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from livessl import wire
+from livessl.capture.spool import Kept, Spool, SpoolError
+from livessl.core.types import Frame, Mark, Message
+
+BACKLOG_FRAMES: Final = 16
+"""Most frames of the backlog on their way at a time. Live sound may have to wait behind them: 0.25 s at 3 MB/s."""
+
+BACKLOG_TIMEOUT_NS: Final = 2_000_000_000
+"""Wait for an acknowledgement of the backlog, in ns. After that the server is taken to have these frames, or not to
+want them, and more are sent."""
+
+LATE_NS: Final = 5_000_000_000
+"""Live sound that has waited so long to be sent, in ns, joins the backlog, so that newer sound can go first."""
+
+MAX_REQUESTED: Final = 500
+"""Most requested frames that wait to be sent: a quarter of a minute of two arrays. Older ones come too late to matter
+and are dropped."""
+
+_log = logging.getLogger(__name__)
+
+Send = Callable[[bytes], bool]
+"""Hands bytes over to a socket; returns False if there is no room."""
+
+
+class Outbox:
+    """Queues of live sound, backlog and requested frames, and the frames that the server has not acknowledged.
+
+    Parameters
+    ----------
+    spool : Spool
+        Holds the frames; those that it holds already are the first backlog.
+
+    Attributes
+    ----------
+    dropped : int
+        Frames that were lost before the server got them.
+    settled : int or None
+        Frame index before which the server needs nothing more, by its last acknowledgement.
+    """
+
+    def __init__(self, spool: Spool) -> None:
+        self.dropped = 0
+        self.settled: int | None = None
+        self._spool = spool
+        self._newest_marks: dict[str, Mark] = {}  # while the server is away
+        self._live: deque[tuple[int, Kept | Mark]] = deque()  # with the time at which each was queued
+        self._live_sent: deque[Kept] = deque()
+        self._backlog = deque(spool.frames())
+        self._backlog_sent: deque[Kept] = deque()
+        self._backlog_sent_ns = 0
+        self._requested: deque[Message] = deque(maxlen=MAX_REQUESTED)
+        self._received: Mapping[str, int] = {}
+
+    @property
+    def pending(self) -> int:
+        """Number of messages that the server has not acknowledged."""
+        sent = len(self._live_sent) + len(self._backlog_sent)
+        return len(self._live) + len(self._newest_marks) + len(self._backlog) + sent
+
+    @property
+    def has_live(self) -> bool:
+        """True if live sound waits to be sent."""
+        return bool(self._live)
+
+    @property
+    def has_backlog(self) -> bool:
+        """True if a part of the backlog waits to be sent."""
+        return bool(self._backlog)
+
+    def is_late(self, now_ns: int) -> bool:
+        """Return True if live sound has waited for `LATE_NS`."""
+        return bool(self._live) and now_ns - self._live[0][0] >= LATE_NS
+
+    def backlog_spans(self) -> dict[str, tuple[int, int]]:
+        """Return for each array of the backlog the frame index of its first frame, and the one after its last."""
+        spans: dict[str, tuple[int, int]] = {}
+        for kept in (*self._backlog_sent, *self._backlog):
+            spans[kept.array] = (spans.get(kept.array, (kept.frame_index, 0))[0], kept.frame_index + 1)
+        return spans
+
+    def add(self, message: Message, now_ns: int, *, connected: bool) -> None:
+        """Queue a message as live sound; while not connected, frames join the backlog and older marks are replaced."""
+        if isinstance(message, Frame):
+            self._add_frame(message, now_ns, connected=connected)
+        elif connected:
+            self._live.append((now_ns, message))
+        else:
+            self._newest_marks[message.array] = message
+
+    def add_requested(self, messages: Iterable[Message]) -> None:
+        """Queue the answer to a backfill request. It bypasses the spool: it is not sent again if it gets lost."""
+        self._requested.extend(messages)
+
+    def acknowledge(self, received: Mapping[str, int], settled: int | None) -> None:
+        """Forget frames that the server has received, and release from the spool those that it needs no more."""
+        self._received, self.settled = received, settled
+        for array, last in received.items():
+            if settled is not None:
+                self._spool.forget(array, min(settled, last + 1))
+        self._live_sent = deque(kept for kept in self._live_sent if not self._is_received(kept))
+        self._backlog_sent = deque(kept for kept in self._backlog_sent if not self._is_received(kept))
+
+    def reconnected(self, arrays: Collection[str]) -> None:
+        """Make the backlog all frames of `arrays` that the server has not received, in order of time."""
+        frames = [kept for kept in self._spool.frames() if kept.array in arrays]
+        self._backlog = deque(kept for kept in frames if not self._is_received(kept))
+
+    def disconnected(self) -> None:
+        """Make everything in the spool backlog: whatever was on its way may be lost."""
+        self._received = {}
+        self._keep_newest_marks(self._live)
+        for queue in (self._live, self._live_sent, self._backlog_sent, self._requested):
+            queue.clear()
+        self._backlog = deque(self._spool.frames())
+
+    def demote_live(self) -> None:
+        """Move live sound to the end of the backlog."""
+        waiting, self._live = self._live, deque()
+        self._backlog.extend(message for _, message in waiting if isinstance(message, Kept))
+        self._keep_newest_marks(waiting)
+
+    def queue_marks(self, now_ns: int) -> None:
+        """Queue the newest marks, which waited for the server, as live."""
+        self._live.extend((now_ns, mark) for mark in self._newest_marks.values())
+        self._newest_marks.clear()
+
+    def send(self, send: Send, now_ns: int) -> bool:
+        """Send live sound first, then requested frames, then the backlog; return False when `send` finds no room."""
+        while self._live:
+            first = self._live[0][1]
+            if not self._send_one(first, send):
+                return False
+            self._live.popleft()
+            if isinstance(first, Kept):
+                self._live_sent.append(first)
+        while self._requested:
+            if not send(wire.encode(self._requested[0])):
+                return False
+            self._requested.popleft()
+        if self._backlog_sent and now_ns - self._backlog_sent_ns >= BACKLOG_TIMEOUT_NS:
+            self._backlog_sent.clear()
+        while self._backlog and len(self._backlog_sent) < BACKLOG_FRAMES:
+            if not self._send_one(self._backlog[0], send):
+                return False
+            self._backlog_sent.append(self._backlog.popleft())
+            self._backlog_sent_ns = now_ns
+        return True
+
+    def _send_one(self, message: Kept | Mark, send: Send) -> bool:
+        """Return True if the message was handed over, or cannot be read any more."""
+        if isinstance(message, Mark):
+            return send(wire.encode(replace(message, lost_frames=message.lost_frames + self.dropped)))
+        try:
+            data = self._spool.read(message)
+        except SpoolError as error:
+            _log.error("%s", error)
+            self.dropped += 1
+            return True
+        return send(data)
+
+    def _add_frame(self, frame: Frame, now_ns: int, *, connected: bool) -> None:
+        kept, removed = self._spool.append(frame)
+        if connected:
+            self._live.append((now_ns, kept))
+        else:
+            self._backlog.append(kept)
+        self._newest_marks.pop(frame.array, None)  # a mark before the frame is out of date
+        if removed:
+            self._drop(removed)
+
+    def _drop(self, removed: Sequence[Kept]) -> None:
+        """Remove frames from all queues that the spool had no room for, and count those that the server never got."""
+        lost = [kept for kept in removed if not self._is_received(kept)]
+        self._live = deque(waiting for waiting in self._live if waiting[1] not in lost)
+        for kept in lost:
+            for queue in (self._backlog, self._backlog_sent, self._live_sent):
+                if kept in queue:
+                    queue.remove(kept)
+        if lost and not self.dropped:
+            _log.warning("the spool is full and drops its oldest frames; start the server, or raise spool.max_mb")
+        self.dropped += len(lost)
+
+    def _is_received(self, kept: Kept) -> bool:
+        return kept.array in self._received and kept.frame_index <= self._received[kept.array]
+
+    def _keep_newest_marks(self, waiting: Iterable[tuple[int, Kept | Mark]]) -> None:
+        """Keep the last mark of each array, unless a frame follows it: then the mark is out of date."""
+        newest: dict[str, Mark] = {}
+        for _, message in waiting:
+            if isinstance(message, Mark):
+                newest[message.array] = message
+            else:
+                newest.pop(message.array, None)
+        self._newest_marks.update(newest)

@@ -1,0 +1,61 @@
+"""`livessl bench`: how fast this machine locates, and the load that it carries."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from livessl.cli import argument, progress
+from livessl.cli.exits import OK
+from livessl.cli.options import add_json
+from livessl.clock import SystemClock
+from livessl.lab.bench import kernels, live
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    parser.add_argument("--live", action="store_true", help="measure a server under load instead of the kernels alone")
+    only = parser.add_argument_group("with --live")
+    only.add_argument("--arrays", type=argument.positive, default=4, help="arrays that sound all the time (default 4)")
+    only.add_argument("--clients", type=argument.positive, default=4, help="clients that subscribe (default 4)")
+    only.add_argument(
+        "--watchers", type=argument.count, default=0, help="clients that watch the power map (default none)"
+    )
+    only.add_argument(
+        "--seconds", type=argument.above_zero, default=20.0, help="time to measure, after a warm-up (default 20)"
+    )
+    only.add_argument(
+        "--spacing", type=argument.above_zero, default=0.1, metavar="M", help="spacing of the grid (default 0.1)"
+    )
+    only.add_argument(
+        "--rt60",
+        type=argument.rt60,
+        default=0.3,
+        metavar="S",
+        help="reverberation time of the simulated room (default 0.3)",
+    )
+    only.add_argument("--spin", action="store_true", help="let a foreign process spin on each core")
+    add_json(parser, "print one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    if not arguments.live:
+        with progress.counted("measuring", "round") as show:
+            report = kernels.measure(SystemClock(), progress=show)
+        print(json.dumps(report.as_json()) if arguments.json else kernels.table(report))
+        return OK
+    demand = live.Demand(
+        arrays=arguments.arrays,
+        clients=arguments.clients,
+        seconds=arguments.seconds,
+        watchers=arguments.watchers,
+        spacing_m=arguments.spacing,
+        rt60_s=arguments.rt60,
+        spin=arguments.spin,
+    )
+    with progress.counted("measuring", "s") as show:
+        outcome = live.measure(demand, SystemClock(), progress=show)
+    print(json.dumps(outcome.json()) if arguments.json else live.table(outcome))
+    return OK

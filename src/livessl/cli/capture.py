@@ -1,0 +1,47 @@
+"""`livessl capture`: a capture node, on its audio device or on what takes its place."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from livessl.capture.node import capture_device, capture_recordings
+from livessl.cli import argument, progress
+from livessl.cli.exits import OK, stop_on_signal
+from livessl.cli.node_input import audio_device, check_files, node_config, recordings, run_id
+from livessl.cli.options import add_joint, add_site, add_wav, read_site
+from livessl.clock import SystemClock
+from livessl.recordings.assign import span_ns
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add_site(parser)
+    parser.add_argument("--node", required=True, help="name of the node in the site file")
+    add_joint(parser)
+    add_wav(parser, "play FILE at real speed instead of the device; give one for each array of the node")
+    parser.add_argument("--loop", action="store_true", help="play the files again and again")
+    parser.add_argument(
+        "--start-at",
+        type=argument.time,
+        metavar="TIME",
+        help="when the files begin, RFC 3339 (default: now, or with several nodes the next full 5 s of the clock)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    site = read_site(arguments)
+    config = node_config(site, arguments.node, arguments.site)
+    check_files(arguments, config)
+    clock = SystemClock()
+    name = run_id(arguments.node, clock)
+    device = audio_device(arguments, config, clock)
+    if device is not None:
+        with stop_on_signal() as stop:
+            capture_device(site, arguments.node, device, clock, name, stop.is_set)
+        return OK
+    parts = recordings(arguments, site, clock.now_ns())
+    with stop_on_signal() as stop, progress.timed("playing", *span_ns(parts)) as bar:
+        capture_recordings(site, arguments.node, parts, clock, name, stop.is_set, bar)
+    return OK

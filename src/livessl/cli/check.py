@@ -1,0 +1,46 @@
+"""`livessl check`: whether a site file is valid, with every fault at once."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from livessl.cli.exits import OK, WRONG_USE
+from livessl.cli.options import add_json
+from livessl.cli.output import print_warnings
+from livessl.errors import ConfigError, Fault
+from livessl.site.build.grid import search_grid
+from livessl.site.checks import unprotected_addresses
+from livessl.site.load import load_site
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    parser.add_argument("site", type=Path, help="site file")
+    add_json(parser, "print the result as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    try:
+        site = load_site(arguments.site)
+        doors = unprotected_addresses(site)
+        if doors:
+            raise ConfigError([Fault(f"{arguments.site}: {door.where}", door.what) for door in doors])
+    except ConfigError as error:
+        if arguments.json:
+            faults = [{"where": fault.where, "what": fault.what} for fault in error.faults]
+            print(json.dumps({"valid": False, "faults": faults}))
+            return WRONG_USE
+        raise
+    grid = search_grid(site)
+    if arguments.json:
+        checked = {"valid": True, "faults": [], "warnings": list(site.warnings), "site": site.site}
+        print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
+    else:
+        print_warnings(site)
+        arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)
+        print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid points")
+    return OK

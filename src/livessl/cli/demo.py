@@ -1,0 +1,91 @@
+"""`livessl demo`: a simulated scene through real processes, with the error of every answer."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+import tempfile
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Any, Final
+
+from livessl.cli import argument, progress
+from livessl.cli.exits import FAILED, OK
+from livessl.cli.options import add_json
+from livessl.cli.output import xyz
+from livessl.clock import SystemClock
+from livessl.lab import demo
+
+WITHIN_M: Final = 0.5
+"""Largest error, in metres, of a sound that counts as located; the paper counts so, too."""
+
+_HEAD: Final = f"{'time':>7}  {'sound':<14} {'true position':<22} {'found':<22} {'error':>7}  status"
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    parser.add_argument("--once", action="store_true", help="run the scene once, print each event and its error")
+    add_json(parser)
+    parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default 8000)")
+    parser.add_argument("--events", type=argument.positive, default=8, help="sounds in the scene (default 8)")
+    parser.add_argument("--no-browser", action="store_true", help="do not open the dashboard")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    try:
+        return _show(arguments)
+    except KeyboardInterrupt:
+        if arguments.once:
+            raise
+        logging.info("stopped")
+        return OK
+
+
+def _show(arguments: argparse.Namespace) -> int:
+    clock = SystemClock()
+    with (
+        tempfile.TemporaryDirectory(prefix="livessl-demo-") as name,
+        progress.counted("simulating the room", "source") as bar,
+    ):
+        directory = Path(name)
+        site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
+        truth = demo.read_truth(directory)
+        with demo.running(directory, site, loop=not arguments.once, clock=clock) as (url, start_ns):
+            print(f"dashboard: {url}", file=sys.stderr)
+            if not arguments.once and not arguments.no_browser:
+                threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+            until_ns = start_ns + round((scene.duration_s + 1.5) * 1e9) if arguments.once else None
+            events = []
+            if not arguments.json:
+                print(_HEAD)
+            for event in demo.events_of(url, until_ns, clock):
+                events.append(event)
+                outcome = demo.nearest_source(truth, event, start_ns, scene.duration_s)
+                print(_as_json(outcome) if arguments.json else _as_row(outcome), flush=True)
+                if not arguments.once:
+                    events.clear()
+    outcomes = demo.match(truth, events, start_ns, scene.duration_s)
+    good = [o for o in outcomes if o.located and o.error_m is not None and o.error_m <= WITHIN_M]
+    surplus = len(events) - len({o.event["id"] for o in outcomes if o.event is not None})
+    summary = f"{len(good)} of {len(outcomes)} sounds located within {WITHIN_M:g} m; {surplus} events without a sound"
+    print(summary, file=sys.stderr)
+    return OK if len(good) == len(outcomes) else FAILED
+
+
+def _as_row(outcome: demo.Outcome) -> str:
+    event = outcome.event
+    assert event is not None
+    error = "-" if outcome.error_m is None else f"{outcome.error_m:.2f} m"
+    return (
+        f"{outcome.start_s:6.2f}s  {outcome.name:<14} {xyz(outcome.true_position_m):<22} "
+        f"{xyz(event['position_m']):<22} {error:>7}  {event['status']}"
+    )
+
+
+def _as_json(outcome: demo.Outcome) -> str:
+    truth = {"name": outcome.name, "start_s": outcome.start_s, "position_m": list(outcome.true_position_m)}
+    return json.dumps({**(outcome.event or {}), "truth": truth, "error_m": outcome.error_m})

@@ -1,0 +1,126 @@
+"""`livessl keys`: key pairs of server and nodes, and tokens of clients."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from livessl.cli import argument
+from livessl.cli.exits import OK
+from livessl.cli.options import add_json, add_site
+from livessl.errors import ConfigError, Fault
+from livessl.site import keys, tokens
+from livessl.site.load import load_site
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+
+    def action(name: str, act: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
+        sub = actions.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + ".", epilog=f"example: livessl keys {example}"
+        )
+        sub.set_defaults(act=act)
+        add_site(sub)
+        return sub
+
+    action("server", _server, "make the server's key pair", "server --site site.yaml")
+    sub = action("node", _node, "make a node's key pair, on the node", "node lab-pc --site site.yaml --server 4f8a…")
+    sub.add_argument("name", help="name of the node in the site file; `replay` for sending sessions to a server")
+    sub.add_argument(
+        "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` printed it"
+    )
+    sub = action("enrol", _enrol, "admit a node, on the server", "enrol lab-pc 9c01… --site site.yaml")
+    sub.add_argument("name", help="name of the node in the site file")
+    sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` printed it")
+    sub = action("token", _token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
+    sub.add_argument("--name", required=True, help="name of the client, to revoke its token by")
+    sub.add_argument("--role", choices=[str(role) for role in tokens.Role], default="viewer", help="default viewer")
+    sub = action("revoke", _revoke, "stop admitting a node or a client", "revoke --site site.yaml --token wall")
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument("--node", metavar="NAME")
+    which.add_argument("--token", metavar="NAME")
+    add_json(
+        action("list", _list, "list the nodes and clients that may connect", "list --site site.yaml"),
+        "print one JSON object",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    return int(arguments.act(arguments))
+
+
+def _folder(arguments: argparse.Namespace) -> Path:
+    site = load_site(arguments.site)
+    if site.keys is None:
+        what = "expected the folder that holds the keys, got none; add keys: keys to the site file"
+        raise ConfigError([Fault(f"{arguments.site}: keys", what)])
+    return site.file(site.keys)
+
+
+def _tokens_file(arguments: argparse.Namespace) -> Path:
+    site = load_site(arguments.site)
+    if site.server.http.tokens is None:
+        what = "expected the file that holds the tokens, got none; add tokens: tokens.yaml to server.http"
+        raise ConfigError([Fault(f"{arguments.site}: server.http.tokens", what)])
+    return site.file(site.server.http.tokens)
+
+
+def _server(arguments: argparse.Namespace) -> int:
+    key = keys.make_server_keys(_folder(arguments))
+    print(key.hex())
+    logging.info("the server's public key; on each node: livessl keys node NAME --site SITE --server %s", key.hex())
+    return OK
+
+
+def _node(arguments: argparse.Namespace) -> int:
+    key = keys.make_node_keys(_folder(arguments), arguments.name, arguments.server)
+    print(key.hex())
+    logging.info(
+        "the node's public key; on the server: livessl keys enrol %s %s --site SITE", arguments.name, key.hex()
+    )
+    return OK
+
+
+def _enrol(arguments: argparse.Namespace) -> int:
+    keys.enrol(_folder(arguments), arguments.name, arguments.key)
+    logging.info("node %r is enrolled; restart a running server, so that it admits the node", arguments.name)
+    return OK
+
+
+def _token(arguments: argparse.Namespace) -> int:
+    print(tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role))
+    logging.info("the token is shown only now; a running server accepts it within a second")
+    return OK
+
+
+def _revoke(arguments: argparse.Namespace) -> int:
+    if arguments.node is not None:
+        keys.dismiss(_folder(arguments), arguments.node)
+        logging.info("node %r is no longer enrolled; restart a running server to shut it out", arguments.node)
+    else:
+        tokens.revoke_token(_tokens_file(arguments), arguments.token)
+        logging.info("a running server refuses the token within a second")
+    return OK
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    site = load_site(arguments.site)
+    nodes = {} if site.keys is None else keys.enrolled(site.file(site.keys))
+    file = site.server.http.tokens
+    clients = () if file is None else tokens.read_tokens(site.file(file)).clients
+    if arguments.json:
+        listed = [{"name": client.name, "role": str(client.role)} for client in clients]
+        print(json.dumps({"nodes": {name: key.hex() for name, key in nodes.items()}, "clients": listed}))
+        return OK
+    for name, key in nodes.items():
+        print(f"node    {name:<20} {key.hex()}")
+    for client in clients:
+        print(f"client  {client.name:<20} {client.role}")
+    return OK

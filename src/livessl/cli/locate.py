@@ -1,0 +1,47 @@
+"""`livessl locate`: the whole pipeline on recordings, as fast as it can."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from livessl import offline
+from livessl.cli import progress
+from livessl.cli.exits import OK
+from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, read_site, wavs
+from livessl.cli.output import complain, print_event, print_warnings
+from livessl.clock import UnpacedClock
+from livessl.core.types import Event
+from livessl.recordings.assign import assign_files, span_ns
+from livessl.server.api.encode import Messages
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add_site(parser)
+    add_wav(parser, "recording of an array; all begin together", required=True)
+    add_method(parser)
+    add_joint(parser)
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    site = read_site(arguments)
+    print_warnings(site)
+    parts = assign_files(site, *wavs(arguments))
+    messages = Messages(site, 0, utc=False)
+    found = 0
+    with progress.timed("locating", *span_ns(parts)) as bar:
+        for output in offline.run(site, parts, UnpacedClock(), method=arguments.method, progress=bar):
+            if isinstance(output, Event):
+                found += 1
+                print_event(messages.event(output), as_json=arguments.json)
+    if not found:
+        factor = site.activity.floor_factor
+        complain(
+            f"no sound found: nothing rose {factor:g} times in power above the background; "
+            "see activity.floor_factor and band_hz in the site file",
+            kind="note",
+        )
+    return OK

@@ -1,0 +1,86 @@
+"""Options that several commands share, and how their values are read."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from livessl.cli import argument
+from livessl.errors import ConfigError, Fault
+from livessl.site.load import load_site
+from livessl.site.models import METHODS, Site
+
+T = TypeVar("T")
+
+
+def add_site(parser: Any) -> None:
+    """Add --site."""
+    parser.add_argument("--site", type=Path, required=True, help="site file")
+
+
+def add_method(parser: Any) -> None:
+    """Add --method."""
+    parser.add_argument("--method", choices=sorted(METHODS), help="estimator (default: the site's)")
+
+
+def add_json(parser: Any, text: str = "print one JSON object per event") -> None:
+    """Add --json."""
+    parser.add_argument("--json", action="store_true", help=text)
+
+
+def add_joint(parser: Any) -> None:
+    """Add --joint."""
+    parser.add_argument(
+        "--joint",
+        action="append",
+        type=argument.joint,
+        default=[],
+        metavar="NAME=ARRAY,ARRAY,…",
+        help="process arrays of one node as a single array, in addition to those that the site file joins",
+    )
+
+
+def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
+    """Add --wav and --channels."""
+    parser.add_argument(
+        "--wav",
+        action="append",
+        type=argument.assignment,
+        default=[],
+        metavar="ARRAY=FILE",
+        help=text,
+        required=required,
+    )
+    parser.add_argument(
+        "--channels",
+        action="append",
+        type=argument.channels,
+        default=[],
+        metavar="ARRAY=1,2,3,4",
+        help="channels of the file, from 1, in microphone order",
+    )
+
+
+def read_site(arguments: argparse.Namespace) -> Site:
+    """Read the site file that --site names, with the arrays that --joint joins."""
+    return load_site(arguments.site, joints(arguments))
+
+
+def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
+    """Return the arrays that --joint joins, by the name of the joint array."""
+    return _each_once(arguments.joint, "--joint")
+
+
+def wavs(arguments: argparse.Namespace) -> tuple[dict[str, Path], dict[str, list[int]]]:
+    """Return the files of --wav and the channels of --channels, by array."""
+    return _each_once(arguments.wav, "--wav"), _each_once(arguments.channels, "--channels")
+
+
+def _each_once(pairs: Sequence[tuple[str, T]], option: str) -> dict[str, T]:
+    names = [name for name, _ in pairs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; remove one")])
+    return dict(pairs)

@@ -1,0 +1,55 @@
+"""`livessl plan`: the error to expect, before anything is built, and advice on where arrays should go."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from livessl.cli import argument, progress
+from livessl.cli.exits import OK, WRONG_USE
+from livessl.cli.options import add_json, add_site
+from livessl.cli.output import complain
+from livessl.lab.plan import design, figure, words
+from livessl.site.load import load_site
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add_site(parser)
+    parser.add_argument(
+        "--rt60", type=argument.not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)"
+    )
+    parser.add_argument(
+        "--height", type=argument.not_negative, metavar="M", help="height of the sounds (default 1.5, if searched)"
+    )
+    parser.add_argument(
+        "--calibration",
+        type=argument.above_zero,
+        default=design.CALIBRATION_M,
+        metavar="M",
+        help=f"standard deviation of the microphones' positions (default {design.CALIBRATION_M:g})",
+    )
+    add_json(parser, "print one JSON object")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    site = load_site(arguments.site)
+    if arguments.out is not None:
+        figure.require_matplotlib()
+    try:
+        with progress.counted("trying positions", "array") as bar:
+            plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
+    except ValueError as error:
+        complain(str(error))
+        return WRONG_USE
+    result = words.as_json(plan)
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
+        figure.draw(plan, arguments.out / "plan.png")
+    print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))
+    return OK

@@ -1,0 +1,38 @@
+"""`livessl serve`: the fusion server, its API and its dashboard."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from typing import Any
+
+from livessl.cli.exits import OK
+from livessl.cli.options import add_joint, add_method, add_site, read_site
+from livessl.cli.output import print_warnings
+from livessl.clock import SystemClock
+from livessl.server.app import Server
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add_site(parser)
+    add_method(parser)
+    add_joint(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    site = read_site(arguments)
+    print_warnings(site)
+    server = Server(site, SystemClock(), method=arguments.method)
+    logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
+    run_until_stopped(server)
+    return OK
+
+
+def run_until_stopped(server: Server) -> None:
+    """Run a server until it ends, or until Ctrl-C or SIGTERM."""
+    try:
+        server.run()
+    except KeyboardInterrupt:
+        logging.info("stopped")

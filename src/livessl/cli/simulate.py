@@ -1,0 +1,59 @@
+"""`livessl simulate`: what the arrays of a site would record of a scene, as a session on disk."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+from typing import Any
+
+from livessl.cli import argument, progress
+from livessl.cli.exits import OK, WRONG_USE
+from livessl.cli.options import add_site
+from livessl.cli.output import complain
+from livessl.errors import ConfigError, Fault
+from livessl.recordings.session import SESSION_FILE
+from livessl.simulation.export import TRUTH_FILE, write_scene
+from livessl.simulation.of_site import scene_of
+from livessl.simulation.scene import read_sounds
+from livessl.site.load import load_site
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add_site(parser)
+    parser.add_argument(
+        "--events", type=Path, metavar="DIR", help="WAV or FLAC files to play (default: our own sounds)"
+    )
+    parser.add_argument(
+        "--rt60", type=argument.rt60, default=0.7, metavar="S", help="reverberation time, 0 to 5 (default 0.7)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder without recordings")
+    parser.add_argument("--count", type=argument.positive, default=8, help="sounds in the scene (default 8)")
+    parser.add_argument("--sample-rate", type=argument.positive, default=44100, metavar="HZ", help="default 44100")
+    parser.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    site = load_site(arguments.site)
+    if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
+        raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
+    rate = float(arguments.sample_rate)
+    try:
+        sounds = read_sounds(arguments.events, rate) if arguments.events else None
+        scene = scene_of(
+            site,
+            rt60_s=arguments.rt60,
+            sounds=sounds,
+            count=arguments.count,
+            sample_rate_hz=rate,
+            seed=arguments.seed,
+        )
+        with progress.counted("simulating the room", "source") as bar:
+            write_scene(arguments.out, site, scene, seed=arguments.seed, progress=bar)
+    except ValueError as error:
+        complain(str(error))
+        return WRONG_USE
+    logging.info("%d sounds in %.1f s written to %s", len(scene.sources), scene.duration_s, arguments.out)
+    return OK

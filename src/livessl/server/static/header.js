@@ -1,0 +1,91 @@
+// The bar at the top: site, mode, privacy, latency, array count, server time and connection; and the notices below it.
+
+import { find, write } from "./dom.js";
+import { clock, counted, duration, milliseconds, stageText } from "./format.js";
+import { shownState } from "./model.js";
+
+/** How long, in milliseconds, the notice of skipped messages stays. */
+const NOTICE_MS = 20000;
+/** Time, in milliseconds, that the first connection may take before the page reports a problem. */
+const FIRST_CONTACT_MS = 1000;
+const LINK_WORDS = { live: "connected", stale: "stale", down: "offline" };
+
+export class Header {
+  constructor() {
+    this.skipped = 0;
+    this.noticeTimer = null;
+    find("gap-close").addEventListener("click", () => this.#closeNotice());
+  }
+
+  showSite(name, mode) {
+    write(find("site-name"), name ?? "");
+    document.title = name ? `${name} · livessl` : "livessl";
+    const chip = find("mode");
+    chip.hidden = !mode;
+    chip.dataset.mode = mode ?? "";
+    write(chip, mode ?? "");
+    write(find("vital-clock-label"), mode === "replay" ? "recording time" : "server time");
+  }
+
+  showPrivacy({ mode, retention_days: days }) {
+    const positionsOnly = mode === "positions-only";
+    const chip = find("privacy");
+    chip.hidden = !positionsOnly && days === null;
+    const words = [positionsOnly ? "positions only" : null, days === null ? null : `kept ${days} d`];
+    write(chip, words.filter(Boolean).join(" · "));
+    const sound = positionsOnly ? "No sound is stored" : "Sound may be recorded";
+    chip.title = `${sound}. Events are ${days === null ? "never deleted" : `deleted after ${days} days`}.`;
+  }
+
+  /** Show the median latency of each kind of result; a tooltip splits it into stages. */
+  showLatency({ update, event }) {
+    const kinds = Object.entries({ live: update, event }).filter(([, results]) => results.length > 0);
+    const each = kinds.map(([name, results]) => `${name} ${milliseconds(median(results.map((one) => one.latency_s)))}`);
+    write(find("vital-latency"), each.join(" · ") || "–");
+    find("vital-latency").title = kinds.map(([name, results]) => {
+      const all = results.map((one) => one.latency_stages_s).filter(Boolean);
+      const medians = Object.keys(all[0] ?? {}).map((stage) => [stage, median(all.map((stages) => stages[stage]))]);
+      return medians.length > 0 ? `${name}: ${stageText(Object.fromEntries(medians))}` : "";
+    }).filter(Boolean).join("\n");
+  }
+
+  showLink(link, silentMs) {
+    document.body.dataset.link = link;
+    find("connection").dataset.state = link;
+    write(find("connection-word"), link === "down" && silentMs === null ? "connecting" : LINK_WORDS[link]);
+    find("banner").hidden = link === "live" || (silentMs === null && performance.now() < FIRST_CONTACT_MS);
+    write(find("banner-text"), link === "stale" ? "No message from the server" : "Server unreachable; reconnecting");
+    const silence = silentMs === null ? null : duration(silentMs / 1000);
+    const suffix = link === "stale" ? ` for ${silence}` : ` (last contact ${silence} ago)`;
+    write(find("banner-for"), silence === null ? "" : suffix);
+  }
+
+  /** Report that messages were skipped; `missed` is null where the server does not know how many. */
+  showGap({ missed, reason }) {
+    this.skipped = missed === null || this.skipped === null ? null : this.skipped + missed;
+    const what = this.skipped === null ? "Some messages" : counted(this.skipped, "message");
+    write(find("gap-text"), `${what} skipped${reason ? ` (${reason})` : ""}; event list reloaded`);
+    find("gap").hidden = false;
+    clearTimeout(this.noticeTimer);
+    this.noticeTimer = setTimeout(() => this.#closeNotice(), NOTICE_MS);
+  }
+
+  #closeNotice() {
+    this.skipped = 0;
+    find("gap").hidden = true;
+  }
+
+  /** Show what changes with time. */
+  tick({ arrays, link }, serverNowMs) {
+    const live = link === "live";
+    const healthy = arrays.filter(({ array }) => shownState(array, link) === "healthy").length;
+    const vital = find("vital-arrays");
+    write(vital, live && arrays.length > 0 ? `${healthy} of ${arrays.length} healthy` : "–");
+    vital.dataset.tone = live && healthy < arrays.length ? "warn" : "fine";
+    write(find("vital-clock"), live ? clock(serverNowMs, false) : "–");
+  }
+}
+
+function median(values) {
+  return values.sort((a, b) => a - b)[values.length >> 1];
+}

@@ -1,0 +1,122 @@
+"""Scenes in a site's own room, and what its arrays would record of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from livessl.core.types import ArraySpec, Float32Array
+from livessl.simulation.scene import NamedSound, Scene, make_scene, render, synthesised_sounds
+from livessl.site.load import load_site
+from livessl.site.models import Site
+
+DEFAULT_RATE_HZ = 44100.0
+"""Sampling rate, in hertz, where neither the caller nor the site says one: the paper's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """A simulated scene as the arrays of a site would record it.
+
+    Parameters
+    ----------
+    scene : Scene
+        Room and sources: `scene.sources` has the true positions and start times.
+    recordings : mapping of array name to (channels, n) float32
+        What each array records; all begin together.
+    sample_rate_hz : float
+        Sampling rate of the recordings.
+    """
+
+    scene: Scene
+    recordings: Mapping[str, Float32Array]
+    sample_rate_hz: float
+
+
+def simulate(
+    site: Site | Path | str,
+    *,
+    rt60_s: float = 0.7,
+    count: int = 8,
+    sample_rate_hz: float | None = None,
+    sounds: Sequence[NamedSound] | None = None,
+    seed: int = 0,
+) -> Simulation:
+    """Simulate sounds at random places in a site's room, recorded by its arrays.
+
+    Parameters
+    ----------
+    site : Site, Path or str
+        A site, or the path of a site file.
+    rt60_s : float
+        Reverberation time, seconds.
+    count : int
+        Number of sounds, one after the other.
+    sample_rate_hz : float or None
+        Sampling rate, hertz; None takes the rate of the site's first device, or 44100.
+    sounds : sequence of (name, (n,) float32) or None
+        What is played, at that rate; None takes the project's own sounds.
+    seed : int
+        The same seed and arguments give the same recordings.
+
+    Raises
+    ------
+    ValueError
+        Where there is no such scene: see `make_scene`.
+    """
+    site = site if isinstance(site, Site) else load_site(site)
+    rate_hz = sample_rate_hz or _device_rate_hz(site)
+    scene = scene_of(site, rt60_s=rt60_s, sounds=sounds, count=count, sample_rate_hz=rate_hz, seed=seed)
+    recordings = {spec.name: samples for spec, samples in rendered(site, scene, seed=seed)}
+    return Simulation(scene, recordings, rate_hz)
+
+
+def scene_of(
+    site: Site,
+    *,
+    rt60_s: float,
+    count: int,
+    sample_rate_hz: float,
+    sounds: Sequence[NamedSound] | None = None,
+    seed: int,
+) -> Scene:
+    """Place sounds at random in a site's room, away from its arrays: see `simulate` and `make_scene`."""
+    return make_scene(
+        site.room.size_m,
+        rt60_s=rt60_s,
+        sounds=synthesised_sounds(sample_rate_hz, seed) if sounds is None else sounds,
+        count=count,
+        sample_rate_hz=sample_rate_hz,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=seed,
+    )
+
+
+def rendered(
+    site: Site,
+    scene: Scene,
+    arrays: Sequence[str] | None = None,
+    *,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[ArraySpec, Float32Array]]:
+    """Yield each array of a site, or each of those named, with what it records of a scene (channels, n).
+
+    An array's noise depends on the seed and on its place in the site file alone, so arrays may be rendered apart.
+    """
+    chosen = [(number, spec) for number, spec in enumerate(site.specs) if arrays is None or spec.name in arrays]
+    total = len(chosen) * len(scene.sources)
+    for turn, (number, spec) in enumerate(chosen):
+
+        def report(done: int, of_array: int, before: int = turn * len(scene.sources)) -> None:  # noqa: ARG001
+            if progress is not None:
+                progress(before + done, total)
+
+        yield spec, render(scene, spec.microphones_m, seed=seed + 1 + number, progress=report)
+
+
+def _device_rate_hz(site: Site) -> float:
+    rates = (node.device.sample_rate_hz for node in site.nodes.values())
+    return next((rate for rate in rates if rate is not None), DEFAULT_RATE_HZ)

@@ -1,0 +1,23 @@
+"""Base class and field types that the models of the site file share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+Interval = tuple[Coordinate, Coordinate]
+Bounds = tuple[Interval, Interval, Interval]
+BandHz = tuple[Annotated[float, Field(ge=0)], Positive]
+
+FileName = Annotated[str, Field(min_length=1)]
+"""Path of a file or folder; `Site.file` resolves it from the site file's folder."""
+
+
+class Model(BaseModel):
+    """Base of all models of the site file: frozen, and without unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,0 +1,156 @@
+"""Faults of YAML files: their places, their lines, and one sentence for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, Final, get_args
+
+import yaml
+from pydantic import BaseModel
+
+from livessl.errors import Fault
+
+Place = tuple[str | int, ...]
+"""Place in a file: keys and indices from the top down."""
+
+Finding = tuple[Place, str]
+"""A place in a file and the fault there, in one sentence."""
+
+_SENTENCES: Final = {
+    "missing": "missing; add it",
+    "greater_than": "expected a value greater than {gt:g}, got {got}",
+    "greater_than_equal": "expected a value greater than or equal to {ge:g}, got {got}",
+    "less_than": "expected a value less than {lt:g}, got {got}",
+    "less_than_equal": "expected a value less than or equal to {le:g}, got {got}",
+    "finite_number": "expected a finite number, got {got}",
+    "literal_error": "expected {expected}, got {got}",
+    "string_pattern_mismatch": "expected letters, digits, '.', '_' or '-' only, got {got}",
+    "string_too_short": "expected at least {min_length} characters, got {got}",
+    "string_too_long": "expected at most {max_length} characters, got {got}",
+    "too_short": "expected at least {min_length} items, got {actual_length}",
+    "too_long": "expected at most {max_length} items, got {actual_length}",
+}
+"""Sentence for each type of pydantic error; other types keep pydantic's own."""
+
+
+def read_yaml(text: str) -> Any:
+    """Return the value of a YAML text.
+
+    Raises
+    ------
+    yaml.YAMLError
+        If it is not YAML, or holds an impossible value such as the 45th of a month.
+    """
+    try:
+        return yaml.safe_load(text)
+    except (ValueError, KeyError, AttributeError, RecursionError) as error:  # the library's constructors leak these
+        raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
+
+
+class Locator:
+    """Turns a place inside a file into "file:line: place".
+
+    Parameters
+    ----------
+    source : str
+        Name of the file.
+    root : yaml.Node or None
+        The file's YAML nodes.
+    """
+
+    def __init__(self, source: str, root: yaml.Node | None) -> None:
+        self._source = source
+        self._lines = {tuple(map(str, place)): line for place, line in _lines(root)}
+
+    def fault(self, place: Place, what: str) -> Fault:
+        """Return a fault with the line of `place`, or of the innermost part of it that the file has."""
+        known = tuple(map(str, place))
+        while known and known not in self._lines:
+            known = known[:-1]
+        line = self._lines.get(known)
+        where = self._source if line is None else f"{self._source}:{line}"
+        return Fault(f"{where}: {dotted(place)}" if place else where, what)
+
+
+def dotted(place: Place) -> str:
+    """Return a place as text, such as `arrays.north.position_m.0`."""
+    return ".".join(map(str, place))
+
+
+def duplicate_keys(node: yaml.Node | None, place: Place = ()) -> Iterator[Finding]:
+    """Yield keys that a mapping holds twice."""
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            here = (*place, key.value)
+            if key.value in seen:
+                yield here, "expected each key once, got it twice; remove one"
+            seen.add(key.value)
+            yield from duplicate_keys(value, here)
+
+
+def validation_findings(model: type[BaseModel], errors: Iterable[Mapping[str, Any]]) -> list[Finding]:
+    """Return pydantic's errors for a file that `model` describes, each as one sentence."""
+    found: list[Finding] = []
+    for error in errors:
+        place = tuple(part for part in error["loc"] if part != "[key]")
+        if error["type"] == "extra_forbidden":
+            found.append((place, unknown_key(str(place[-1]), _keys_at(model, place[:-1]))))
+        else:
+            found.append((place, _sentence(error)))
+    return found
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """Return the sentence for a key that is not known, with the known key that it may be a slip of."""
+    similar = get_close_matches(key, list(known), 1)
+    return f"unknown key {key!r}; " + (f"did you mean {similar[0]!r}?" if similar else "remove it")
+
+
+def unknown_array(name: str, known: Iterable[str]) -> str:
+    """Return the sentence for an array that the file does not have."""
+    return f"expected one of the arrays {', '.join(known)}, got {name!r}; correct the name or add the array"
+
+
+def reason(error: Exception) -> str:
+    """Return why something could not be read, without its path."""
+    return getattr(error, "strerror", None) or str(error)
+
+
+def _sentence(error: Mapping[str, Any]) -> str:
+    got = error.get("input")
+    template = _SENTENCES.get(error["type"])
+    if template is not None:
+        text = template.format(**{**error.get("ctx", {}), "got": repr(got)})
+        return text.replace("least 1 items", "least 1 item")
+    message = str(error["msg"]).removeprefix("Value error, ").replace("Input should be", "expected")
+    simple = isinstance(got, str | int | float | bool) or got is None
+    return f"{message}, got {got!r}" if simple and "got" not in message else message
+
+
+def _keys_at(model: type[BaseModel], place: Place) -> list[str]:
+    """Return the keys that the models know at a place; parts that are no field are names or indices."""
+    models = [model]
+    for part in place:
+        annotations = [known.model_fields[part].annotation for known in models if part in known.model_fields]
+        models = [inner for annotation in annotations for inner in _models_in(annotation)] or models
+    return [key for known in models for key in known.model_fields]
+
+
+def _models_in(annotation: Any) -> Sequence[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models_in(part)]
+
+
+def _lines(node: yaml.Node | None, place: Place = ()) -> Iterator[tuple[Place, int]]:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            here = (*place, key.value)
+            yield here, key.start_mark.line + 1
+            yield from _lines(value, here)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            yield (*place, index), value.start_mark.line + 1
+            yield from _lines(value, (*place, index))

@@ -1,0 +1,97 @@
+"""Models of the site file's `nodes`: devices, spools, and the arrays on a node's channels."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from livessl.site.addresses import check_endpoint
+from livessl.site.fields import FileName, Model, Positive
+
+
+def _from_one(channel: int) -> int:
+    if channel < 1:
+        raise ValueError(f"expected a channel number from 1 on, got {channel}; channels count from 1")
+    return channel
+
+
+Channel = Annotated[int, AfterValidator(_from_one)]
+"""Channel of a device, counted from 1."""
+
+
+class SoundDeviceConfig(Model):
+    """An audio interface, by name."""
+
+    type: Literal["sound"] = "sound"
+    name: str
+    sample_rate_hz: Positive = 48000.0
+    block_s: Annotated[float, Field(gt=0, le=1)] = 0.02
+
+
+class WavDeviceConfig(Model):
+    """The fake device: recorded files, played at real speed."""
+
+    type: Literal["wav"]
+    files: dict[str, FileName]
+    sample_rate_hz: Positive | None = None
+    loop: bool = False
+
+
+class SceneDeviceConfig(Model):
+    """A simulated scene, played at real speed."""
+
+    type: Literal["scene"]
+    rt60_s: Annotated[float, Field(ge=0, le=100)] = 0.7
+    events: Annotated[int, Field(ge=1)] = 8
+    seed: int = 0
+    sample_rate_hz: Positive = 44100.0
+    loop: bool = True
+
+
+DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
+
+
+class SpoolConfig(Model):
+    """Store for the frames that the server may still need: a folder, or by default the memory."""
+
+    directory: FileName | None = None
+    max_mb: Positive = 512.0
+    max_age_s: Positive = 3600.0
+
+
+class NodeConfig(Model):
+    """A capture node: one device, and one or more arrays on its channels, which count from 1."""
+
+    server: str = "tcp://127.0.0.1:5570"
+    device: DeviceConfig
+    spool: SpoolConfig = SpoolConfig()
+    arrays: Annotated[dict[str, list[Channel]], Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sound_by_default(cls, data: Any) -> Any:
+        device = data.get("device") if isinstance(data, dict) else None
+        if isinstance(device, dict) and "type" not in device:
+            return {**data, "device": {"type": "sound", **device}}
+        return data
+
+    @field_validator("device", mode="before")
+    @classmethod
+    def _by_type(cls, device: Any) -> Any:
+        if not isinstance(device, dict):
+            raise ValueError("expected a mapping such as {name: UMC1820, sample_rate_hz: 44100}")
+        kinds: dict[str, type[Model]] = {
+            "sound": SoundDeviceConfig,
+            "wav": WavDeviceConfig,
+            "scene": SceneDeviceConfig,
+        }
+        kind = kinds.get(str(device.get("type")))
+        if kind is None:
+            raise ValueError(f"type: expected one of {', '.join(kinds)}, got {device.get('type')!r}")
+        return kind.model_validate(device)
+
+    @field_validator("server")
+    @classmethod
+    def _endpoint(cls, endpoint: str) -> str:
+        return check_endpoint(endpoint)

@@ -1,0 +1,56 @@
+"""Models of the site file's `server` and `store`: the fusion server, its API, its sinks and its history."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from livessl.site.addresses import check_endpoint
+from livessl.site.fields import FileName, Model, Positive
+
+
+class HttpConfig(Model):
+    """Address, access tokens and certificate of the API and the dashboard."""
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    tokens: FileName | None = None
+    certificate: FileName | None = None
+    private_key: FileName | None = None
+
+    @model_validator(mode="after")
+    def _pair(self) -> HttpConfig:
+        if (self.certificate is None) != (self.private_key is None):
+            raise ValueError(
+                "expected certificate and private_key, got "
+                f"{'private_key' if self.certificate is None else 'certificate'} alone; add the other one"
+            )
+        return self
+
+
+class SinkConfig(Model):
+    """Another destination of events: a file with one JSON object a line."""
+
+    type: Literal["jsonl"]
+    path: FileName
+
+
+class ServerConfig(Model):
+    """The fusion server."""
+
+    bind: str = "tcp://127.0.0.1:5570"
+    http: HttpConfig = HttpConfig()
+    events_db: str | None = None
+    sinks: tuple[SinkConfig, ...] = ()
+
+    @field_validator("bind")
+    @classmethod
+    def _endpoint(cls, endpoint: str) -> str:
+        return check_endpoint(endpoint, wildcards=True)
+
+
+class StoreConfig(Model):
+    """Retention of events in days; None keeps them for ever."""
+
+    retention_days: Positive | None = None

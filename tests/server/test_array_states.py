@@ -1,0 +1,133 @@
+"""States of the arrays: reported at once when one changes, else twice a second, and hidden while one is disabled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from world import START, HandClock
+
+from livessl import wire
+from livessl.core.types import FRAME_NS
+from livessl.server.api.encode import JsonObject
+from livessl.server.array_states import REPORT_NS, WATCH_NS, ArrayStates
+from livessl.server.ingest import Ingest
+from livessl.server.run import live_run
+from livessl.server.site_time import SiteTime
+from livessl.server.store import Finalized, Store, StoreError
+from small_site import mark, site_of
+
+SITE = site_of()
+HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
+
+
+class ReadOnlyStore(Store):
+    """A store that takes nothing."""
+
+    def enable(self, site: str, array: str, enabled: bool) -> None:
+        raise StoreError("disk full")
+
+
+def for_each(function: Callable[[Any], None], items: Iterable[Any]) -> None:
+    for item in items:
+        function(item)
+
+
+class Desk:
+    """Array states with all that they need, and a fusion to describe."""
+
+    def __init__(self, store: Store | None = None) -> None:
+        self.clock = HandClock()
+        self.ingest = Ingest(SITE)
+        self.published: list[JsonObject] = []
+        self.store = Store() if store is None else store
+        site_time = SiteTime(self.clock)
+        self.states = ArrayStates(SITE, self.clock, self.store, site_time, self.ingest, self.published.append)
+        self.fusion = live_run(SITE, Finalized(None, None), for_each).fusion
+        self.states.follow(self.fusion)
+        self.pace = 0
+
+    def greet(self, hello: wire.Hello = HELLO) -> None:
+        self.ingest.receive(b"p1", wire.encode(hello), self.clock.monotonic_ns())
+
+    def quiet(self, *arrays: str) -> None:
+        """One frame index passes, and these arrays send a mark of it."""
+        self.pace += 1
+        self.clock.time_ns += FRAME_NS
+        marks = [mark(0, START + self.pace - 1, array) for array in arrays]
+        self.fusion.step(marks, self.clock.now_ns())
+
+    def array(self, name: str) -> dict[str, Any]:
+        return next(array for array in self.states.describe() if array["name"] == name)
+
+
+def states(message: JsonObject) -> dict[str, str]:
+    return {array["name"]: array["state"] for array in message["arrays"]}
+
+
+def test_states_are_published_twice_a_second_and_at_once_when_one_changes(caplog: pytest.LogCaptureFixture) -> None:
+    desk = Desk()
+    times_ns: list[int] = []
+    with caplog.at_level("INFO"):
+        for _ in range(10 * REPORT_NS // WATCH_NS):
+            desk.clock.time_ns += WATCH_NS
+            desk.states.watch()
+            desk.states.watch()  # looks no oftener than every WATCH_NS
+            times_ns += [desk.clock.time_ns] * (len(desk.published) - len(times_ns))
+        assert [later - earlier for earlier, later in pairwise(times_ns)] == [REPORT_NS] * 9
+        assert caplog.text == ""
+        desk.pace = (desk.clock.time_ns - START * FRAME_NS) // FRAME_NS
+        desk.quiet("north")
+        desk.clock.time_ns += WATCH_NS
+        desk.states.watch()
+    assert len(desk.published) == 11
+    assert states(desk.published[-2]) == {"north": "starting", "south": "starting"}
+    assert states(desk.published[-1]) == {"north": "healthy", "south": "starting"}
+    assert "array 'north' is healthy" in caplog.text
+
+
+def test_disabled_state_hides_the_other_one_and_names_it() -> None:
+    desk = Desk()
+    desk.quiet("north", "south")
+    desk.states.enable("north", False)
+    assert desk.states.disabled == {"north"}
+    north = desk.array("north")
+    assert (north["state"], north["enabled"]) == ("disabled", False)
+    assert north["reason"] == "an operator has disabled it, and its sound is not used; otherwise healthy"
+    assert (desk.array("south")["state"], desk.array("south")["enabled"]) == ("healthy", True)
+    desk.states.enable("north", True)
+    assert desk.array("north")["state"] == "healthy"
+
+
+def test_array_stays_enabled_if_the_store_cannot_remember_otherwise() -> None:
+    desk = Desk(ReadOnlyStore())
+    with pytest.raises(StoreError):
+        desk.states.enable("north", False)
+    assert desk.states.disabled == frozenset()
+
+
+def test_store_remembers_what_is_disabled() -> None:
+    desk = Desk()
+    desk.states.enable("south", False)
+    assert Desk(desk.store).states.disabled == {"south"}
+
+
+def test_problem_that_a_node_reports_degrades_its_arrays() -> None:
+    desk = Desk()
+    desk.greet(replace(HELLO, problem="input device 'UMC1820' is not connected"))
+    desk.quiet("north", "south")
+    north = desk.array("north")
+    assert (north["state"], north["reason"]) == ("degraded", "input device 'UMC1820' is not connected")
+
+
+def test_array_whose_node_greets_without_sound_is_quiet_and_not_lost() -> None:
+    desk = Desk()
+    desk.quiet("north", "south")
+    desk.clock.time_ns += 3_000_000_000
+    assert desk.array("north")["state"] == "lost"
+    desk.greet()
+    north = desk.array("north")
+    assert (north["state"], north["reason"]) == ("quiet", "its node is there, but no sound comes from its device")

@@ -1,0 +1,69 @@
+"""Links of the Markdown documents lead to files and headings that exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS_WITHOUT_DOCUMENTS = {".git", ".venv", "node_modules", "build", "dist"}
+LINK = re.compile(r"\]\(\s*<?([^()\s<>]+)>?(?:\s+\"[^\"]*\")?\s*\)")
+CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+
+
+def documents() -> list[Path]:
+    return [
+        path
+        for path in sorted(ROOT.rglob("*.md"))
+        if not FOLDERS_WITHOUT_DOCUMENTS.intersection(path.relative_to(ROOT).parts)
+    ]
+
+
+def anchors(path: Path) -> set[str]:
+    """Names that GitHub gives to the headings of a document."""
+    names: set[str] = set()
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for heading in re.findall(r"^#{1,6} +(.+?) *$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")
+        name = base = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        number = 0
+        while name in names:
+            number += 1
+            name = f"{base}-{number}"
+        names.add(name)
+    return names
+
+
+def broken_links(path: Path) -> list[str]:
+    broken = []
+    for target in LINK.findall(CODE.sub("", path.read_text(encoding="utf-8"))):
+        if re.match(r"[a-z][a-z0-9+.-]*:", target):
+            continue
+        name, _, anchor = unquote(target).partition("#")
+        file = (path.parent / name).resolve() if name else path
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+            broken.append(target)
+    return broken
+
+
+def test_there_are_documents_to_check() -> None:
+    assert {"README.md", "CHANGELOG.md"} <= {path.name for path in documents()}
+
+
+@pytest.mark.parametrize("path", documents(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_relative_links_of_a_document_resolve(path: Path) -> None:
+    assert broken_links(path) == []
+
+
+def test_a_link_to_a_missing_file_or_heading_is_found(tmp_path: Path) -> None:
+    (tmp_path / "other.md").write_text("# Other\n\n## `Some` heading, twice\n", encoding="utf-8")
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Page\n[a](other.md#some-heading-twice) [b](#page) [c](https://example.org) `[d](code.md)`\n"
+        "[e](gone.md) [f](other.md#gone) [g](#gone)\n",
+        encoding="utf-8",
+    )
+    assert broken_links(page) == ["gone.md", "other.md#gone", "#gone"]
