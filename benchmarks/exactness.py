@@ -2,7 +2,7 @@
 
     python benchmarks/exactness.py --out docs/performance
 
-All rules of fusion, two to eight arrays, a voice, two voices and noise, grids of 0.1 and 0.05 m; the maps are those of
+Two to eight arrays, a voice, two voices and noise, grids of 0.1 and 0.05 m; the maps are those of
 the compiled mapper, the search may look up as much as it needs. How many searches the shipped limit gives up is told
 beside.
 """
@@ -16,14 +16,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 import machine
 from livessl.cli.progress import counted
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.kernels import kernels
-from livessl.core.locate.peak_search import MOST_LOOK_UPS, PeakSearch, Rule
+from livessl.core.locate.peak_search import MOST_LOOK_UPS, PeakSearch
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import Evidence, Float32Array
 from livessl.lab.bench.kernels import C_M_S, KINDS, PLACES_M, RATE_HZ, Blocks, array_specs
@@ -32,7 +31,7 @@ from peers import room_grid
 COUNTS: Final = (2, 3, 4, 6, 8)
 SPACINGS_M: Final = (0.1, 0.05)
 SOUNDS: Final = 6
-"""Of each kind: with all else 540 maps."""
+"""Of each kind: with all else 180 maps."""
 
 UNBOUNDED: Final = sys.maxsize
 
@@ -54,7 +53,7 @@ def compare(
     specs = array_specs(max(counts))
     blocks = Blocks(specs)
     gcc = [GCCPhat(spec, RATE_HZ, C_M_S) for spec in specs]
-    cases: dict[tuple[float, int, str, str], dict[str, int]] = {}
+    cases: dict[tuple[float, int, str], dict[str, int]] = {}
     done, total = 0, len(spacings_m) * len(KINDS) * sounds
     for spacing_m in spacings_m:
         grid = room_grid(spacing_m)
@@ -68,29 +67,26 @@ def compare(
                     Evidence(s, make([x])) for s, make, x in zip(specs, gcc, blocks.sound(kind, number), strict=True)
                 ]
                 maps = [mapper(one.gcc) for mapper, one in zip(mappers, heard, strict=True)]
-                for rule in Rule:
-                    for count, node, value in _peaks(maps, counts, rule):
-                        (free,) = search.among(heard[:count], rule, UNBOUNDED)(1)
-                        (limited,) = search.among(heard[:count], rule)(1)
-                        case = cases.setdefault(
-                            (spacing_m, count, kind, rule.name.lower()),
-                            {"maps": 0, "same": 0, "given_up": 0, "right_all_the_same": 0},
-                        )
-                        case["maps"] += 1
-                        case["same"] += (free.node, free.power, free.proven) == (node, value, True)
-                        case["given_up"] += not limited.proven
-                        case["right_all_the_same"] += not limited.proven and limited.node == node
+                for count, node, value in _peaks(maps, counts):
+                    (free,) = search.among(heard[:count], UNBOUNDED)(1)
+                    (limited,) = search.among(heard[:count])(1)
+                    case = cases.setdefault(
+                        (spacing_m, count, kind), {"maps": 0, "same": 0, "given_up": 0, "right_all_the_same": 0}
+                    )
+                    case["maps"] += 1
+                    case["same"] += (free.node, free.power, free.proven) == (node, value, True)
+                    case["given_up"] += not limited.proven
+                    case["right_all_the_same"] += not limited.proven and limited.node == node
                 progress(done := done + 1, total)
-    names = ("spacing_m", "arrays", "kind", "rule")
+    names = ("spacing_m", "arrays", "kind")
     return [dict(zip(names, key, strict=True)) | found for key, found in cases.items()]
 
 
-def _peaks(maps: Sequence[Float32Array], counts: Sequence[int], rule: Rule) -> Iterator[tuple[int, int, float]]:
+def _peaks(maps: Sequence[Float32Array], counts: Sequence[int]) -> Iterator[tuple[int, int, float]]:
     """Highest node, and its value, of the fused maps of the first so many arrays; fused one after the other."""
-    join = {Rule.SUM: np.add, Rule.PRODUCT: np.multiply, Rule.MINIMUM: np.minimum}[rule]
-    fused = np.maximum(maps[0], 0.0) if rule is Rule.PRODUCT else maps[0].copy()
+    fused = maps[0].copy()
     for count, one in enumerate(maps[1:], start=2):
-        join(fused, np.maximum(one, 0.0) if rule is Rule.PRODUCT else one, out=fused)
+        fused += one
         if count in counts:
             node = int(fused.argmax())
             yield count, node, float(fused[node])
@@ -100,7 +96,7 @@ def main() -> int:
     """Compare, write exactness.json; fail unless all are the same."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"of each kind (default {SOUNDS}: 540 maps)")
+    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"of each kind (default {SOUNDS}: 180 maps)")
     arguments = parser.parse_args()
     about = machine.describe()
     with threadpool_limits(limits=1), counted("maps", "sound") as show:
@@ -121,7 +117,7 @@ def main() -> int:
     for case in cases:
         if case["given_up"] or case["same"] < case["maps"]:
             print(
-                f"{case['spacing_m']:g} m, {case['arrays']} arrays, {case['kind']}, {case['rule']}: {case['same']} of "
+                f"{case['spacing_m']:g} m, {case['arrays']} arrays, {case['kind']}: {case['same']} of "
                 f"{case['maps']} the same; the default limit gives up {case['given_up']}"
             )
     print(f"{same} of {maps} maps: the search finds the same node and value; the default limit gives up {given_up}")

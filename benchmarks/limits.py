@@ -17,7 +17,7 @@ import scipy.fft
 
 from livessl.core.correlate.onset_gcc import _STRONGEST, OnsetFrontEnd, OnsetGCC
 from livessl.core.correlate.spectra import Spectra
-from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
+from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
 from livessl.lab.evaluate.campaign import read_clips
 from livessl.lab.evaluate.localizer import LEAD_S, PRE_ROLL_FRAMES, _active
@@ -51,9 +51,9 @@ class Known:
         spectra = np.asarray(scipy.fft.rfft(cut.swapaxes(0, 1) * here._window, here._n_fft, axis=2), dtype=np.complex64)
         whole, straight = np.split(spectra, 2, axis=1)
         power, rest = (_power(part[:, :, here._band]) for part in (straight, whole - straight))
-        rest += here._least
+        rest += here._parameters.least
         weights = np.minimum(power**2 / (rest * (rest + 2.0 * power)), _STRONGEST).astype(np.float32)
-        cross = here._cross(Spectra(whole, here._n_fft), weights, np.broadcast_to(here._noise, weights.shape))
+        cross = here._cross(Spectra(whole, here._n_fft), weights, np.broadcast_to(here._state.noise, weights.shape))
         return OnsetGCC(here._sampling.sample(cross), cross.levels)
 
 
@@ -78,7 +78,7 @@ def errors_m(
     ):
         active: BoolArray = _active(every, RATE_HZ)
         loud = np.flatnonzero(active)
-        listener = estimator.listener(spec.name, RATE_HZ)
+        listener = estimator.onset_front_end(spec.name, RATE_HZ)
         if listener is None or not len(loud):
             raise SystemExit(f"{spec.name}: nothing to hear")
         known = Known(listener, len(every))
@@ -101,7 +101,7 @@ def main() -> int:
     arguments = parser.parse_args()
     clips = read_clips(arguments.events, CLASSES, RATE_HZ)
     arrays = pair(np.array(ROOM_M) / 2.0, 1, 5)
-    estimator = ESTIMATORS["onset"](arrays, EXPERIMENTS["diversity"].grid(0.1), C_M_S)
+    estimator = create("onset", arrays, EXPERIMENTS["diversity"].grid(0.1), C_M_S)
     microphones_m = np.vstack([spec.microphones_m for spec in arrays])
     found: dict[tuple[float, str], list[tuple[float, float]]] = {}
     for number in range(arguments.positions):

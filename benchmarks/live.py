@@ -23,8 +23,7 @@ import numpy as np
 from livessl.cli.main import main as livessl
 from livessl.clock import SystemClock
 from livessl.core.geometry import Grid
-from livessl.core.locate import estimators
-from livessl.core.locate.estimators import Localization, PowerMaps, Sound
+from livessl.core.locate.estimator import Localization, PowerMaps, Sound, register
 from livessl.core.types import ArraySpec, Evidence
 from livessl.lab.bench import live
 from livessl.server.engine import Engine
@@ -42,7 +41,7 @@ class Nowhere:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """There is nothing to prepare."""
 
-    def listener(self, array: str, sample_rate_hz: float) -> None:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> None:
         """Nothing listens."""
         return
 
@@ -58,7 +57,7 @@ class Nowhere:
 
 def serve(site_file: Path, profile: Path | None) -> None:
     """Be the server, with the estimator above, and perhaps profiled."""
-    estimators.ESTIMATORS["onset"] = Nowhere
+    register("onset", Nowhere)
     if profile is not None:
         turn = Engine.turn
         profiler = cProfile.Profile()

@@ -3,7 +3,7 @@
     python benchmarks/many.py --sounds 12 --rt60 1 --snr 10
 
 prints the error and the time of an answer for each number of arrays that may have a part in it
-(`livessl.core.locate.estimators.MOST_ARRAYS`), on the same sounds. What came out is in
+(`livessl.core.locate.onset.MOST_ARRAYS`), on the same sounds. What came out is in
 docs/performance/experiments.md.
 """
 
@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.locate import estimators
-from livessl.core.locate.estimators import ESTIMATORS
+from livessl.core.locate import onset
+from livessl.core.locate.estimator import create
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
 from livessl.lab.bench import load
 from livessl.lab.evaluate.localizer import heard
@@ -53,25 +53,25 @@ def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed
 def compare(arrays: int, sounds: int, rt60_s: float, snr_db: float, most: Sequence[int]) -> dict[int, FloatArray]:
     """By how many arrays may have a part: error in metres and time in seconds of every sound's answer, (sounds, 2)."""
     site = parse_site(load.site_text(arrays, 0.1, "tcp://127.0.0.1:5570", 8000))
-    estimator = ESTIMATORS["onset"](site.specs, search_grid(site), site.c_m_s)
+    estimator = create("onset", site.specs, search_grid(site), site.c_m_s)
     rng = np.random.default_rng(3)
     x, y, _ = site.room.size_m
     active = np.arange(round(DURATION_S / FRAME_S)) >= round(QUIET_S / FRAME_S)
     rows: dict[int, list[tuple[float, float]]] = {count: [] for count in most}
-    shipped = estimators.MOST_ARRAYS
+    shipped = onset.MOST_ARRAYS
     try:
         for number in range(sounds):
             place_m = rng.uniform((0.8, 0.8, 0.8), (x - 0.8, y - 0.8, 1.8))
             samples = heard_at(site, place_m, rt60_s, snr_db, seed=number)
             told = {spec.name: heard(estimator, spec, samples[spec.name], active, RATE_HZ) for spec in site.specs}
             for count in most:
-                estimators.MOST_ARRAYS = count  # type: ignore[misc]
+                onset.MOST_ARRAYS = count  # type: ignore[misc]
                 estimator.locate(told)
                 before_s = time.perf_counter()
                 found = estimator.locate(told)
                 rows[count].append((float(np.linalg.norm(found.position_m - place_m)), time.perf_counter() - before_s))
     finally:
-        estimators.MOST_ARRAYS = shipped  # type: ignore[misc]
+        onset.MOST_ARRAYS = shipped  # type: ignore[misc]
     return {count: np.array(each) for count, each in rows.items()}
 
 

@@ -286,7 +286,7 @@ def _exactness(exact: Json) -> Iterator[str]:
     yield "## The same node as the whole map"
     yield ""
     yield _paragraph(
-        f"{exact['same']} of {exact['maps']} maps: all rules of fusion, 2 to {exact['most_arrays']} arrays, a voice,",
+        f"{exact['same']} of {exact['maps']} maps: 2 to {exact['most_arrays']} arrays, a voice,",
         "two voices and noise, grids of 0.1 and 0.05 m; the search unbounded. As shipped it gives up after",
         f"{exact['most_look_ups'] / 1e6:g} million look-ups and says so: in {exact['given_up']} of them.",
     )
@@ -294,9 +294,9 @@ def _exactness(exact: Json) -> Iterator[str]:
     if given_up:
         yield ""
         yield from _table(
-            ("grid", "arrays", "sound", "rule", "given up", "right all the same"),
+            ("grid", "arrays", "sound", "given up", "right all the same"),
             (
-                (f"{case['spacing_m']:g} m", str(case["arrays"]), case["kind"], case["rule"],
+                (f"{case['spacing_m']:g} m", str(case["arrays"]), case["kind"],
                  f"{case['given_up']} of {case['maps']}", str(case["right_all_the_same"]))
                 for case in given_up
             ),

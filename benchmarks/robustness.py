@@ -16,7 +16,8 @@ import numpy as np
 
 from livessl.core.correlate.band import band_power
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimators import Localization, Onset, Sound
+from livessl.core.locate.estimator import Localization, Sound
+from livessl.core.locate.onset import Onset
 from livessl.core.stream.activity import ActivityParameters, CausalActivity, exact_mask
 from livessl.core.stream.fusion import Fusion
 from livessl.core.stream.parameters import FusionParameters
@@ -88,7 +89,7 @@ def sounds_of(
     frames = range(max(0, int(loud[0]) - PRE_ROLL), int(loud[-1]) + 1)
     sounds = {}
     for spec, part in zip(specs, np.split(samples, len(specs)), strict=True):
-        listener = estimator.listener(spec.name, RATE_HZ)
+        listener = estimator.onset_front_end(spec.name, RATE_HZ)
         moments = tuple(listener.push(part[:, k * FRAME : (k + 1) * FRAME], quiet=not active[k]) for k in frames)
         segment = part[:, frames[0] * FRAME : frames[-1] * FRAME + FRAME]
         sounds[spec.name] = Sound((segment,), RATE_HZ, moments, sources=2)

@@ -21,7 +21,7 @@ from livessl.core import kernels as kernels_in_use
 from livessl.core.geometry import Grid
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.locate import peak_search, srp
-from livessl.core.locate.peak_search import PeakSearch, Rule
+from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.refine import FindPeaks
 from livessl.core.types import Evidence
 from livessl.lab.bench import kernels
@@ -73,15 +73,15 @@ def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds)
 
 def test_fused_maps_are_what_the_search_is_held_against() -> None:
     cases = exactness.compare(spacings_m=(0.5,), counts=(2, 3), sounds=1)
-    assert len(cases) == 2 * len(kernels.KINDS) * len(Rule)
+    assert len(cases) == 2 * len(kernels.KINDS)
     assert all(case["same"] == case["maps"] == 1 and case["given_up"] == 0 for case in cases)
 
 
 def test_a_search_that_is_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     among = PeakSearch.among
 
-    def wrong(self: PeakSearch, evidence: Sequence[Evidence], rule: Rule, *most: int) -> FindPeaks:
-        find = among(self, evidence, rule, *most)
+    def wrong(self: PeakSearch, evidence: Sequence[Evidence], *most: int) -> FindPeaks:
+        find = among(self, evidence, *most)
         return lambda count, *rest: [replace(peak, node=peak.node + 1) for peak in find(count, *rest)]
 
     monkeypatch.setattr(PeakSearch, "among", wrong)
@@ -140,7 +140,7 @@ def measured() -> dict[str, Json]:
         for length in ("block", "1 s")
         for kind in kernels.KINDS
     ]
-    case = {"spacing_m": 0.05, "arrays": 8, "kind": "noise", "rule": "sum", "maps": 6, "same": 6, "given_up": 2}
+    case = {"spacing_m": 0.05, "arrays": 8, "kind": "noise", "maps": 6, "same": 6, "given_up": 2}
     timing = {
         "name": "map, 2 arrays, 0.1 m",
         "ratio": 1.9,

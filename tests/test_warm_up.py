@@ -11,8 +11,9 @@ from livessl.core.kernels import kernels
 
 SCRIPT = """
 import numpy as np
-from livessl.core import compiled
-from livessl.core.locate.estimators import Onset, Sound
+from livessl.core.kernels import with_numba as compiled
+from livessl.core.locate.estimator import Sound
+from livessl.core.locate.onset import Onset
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.locate.peak_search import warm_up
 from livessl.core.types import ArraySpec
@@ -29,8 +30,8 @@ samples = np.random.default_rng(1).standard_normal((4, 8000)).astype(np.float32)
 samples.setflags(write=False)
 sounds = {}
 for spec in specs:
-    ear = estimator.listener(spec.name, 16000.0)
-    onsets = [ear.push(part, quiet=k < 4) for k, part in enumerate(np.split(samples, 10, axis=1))]
+    front = estimator.onset_front_end(spec.name, 16000.0)
+    onsets = [front.push(part, quiet=k < 4) for k, part in enumerate(np.split(samples, 10, axis=1))]
     sounds[spec.name] = Sound((samples,), 16000.0, onsets, sources=2)
 found = estimator.locate(sounds)
 estimator.power_maps(found.evidence)

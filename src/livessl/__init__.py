@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from livessl.core.geometry import Grid
-    from livessl.core.locate.estimators import Estimator, Localization, Sound
+    from livessl.core.locate.estimator import Estimator, Localization, Sound, register
+    from livessl.core.locate.map_estimator import MapEstimator
+    from livessl.core.methods import METHODS
     from livessl.core.types import ArraySpec, Estimate, Event
     from livessl.errors import ConfigError
     from livessl.offline import PowerMap, locate, power_map
     from livessl.simulation.of_site import Simulation, simulate
     from livessl.site.load import load_site
-    from livessl.site.models import METHODS, Site
+    from livessl.site.models import Site
 
 __version__ = "0.2.0"
 
@@ -30,6 +32,7 @@ __all__ = [
     "Event",
     "Grid",
     "Localization",
+    "MapEstimator",
     "PowerMap",
     "Simulation",
     "Site",
@@ -38,25 +41,28 @@ __all__ = [
     "load_site",
     "locate",
     "power_map",
+    "register",
     "simulate",
 ]
 
 _HOMES: Final = {
-    "METHODS": "site.models",
+    "METHODS": "core.methods",
     "ArraySpec": "core.types",
     "ConfigError": "errors",
     "Estimate": "core.types",
-    "Estimator": "core.locate.estimators",
+    "Estimator": "core.locate.estimator",
     "Event": "core.types",
     "Grid": "core.geometry",
-    "Localization": "core.locate.estimators",
+    "Localization": "core.locate.estimator",
+    "MapEstimator": "core.locate.map_estimator",
     "PowerMap": "offline",
     "Simulation": "simulation.of_site",
     "Site": "site.models",
-    "Sound": "core.locate.estimators",
+    "Sound": "core.locate.estimator",
     "load_site": "site.load",
     "locate": "offline",
     "power_map": "offline",
+    "register": "core.locate.estimator",
     "simulate": "simulation.of_site",
 }
 """The module of each name, below `livessl`."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from livessl import wire
 from livessl.clock import Clock, UnpacedClock
-from livessl.core.locate.estimators import Sound
+from livessl.core.locate.estimator import Sound
 from livessl.core.types import (
     MAX_SAMPLE,
     BackfillRequest,

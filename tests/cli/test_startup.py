@@ -8,9 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-from livessl.core.locate.estimators import ESTIMATORS
-from livessl.site.models import METHODS
-
 PAPER = Path(__file__).parents[2] / "config" / "paper.yaml"
 RUN = """
 import json, sys
@@ -40,7 +37,7 @@ def test_a_node_loads_nothing_that_localizes() -> None:
     names = loaded("capture", "--site", str(PAPER), "--node", "nobody", code=2)
     assert {"livessl.capture.node", "livessl.capture.link", "livessl.site.models"} <= names
     heavy = {
-        "livessl.core.locate.estimators",
+        "livessl.core.locate.estimator",
         "livessl.core.stream.fusion",
         "livessl.core.kernels",
         "livessl.core.locate.peak_search",
@@ -58,8 +55,3 @@ def test_a_server_loads_nothing_of_other_commands(tmp_path: Path) -> None:
         names = loaded("serve", "--site", str(site), code=1)  # once all else is ready
     assert {"livessl.server.api.app", "livessl.core.locate.peak_search", "fastapi", "numba"} <= names
     assert names & (OTHER_COMMANDS | NEVER_LIVE | {"livessl.recordings.recording", "livessl.simulation"}) == set()
-
-
-def test_methods_of_a_site_file_are_the_estimators() -> None:
-    ours = [name for name, made in ESTIMATORS.items() if made.__module__.startswith("livessl.")]  # tests add their own
-    assert tuple(ours) == METHODS

@@ -1,4 +1,4 @@
-"""Shapes, poses, directions and the grid, against what can be said about them without their formulas."""
+"""Shapes, poses, directions and the grid, tested by properties instead of their formulas."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_sound_travels_at_343_m_s_at_20_degrees() -> None:
 
 
 @pytest.mark.parametrize("given_m", [[[1, 2, 3]], ((1.0, 2.0, 3.0),), np.array([[1, 2, 3]], dtype=np.float32)])
-def test_positions_may_be_anything_like_them(given_m: ArrayLike) -> None:
+def test_positions_may_be_any_sequence_or_array(given_m: ArrayLike) -> None:
     positions_m = as_positions_m(given_m)
     assert positions_m.dtype == np.float64
     assert positions_m.tolist() == [[1.0, 2.0, 3.0]]
@@ -53,7 +53,7 @@ def test_positions_are_a_copy() -> None:
         ([[1.0, 2.0, np.inf]], "expected finite coordinates"),
     ],
 )
-def test_positions_of_another_kind_are_refused(given_m: ArrayLike, said: str) -> None:
+def test_positions_of_another_shape_or_not_finite_are_an_error(given_m: ArrayLike, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         as_positions_m(given_m)
 
@@ -118,7 +118,7 @@ spans = st.tuples(st.floats(-20.0, 20.0), st.floats(0.0, 9.0)).map(lambda span: 
 
 
 @given(bounds_m=st.tuples(spans, spans, spans), spacing_m=st.floats(0.5, 3.0), seed=st.integers(0, 2**32 - 1))
-def test_no_point_is_further_than_half_a_cell_from_a_node(
+def test_no_point_is_further_than_half_a_cell_from_a_grid_point(
     bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]], spacing_m: float, seed: int
 ) -> None:
     grid = Grid(bounds_m, spacing_m)
@@ -128,17 +128,17 @@ def test_no_point_is_further_than_half_a_cell_from_a_node(
     # half a cell along every axis at once, so half its diagonal; 1e-12: rounding of coordinates up to 29 m
     nearest = int((offset_m**2).sum(axis=1).argmin())
     assert (offset_m[nearest] <= grid.cell_m / 2 + 1e-12).all()
-    # the cells fill the box, no more and no less
+    # the cells fill the box exactly
     np.testing.assert_allclose(nodes_m.min(axis=0) - grid.cell_m / 2, grid.lower_m, atol=1e-12)
     np.testing.assert_allclose(nodes_m.max(axis=0) + grid.cell_m / 2, grid.upper_m, atol=1e-12)
-    # as near to the wanted spacing as goes: n cells instead of n +- 1 are off by at most half a cell in all
+    # as near to the wanted spacing as possible: n cells instead of n +- 1 are off by at most half a cell in all
     assert (np.abs(np.array(grid.shape) * spacing_m - (grid.upper_m - grid.lower_m)) <= spacing_m * (1.0 + 1e-9)).all()
     several = np.array(grid.shape) > 1
     assert (grid.cell_m[several] <= 1.25 * spacing_m + 1e-12).all()
     assert (grid.cell_m[several] >= 0.75 * spacing_m - 1e-12).all()
 
 
-def test_nodes_are_numbered_z_fastest() -> None:
+def test_grid_points_are_numbered_z_fastest() -> None:
     grid = Grid(BOUNDS_M, 0.3)
     assert grid.shape == (11, 12, 9)
     assert grid.size == 11 * 12 * 9 == len(grid.nodes_m())
@@ -161,7 +161,7 @@ def test_equal_bounds_make_a_plane() -> None:
     assert Grid(BOUNDS_M, 0.3).free_axes == (0, 1, 2)
 
 
-def test_impossible_grids_are_refused() -> None:
+def test_impossible_grids_are_an_error() -> None:
     for spacing_m in (0.0, -0.1, np.nan):
         with pytest.raises(ValueError, match="grid: expected spacing_m > 0"):
             Grid(BOUNDS_M, spacing_m)

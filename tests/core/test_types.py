@@ -1,4 +1,4 @@
-"""The values that flow: what they refuse, that nobody can write to them, and the units of what they work out."""
+"""The value types: what they reject, that they cannot be changed, and the units of their properties."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_frame_is_fifty_milliseconds() -> None:
 
 
 @pytest.mark.parametrize("samples", [SAMPLES[0], SAMPLES.astype(np.float64)], ids=["one axis", "float64"])
-def test_samples_of_another_kind_are_refused(samples: Any) -> None:
+def test_samples_of_another_shape_or_type_are_an_error(samples: Any) -> None:
     with pytest.raises(ValueError, match=r"array 'north': samples must be \(channels, n\) float32, got"):
         frame(samples=samples)
     with pytest.raises(ValueError, match=r"block: samples must be \(channels, n\) float32, got"):
@@ -75,24 +75,24 @@ def test_values_cannot_be_changed() -> None:
             setattr(value, name, None)
 
 
-def test_gcc_wants_a_row_for_each_pair_and_a_column_for_each_lag() -> None:
+def test_a_gcc_needs_a_row_for_each_pair_and_a_column_for_each_lag() -> None:
     with pytest.raises(ValueError, match=r"\(pairs, lags\) = \(1, 5\), got \(1, 4\)"):
         GCC(np.array([[0, 1]]), np.zeros(5), np.zeros((1, 4)))
 
 
 @pytest.mark.parametrize("shape", [(1, 3), (17, 3), (4, 2), (4,)])
-def test_array_has_two_to_sixteen_microphones_in_space(shape: tuple[int, ...]) -> None:
+def test_an_array_has_two_to_sixteen_microphones_in_space(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="array 'north': expected 2 to 16 microphone positions"):
         spec(microphones_m=np.zeros(shape))
 
 
 @pytest.mark.parametrize("count", [2, 16])
-def test_the_limits_themselves_are_allowed(count: int) -> None:
+def test_two_and_sixteen_microphones_are_allowed(count: int) -> None:
     assert len(spec(microphones_m=np.zeros((count, 3))).microphones_m) == count
 
 
 @pytest.mark.parametrize("band_hz", [(-1.0, 100.0), (100.0, 100.0), (200.0, 100.0)])
-def test_band_ascends_from_zero_or_above(band_hz: tuple[float, float]) -> None:
+def test_a_band_must_ascend_from_zero_or_above(band_hz: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="array 'north': expected a band 0 <= low < high in Hz"):
         spec(band_hz=band_hz)
 
@@ -104,7 +104,7 @@ def test_centre_is_the_mean_and_aperture_the_largest_distance() -> None:
 
 
 @pytest.mark.parametrize("shapes", [((2,), (3, 3)), ((3,), (3,))])
-def test_estimate_is_in_space(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+def test_an_estimate_has_three_coordinates(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     with pytest.raises(ValueError, match=r"expected position \(3,\) and covariance \(3, 3\)"):
         Estimate(0, np.zeros(shapes[0]), np.zeros(shapes[1]), 0.5, ())
 

@@ -21,7 +21,7 @@ from livessl.capture.dealer import Dealer
 from livessl.capture.link import Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
-from livessl.core.locate.estimators import ESTIMATORS, Localization, PowerMaps, Sound
+from livessl.core.locate.estimator import Localization, PowerMaps, Sound, register
 from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
 from livessl.server.app import assemble
 from livessl.server.fanout import Fanout
@@ -64,7 +64,7 @@ class Fingerprint:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         pass
 
-    def listener(self, array: str, sample_rate_hz: float) -> None:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> None:
         return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -79,7 +79,7 @@ class Fingerprint:
         raise AssertionError("nobody looks at maps here")
 
 
-ESTIMATORS["fingerprint"] = Fingerprint
+register("fingerprint", Fingerprint)
 
 
 class HandClock:

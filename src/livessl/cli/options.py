@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from livessl.cli import argument
+from livessl.core.methods import METHODS
 from livessl.errors import ConfigError, Fault
 from livessl.site.load import load_site
-from livessl.site.models import METHODS, Site
+from livessl.site.models import Site
 
 T = TypeVar("T")
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from livessl.core.types import FloatArray, IntArray
 
 SPEED_OF_SOUND_0C_M_S: Final = 331.3
+"""Speed of sound in dry air at 0 degrees Celsius, m/s."""
 
 
 def speed_of_sound_m_s(temperature_c: float) -> float:
@@ -20,12 +21,12 @@ def speed_of_sound_m_s(temperature_c: float) -> float:
 
 
 def as_positions_m(positions: ArrayLike) -> FloatArray:
-    """Turn anything like (n, 3) metres into a float64 array of that shape.
+    """Return positions (n, 3), in metres, as a float64 array.
 
     Raises
     ------
     ValueError
-        Where the shape is another or a coordinate is not finite.
+        If the shape is another or a coordinate is not finite.
     """
     array = np.array(positions, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
@@ -36,7 +37,7 @@ def as_positions_m(positions: ArrayLike) -> FloatArray:
 
 
 def tetrahedron(edge_m: float) -> FloatArray:
-    """Regular tetrahedron of four microphones around the origin, base down.
+    """Regular tetrahedron of four microphones around the origin, with its base down.
 
     Channel 1 is the apex (+z); channels 2 to 4 are the base, counter-clockwise seen from above, channel 2 towards +x.
 
@@ -83,14 +84,14 @@ def posed(
     pitch_deg: float = 0.0,
     roll_deg: float = 0.0,
 ) -> FloatArray:
-    """Turn and move a shape: roll about x, then pitch about y, then yaw about z (right-hand rule), then shift.
+    """Rotate and move a shape: roll about x, then pitch about y, then yaw about z (right-hand rule), then a shift.
 
     Parameters
     ----------
     shape_m : (K, 3) float64
-        Relative to the array's own origin.
+        Positions relative to the array's own origin, metres.
     position_m : (3,)
-        Where that origin goes.
+        Position of that origin in the room, metres.
     yaw_deg, pitch_deg, roll_deg : float
         Degrees. Yaw is counter-clockwise seen from above; a positive pitch lowers the +x end.
     """
@@ -120,22 +121,22 @@ def direction_deg(origin_m: FloatArray, target_m: FloatArray) -> tuple[float, fl
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Nodes at the centres of the cells that fill a box.
+    """Grid points at the centres of the cells that fill a box.
 
-    The cells are as near to `spacing_m` as fills the box evenly, so no part of it lies more than half a cell from a
-    node. An axis whose bounds are equal has one node: the search is then in a plane.
+    The cells divide the box evenly, with edges as near to `spacing_m` as possible, so no part of it lies more than half
+    a cell from a grid point. An axis whose bounds are equal has one point: the search is then in a plane.
 
     Parameters
     ----------
     bounds_m : ((x0, x1), (y0, y1), (z0, z1))
         The search volume, metres.
     spacing_m : float
-        Wanted distance between neighbouring nodes, metres.
+        Wanted distance between neighbouring points, metres.
 
     Raises
     ------
     ValueError
-        Where a lower bound lies above its upper one, or the spacing is not positive.
+        If a lower bound lies above its upper one, or the spacing is not positive.
     """
 
     bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -160,37 +161,37 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number of nodes along x, y and z."""
+        """Number of points along x, y and z."""
         x, y, z = (max(1, round(float(extent) / self.spacing_m)) for extent in self.upper_m - self.lower_m)
         return x, y, z
 
     @property
     def size(self) -> int:
-        """Number of nodes."""
+        """Number of points."""
         x, y, z = self.shape
         return x * y * z
 
     @property
     def cell_m(self) -> FloatArray:
-        """Edges of a cell (3,), metres; 0 on a fixed axis."""
+        """Edges of a cell (3,), metres; 0 on an axis whose bounds are equal."""
         return np.asarray((self.upper_m - self.lower_m) / np.array(self.shape))
 
     @property
     def free_axes(self) -> tuple[int, ...]:
-        """Axes along which there is anything to search."""
+        """Axes whose bounds are not equal."""
         return tuple(axis for axis, (low, high) in enumerate(self.bounds_m) if high > low)
 
     def axis_m(self, axis: int) -> FloatArray:
-        """Node coordinates along one axis, metres."""
+        """Coordinates of the points along one axis, metres."""
         return np.asarray(self.lower_m[axis] + (np.arange(self.shape[axis]) + 0.5) * self.cell_m[axis])
 
     def nodes_m(self, which: slice = slice(None)) -> FloatArray:
-        """Nodes (G, 3), metres, all or some, z fastest: node g is at `numpy.unravel_index(g, shape)`."""
+        """Points (G, 3), metres, all or some, z fastest: point g is at `numpy.unravel_index(g, shape)`."""
         cells = np.unravel_index(np.arange(self.size)[which], self.shape)
         return np.stack([self.axis_m(axis)[cell] for axis, cell in enumerate(cells)], axis=1)
 
     def node_m(self, index: int) -> FloatArray:
-        """Position (3,) of one node, metres."""
+        """Position (3,) of one point, metres."""
         cell = np.array(np.unravel_index(index, self.shape), dtype=np.float64)
         return np.asarray(self.lower_m + (cell + 0.5) * self.cell_m)
 

@@ -1,4 +1,4 @@
-"""Arrays processed jointly: several that one clock samples become one of all their microphones."""
+"""Joint arrays: several arrays that one clock samples, processed as one array of all their microphones."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from livessl.core.types import MAX_MICROPHONES, ArraySpec
 
 
 def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) -> ArraySpec:
-    """One array of all the microphones of several, to be processed jointly: every pair counts, across arrays too.
+    """Join several arrays into one of all their microphones, in which pairs across arrays count too.
 
-    Its channels are theirs, array by array.
+    Its channels are theirs, array after array.
 
     Parameters
     ----------
     arrays : sequence of ArraySpec
-    clocks : mapping of array name to clock
-        What samples each array: the same name, the same clock.
+    clocks : mapping of str to str
+        Name of the clock that samples each array.
     name : str
-        The new array's.
+        Name of the new array.
 
     Raises
     ------
     ValueError
-        Where clocks differ or are unknown: delays across arrays are good only if one clock samples both. Where bands
-        differ, or there are more microphones than an array may have.
+        If clocks differ or are unknown, for delays across arrays are exact only if one clock samples both; if bands
+        differ, or if there are more microphones than an array may have.
     """
     require_one_clock(name, {spec.name: clocks.get(spec.name) for spec in arrays})
     bands_hz = {spec.band_hz for spec in arrays}
@@ -46,12 +46,19 @@ def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) ->
 
 
 def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:
-    """Refuse to join arrays, into one of that name, which one clock does not sample; None is an unknown clock.
+    """Check that one clock samples all arrays that are to be joined.
+
+    Parameters
+    ----------
+    name : str
+        Name of the joint array.
+    clocks : mapping of str to str or None
+        Name of the clock that samples each array; None if it is unknown.
 
     Raises
     ------
     ValueError
-        Then.
+        If the clocks differ or any is unknown.
     """
     if None in clocks.values() or len(set(clocks.values())) != 1:
         each = ", ".join(f"{array!r} by {clock or 'an unknown clock'}" for array, clock in clocks.items())

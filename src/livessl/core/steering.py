@@ -1,4 +1,4 @@
-"""Delays between an array's microphones as functions of place, and what they ask of a grid. It knows no sound."""
+"""Delays between an array's microphones as functions of position, and the band that a grid can resolve."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from livessl.core.types import FloatArray, IntArray
 
 NEAREST_M: Final = 1e-9
-"""A point in a microphone has no direction from it; one so far away has."""
+"""Least length, in metres, by which the vector from a microphone to a point is divided; they may coincide."""
 
 
 def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float) -> FloatArray:
@@ -20,7 +20,9 @@ def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: In
     points_m : (N, 3) float64
     microphones_m : (K, 3) float64
     pairs : (P, 2) int64
+        Microphones (i, k).
     c_m_s : float
+        Speed of sound, m/s.
 
     Returns
     -------
@@ -34,7 +36,7 @@ def steering_delays_s(points_m: FloatArray, microphones_m: FloatArray, pairs: In
 def delay_gradients_s_m(points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, c_m_s: float) -> FloatArray:
     """Gradient of each pair's delay at each point: (u_k - u_i) / c, u the unit vector from a microphone to the point.
 
-    Exact, near and far; its length is 2 sin(gamma/2)/c, gamma the angle that the pair subtends.
+    It is exact near and far. Its length is 2 sin(gamma/2)/c with gamma the angle that the pair subtends.
 
     Parameters
     ----------
@@ -46,7 +48,7 @@ def delay_gradients_s_m(points_m: FloatArray, microphones_m: FloatArray, pairs: 
     Returns
     -------
     (P, N, 3) float64
-        Seconds a metre.
+        Seconds per metre.
     """
     towards = points_m - microphones_m[:, None]
     unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=2, keepdims=True)), NEAREST_M)
@@ -58,7 +60,7 @@ def alias_free_hz(
 ) -> FloatArray:
     """Frequency up to which a pair's map has no spatial aliasing on a grid: f_max = 1 / (2 D |grad tau|).
 
-    With D the grid's spacing, the phase 2 pi f tau of every kept frequency turns by less than pi from node to node
+    With grid spacing D, the phase 2 pi f tau changes by less than pi between neighbouring grid points
     (García-Barrios, Gutiérrez-Arriola et al., IEEE Access 2021, arXiv 2402.06586). It is infinite where the delay does
     not change.
 
@@ -77,7 +79,7 @@ def alias_free_hz(
     Raises
     ------
     ValueError
-        Where the spacing is not above 0.
+        If the spacing is not above 0.
     """
     if not spacing_m > 0:
         raise ValueError(f"grid spacing: expected metres above 0, got {spacing_m}")

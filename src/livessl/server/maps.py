@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from livessl.clock import Clock
-from livessl.core.locate.estimators import PowerMaps
+from livessl.core.locate.estimator import PowerMaps
 from livessl.core.types import Float32Array, Window
 
 FUSED: Final = "fused"

@@ -11,6 +11,7 @@ import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import microphone_pairs
+from livessl.core.methods import METHODS, unknown_method
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.errors import Fault
@@ -18,7 +19,7 @@ from livessl.site.addresses import is_loopback
 from livessl.site.build.grid import search_grid
 from livessl.site.fields import Bounds
 from livessl.site.findings import Finding, Place, unknown_array
-from livessl.site.models import METHODS, Site
+from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 
 COINCIDENT_M: Final = 1e-3
@@ -40,7 +41,7 @@ def cross_faults(site: Site) -> Iterator[Finding]:
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
     if site.fusion.method not in METHODS:
-        yield ("fusion", "method"), f"expected one of {', '.join(METHODS)}, got {site.fusion.method!r}"
+        yield ("fusion", "method"), unknown_method(site.fusion.method)
     yield from _name_faults(site)
     count = len(site.arrays) + len(site.processed) - len(site.specs)
     if site.fusion.min_arrays > count:

@@ -10,15 +10,13 @@ from typing import Annotated, Any, Final, Literal, get_origin
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo, ValidatorFunctionWrapHandler
 
+from livessl.core.methods import ONSET
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec
 from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
-
-METHODS: Final = ("onset", "srp-phat", "cepstral", "averaged")
-"""Names of `livessl.core.locate.estimators.ESTIMATORS`, so that a check of a site file need not load the estimators."""
 
 _ACTIVITY: Final = ActivityParameters()
 _FUSION: Final = FusionParameters()
@@ -157,7 +155,7 @@ class ActivityConfig(Model):
 class FusionConfig(Model):
     """Parameters of the fusion of arrays: see `livessl.core.stream.fusion`."""
 
-    method: str = "onset"
+    method: str = ONSET
     deadline_s: Annotated[float, Field(gt=0, le=10)] = _FUSION.deadline_s
     window_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.window_s
     update_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.update_s

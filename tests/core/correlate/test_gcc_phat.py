@@ -1,4 +1,4 @@
-"""GCC-PHAT: sign, unit, band and accuracy of its lags, and that nothing comes of silence."""
+"""GCC-PHAT: sign, unit, band and accuracy of its lags, and zeros for silence."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ STEP_S = 1.0 / (OVERSAMPLING * RATE_HZ)
 
 # The parabola through three values of cos(w tau), h apart, is off by at most h (w h)^2 / 24: 0.004 h for 6 kHz at an
 # eighth of 16 kHz. The kernel's ripple of 1e-4 moves it by ripple / (curvature h) = 0.004 h more. In all:
-PARABOLA = 0.01  # of a fine lag: 0.08 us, or 27 um of way
+PARABOLA = 0.01  # of a fine lag: 0.08 us, or 27 um of sound path
 
 
 def pair(spacing_m: float = 0.3, band_hz: tuple[float, float] = BAND_HZ) -> ArraySpec:
@@ -59,25 +59,25 @@ def direct_sum(samples: Float32Array, lags_s: FloatArray, low_hz: float, high_hz
 
 
 def padded(spec: ArraySpec, n: int) -> int:
-    """Length of the FFT for n samples: enough zeros for every lag that is asked for."""
+    """Length of the FFT for n samples: with enough zeros for every lag."""
     return fast_length(n + LagSampling(spec.band_hz, RATE_HZ, spec.aperture_m / C_M_S).room)
 
 
 def two_noises(n: int = 3000) -> Float32Array:
-    """Little in common: 4 samples late and as much noise of its own, so that R has side lobes everywhere."""
+    """Two channels, 4 samples apart, each with as much noise of its own, so that R has side lobes everywhere."""
     rng = np.random.default_rng(3)
     sound = delayed(burst(n, 1), [0.0, 4.3 / RATE_HZ])
     return np.asarray(sound + 0.05 * rng.standard_normal((2, n)), dtype=np.float32)
 
 
-def test_positive_lag_means_that_the_second_channel_hears_it_later() -> None:
+def test_a_positive_lag_means_that_the_sound_reaches_the_second_channel_later() -> None:
     samples = delayed(burst(4000), [0.0, 7.0 / RATE_HZ])
     assert peak_lags_s(correlate(pair(), samples)) == pytest.approx([7.0 / RATE_HZ], abs=PARABOLA * STEP_S)
     mirrored = correlate(pair(), samples[::-1].copy())
     assert peak_lags_s(mirrored) == pytest.approx([-7.0 / RATE_HZ], abs=PARABOLA * STEP_S)
 
 
-def test_nearer_microphone_hears_it_first() -> None:
+def test_the_sound_reaches_the_nearer_microphone_first() -> None:
     spec = pair()  # microphone 1 at the smaller x, so the nearer one to a source at -x
     samples = heard(spec, [-3.0, 0.4, 0.2], burst(4000))
     assert peak_lags_s(correlate(spec, samples))[0] > 0.2 / C_M_S
@@ -86,12 +86,12 @@ def test_nearer_microphone_hears_it_first() -> None:
 
 @settings(deadline=None, max_examples=40)
 @given(lag_samples=st.floats(-13.0, 13.0), seed=st.integers(0, 10**6))
-def test_fraction_of_a_sample_is_found(lag_samples: float, seed: int) -> None:
+def test_lags_of_a_fraction_of_a_sample_are_found(lag_samples: float, seed: int) -> None:
     gcc = correlate(pair(), delayed(burst(2400, seed), [0.0, lag_samples / RATE_HZ]))
     assert peak_lags_s(gcc)[0] == pytest.approx(lag_samples / RATE_HZ, abs=PARABOLA * STEP_S)
 
 
-def test_coherent_sound_has_the_ideal_peak() -> None:
+def test_a_coherent_sound_gives_the_ideal_peak() -> None:
     lag_s = 4.0 / RATE_HZ + 3 * STEP_S  # on a fine lag, between samples
     gcc = correlate(pair(), delayed(burst(4000), [0.0, lag_s]))
     # 80 dB of the kernel. The band's edges fall on bins: half a bin of the 1500 in the band is 3e-4.
@@ -107,7 +107,7 @@ def test_loudness_and_colour_do_not_matter() -> None:
     np.testing.assert_allclose(other.values, plain.values, atol=1e-3)
 
 
-def test_unrelated_noises_are_incoherent() -> None:
+def test_unrelated_noises_have_no_peak() -> None:
     samples = 0.1 * np.random.default_rng(8).standard_normal((2, 16000)).astype(np.float32)
     values = correlate(pair(), samples).values
     # Sum of B = 5900 random phases, R ~ N(0, 1/(2B)): s = 0.0092. 5 s over 45 independent lags: once in 4e4 draws.
@@ -159,7 +159,7 @@ def test_lags_are_seconds_at_any_sampling_rate() -> None:
 
 
 TOP_HZ = (6000.0, 7150.0)
-"""Up to 0.447 of the sampling rate; so high that it is the envelope."""
+"""Band up to 0.447 of the sampling rate, so high that the GCC is the envelope."""
 
 
 def interpolation_error(samples: Float32Array, band_hz: tuple[float, float]) -> float:
@@ -173,13 +173,15 @@ def interpolation_error(samples: Float32Array, band_hz: tuple[float, float]) -> 
 
 @pytest.mark.parametrize("samples", [two_noises(), delayed(burst(3001, 5), [0.0, 3.17 / RATE_HZ]), two_noises(9001)])
 @pytest.mark.parametrize("band_hz", [BAND_HZ, TOP_HZ])
-def test_interpolation_is_the_sum_over_the_bins(samples: Float32Array, band_hz: tuple[float, float]) -> None:
+def test_fine_lags_agree_with_the_sum_over_the_bins(samples: Float32Array, band_hz: tuple[float, float]) -> None:
     # least squares leave 2e-6 in the mean and 5e-5 at the band's edges; float32 rounds a sum of 6000 to 1e-5
     assert interpolation_error(samples, band_hz) < 3e-5
 
 
 @pytest.mark.parametrize(("name", "value"), [("_NYQUIST_MARGIN", 0.95), ("_BEYOND", 0), ("_RIDGE", 1e-4)])
-def test_the_oracle_sees_worse_lags(monkeypatch: pytest.MonkeyPatch, name: str, value: float) -> None:
+def test_the_comparison_with_the_sum_notices_worse_lags(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: float
+) -> None:
     monkeypatch.setattr(module, name, value)
     module._alike.cache_clear()
     try:
@@ -189,18 +191,16 @@ def test_the_oracle_sees_worse_lags(monkeypatch: pytest.MonkeyPatch, name: str, 
 
 
 @pytest.mark.parametrize("band_hz", [BAND_HZ, TOP_HZ])
-def test_lags_by_matrix_and_by_short_fft_are_the_same(
-    monkeypatch: pytest.MonkeyPatch, band_hz: tuple[float, float]
-) -> None:
+def test_lags_by_matrix_and_by_short_fft_agree(monkeypatch: pytest.MonkeyPatch, band_hz: tuple[float, float]) -> None:
     by_matrix = correlate(pair(band_hz=band_hz), two_noises())
     monkeypatch.setattr(module, "_PRODUCT_BINS", 0)
     by_fft = correlate(pair(band_hz=band_hz), two_noises())
     np.testing.assert_allclose(by_matrix.values, by_fft.values, atol=2e-6)
-    assert not np.array_equal(by_matrix.values, by_fft.values)  # two ways indeed
+    assert not np.array_equal(by_matrix.values, by_fft.values)  # they are computed in two ways
 
 
 def test_interpolation_errs_by_two_millionths() -> None:
-    """In the mean square over the band, as the class and the decision say, for the usual array at the usual rate."""
+    """The root mean square error over the band is 2e-6 for the usual array at the usual rate."""
     sampling = LagSampling(BAND_HZ, 44_100.0, 0.5 / C_M_S)
     frequency_hz = np.linspace(*BAND_HZ, 2000)[:, None]
     known, wanted = (np.exp(2j * np.pi * frequency_hz * lags) for lags in (sampling._lags_s, sampling.fine_lags_s))
@@ -208,7 +208,7 @@ def test_interpolation_errs_by_two_millionths() -> None:
     assert np.sqrt(np.mean(np.abs(error) ** 2)) < 2.5e-6
 
 
-def test_few_matrices_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_of_matrices_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MATRICES", 2)
     correlate_again = GCCPhat(pair(), RATE_HZ, C_M_S)
     first, *_ = (correlate_again([two_noises(n)]) for n in (1000, 2000, 3000))
@@ -216,7 +216,7 @@ def test_few_matrices_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(correlate_again._sampling._matrices) == 2
 
 
-def test_only_the_band_is_heard() -> None:
+def test_sound_outside_the_band_has_no_effect() -> None:
     low, high = 900.0, 3100.0
     n = 4000
     frequency_hz = np.fft.rfftfreq(n, 1 / RATE_HZ)
@@ -230,21 +230,21 @@ def test_only_the_band_is_heard() -> None:
     assert peak_lags_s(all_of_it)[0] == pytest.approx(-9.0 / RATE_HZ, abs=STEP_S)
 
 
-def test_band_that_the_rate_cannot_hold_is_refused() -> None:
+def test_a_band_above_half_the_sampling_rate_is_an_error() -> None:
     with pytest.raises(ValueError, match="array 'pair': band_hz up to 6000 Hz needs a sample rate above 12000 Hz"):
         GCCPhat(pair(), 12_000.0, C_M_S)
 
 
-def test_silence_is_zero() -> None:
+def test_silence_gives_zeros() -> None:
     values = correlate(TETRA, np.zeros((4, 800), dtype=np.float32)).values
     assert (values == 0.0).all()
 
 
-def test_no_sound_at_all_is_zero() -> None:
+def test_no_segments_give_zeros() -> None:
     assert (correlate(TETRA).values == 0.0).all()
 
 
-def test_dead_channel_is_zero_and_harms_no_other_pair() -> None:
+def test_a_dead_channel_gives_zeros_in_its_pairs_only() -> None:
     samples = heard(TETRA, SOURCE_M, burst(2400))
     whole = correlate(TETRA, samples)
     dead = samples.copy()
@@ -256,7 +256,7 @@ def test_dead_channel_is_zero_and_harms_no_other_pair() -> None:
     assert touched.sum() == 3
 
 
-def test_constant_offset_adds_nothing() -> None:
+def test_a_constant_offset_does_not_move_peaks() -> None:
     offset = np.tile(np.array([[0.3], [-0.2], [0.1], [0.5]], dtype=np.float32), 2400)
     sound = heard(TETRA, SOURCE_M, burst(2400))
     gcc = correlate(TETRA, (sound + offset).astype(np.float32))
@@ -273,7 +273,7 @@ def test_segments_are_weighted_by_their_length() -> None:
     assert np.abs(both - correlate(TETRA, long).values).max() > 0.1
 
 
-def test_one_segment_or_its_two_halves() -> None:
+def test_one_segment_and_its_two_halves_give_the_same_peak() -> None:
     sound = 0.1 * np.random.default_rng(9).standard_normal(16_000)
     samples = delayed(sound, [0.0, 6.4 / RATE_HZ])
     whole = correlate(pair(), samples)
@@ -295,7 +295,7 @@ def high_pair(spacing_m: float = 0.2) -> ArraySpec:
 
 @settings(deadline=None, max_examples=20)
 @given(lag_samples=st.floats(-25.0, 25.0), seed=st.integers(0, 10**6))
-def test_high_band_gives_the_envelope(lag_samples: float, seed: int) -> None:
+def test_a_high_band_gives_the_envelope(lag_samples: float, seed: int) -> None:
     gcc = correlate(high_pair(), delayed(burst(6000, seed), [0.0, lag_samples / 48_000], 48_000.0), rate_hz=48_000.0)
     assert gcc.values.min() >= 0.0
     # The envelope of 4 to 16 kHz is |sinc(12 kHz tau)|, as wide as a 3.5 kHz tone's crest: bins that round to the
@@ -305,11 +305,11 @@ def test_high_band_gives_the_envelope(lag_samples: float, seed: int) -> None:
     np.testing.assert_allclose(gcc.values[0], ideal, atol=2e-3)
 
 
-def test_low_band_keeps_its_sign() -> None:
+def test_a_low_band_keeps_the_sign() -> None:
     assert correlate(pair(), delayed(burst(4000), [0.0, 0.0])).values.min() < -0.1
 
 
-def test_envelope_begins_where_the_band_is_high_for_its_width() -> None:
+def test_the_envelope_begins_at_a_quarter_of_the_band_width() -> None:
     samples = delayed(burst(6000), [0.0, 1e-4], 48_000.0)
     below, above = (
         correlate(ArraySpec("edge", line(0.2, 2), (low, low + 4000.0)), samples, rate_hz=48_000.0).values.min()
@@ -319,7 +319,7 @@ def test_envelope_begins_where_the_band_is_high_for_its_width() -> None:
     assert above >= 0.0
 
 
-def test_curvature_is_the_ideal_peaks() -> None:
+def test_mean_square_angular_frequency_is_the_curvature_of_the_ideal_peak() -> None:
     h_s = 1e-7
     below, at, above = band_mean_cos(np.array([-h_s, 0.0, h_s]), BAND_HZ)
     # the next term is (2 pi 6 kHz h)^2 / 20 = 7e-7; cancellation leaves 1e-16 / 5e-6 of the difference
@@ -336,8 +336,10 @@ def noises(count: int, samples: int = 2000, channels: int = 4) -> list[Float32Ar
 
 @pytest.mark.parametrize("front_end", [whole_segment, averaged, cepstral])
 @pytest.mark.parametrize("band_hz", [BAND_HZ, (6000.0, 7000.0)])
-def test_arrays_together_are_as_each_alone(front_end: FrontEnd, band_hz: tuple[float, float]) -> None:
-    """However differently loud they are. Rounding: sums of a thousand terms in single precision."""
+def test_arrays_correlated_together_give_the_gcc_of_each_alone(
+    front_end: FrontEnd, band_hz: tuple[float, float]
+) -> None:
+    """They differ in level by 20 dB each; rounding of sums of a thousand terms in single precision remains."""
     specs = [ArraySpec(name, TETRA.microphones_m + k, band_hz) for k, name in enumerate(("north", "south", "east"))]
     each = [GCCPhat(spec, RATE_HZ, C_M_S, front_end) for spec in specs]
     sounds = noises(3)

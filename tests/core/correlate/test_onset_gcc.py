@@ -1,4 +1,4 @@
-"""The onset front end: what comes first counts, what the past or the noise explains does not."""
+"""The onset front end: onsets count, and what the past or the noise explains does not."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.geometry import Grid
-from livessl.core.locate import estimators
-from livessl.core.locate.estimators import Onset, Sound
+from livessl.core.locate import onset
+from livessl.core.locate.estimator import Sound
+from livessl.core.locate.onset import Onset
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
@@ -26,7 +27,7 @@ SOURCE_M = np.array([1.13, 3.31, 1.47])
 ELSEWHERE_M = np.array([3.71, 2.39, 0.83])
 FRAME = 800
 
-# Half a cell of the 0.1 m grid: what is refined lies below it, what is on a wrong peak far above.
+# Half a cell of the 0.1 m grid: refined positions are nearer, a wrong peak is much further away.
 NEAR_M = 0.05
 
 
@@ -38,13 +39,13 @@ def noise(count: int, rms: float, seed: int = 0) -> Float32Array:
     return (rms * np.random.default_rng(seed).standard_normal((4, count))).astype(np.float32)
 
 
-def pushed(ear: OnsetFrontEnd, samples: Float32Array, quiet: bool, size: int = FRAME) -> OnsetGCC:
+def pushed(front: OnsetFrontEnd, samples: Float32Array, quiet: bool, size: int = FRAME) -> OnsetGCC:
     cut = range(0, samples.shape[1], size)
-    return reduce(add, [ear.push(samples[:, at : at + size], quiet=quiet) for at in cut])
+    return reduce(add, [front.push(samples[:, at : at + size], quiet=quiet) for at in cut])
 
 
 def echoing(spec: ArraySpec, rms: float = 0.0) -> Float32Array:
-    """A click from the source; from 20 ms on a tail from elsewhere, at its loudest 9 times as strong together."""
+    """A click from the source and, 30 ms later, a decaying tail from elsewhere that is stronger in sum."""
     n = 12000
     click = np.zeros(n)
     click[1000:1160] = np.hanning(160) * np.random.default_rng(1).standard_normal(160)
@@ -59,54 +60,54 @@ def located(sounds: dict[str, Sound]) -> FloatArray:
     return Onset([NORTH, SOUTH], GRID, C_M_S).locate(sounds).position_m
 
 
-def listened(spec: ArraySpec, samples: Float32Array, quiet: Float32Array) -> Sound:
-    ear = front_end(spec)
-    pushed(ear, quiet, quiet=True)
-    return Sound((samples,), RATE_HZ, [pushed(ear, samples, quiet=False)])
+def sound_of(spec: ArraySpec, samples: Float32Array, quiet: Float32Array) -> Sound:
+    front = front_end(spec)
+    pushed(front, quiet, quiet=True)
+    return Sound((samples,), RATE_HZ, [pushed(front, samples, quiet=False)])
 
 
 @pytest.mark.parametrize("rms", [0.0, 0.002])
-def test_what_comes_first_is_found_and_not_the_louder_tail(rms: float) -> None:
-    sounds = {s.name: listened(s, echoing(s, rms), noise(6400, rms)) for s in (NORTH, SOUTH)}
+def test_the_first_sound_is_located_and_not_its_louder_tail(rms: float) -> None:
+    sounds = {s.name: sound_of(s, echoing(s, rms), noise(6400, rms)) for s in (NORTH, SOUTH)}
     assert np.linalg.norm(located(sounds) - SOURCE_M) < NEAR_M
-    late = {s.name: listened(s, echoing(s, rms)[:, 1480:], noise(6400, rms)) for s in (NORTH, SOUTH)}
-    assert np.linalg.norm(located(late) - ELSEWHERE_M) < 2.0 * NEAR_M  # without the click, the tail is the first
+    late = {s.name: sound_of(s, echoing(s, rms)[:, 1480:], noise(6400, rms)) for s in (NORTH, SOUTH)}
+    assert np.linalg.norm(located(late) - ELSEWHERE_M) < 2.0 * NEAR_M  # without the click the tail comes first
 
 
-def test_a_pure_delay_gives_the_weights_themselves() -> None:
+def test_identical_channels_give_the_sum_of_the_weights_at_lag_zero() -> None:
     found = pushed(front_end(), heard(NORTH, NORTH.centre_m, burst(9000)), quiet=False)
-    assert found.weight == 0.0  # nothing quiet was heard before: it may be anything's middle
-    ear = front_end()
-    pushed(ear, np.zeros((4, 6400), np.float32), quiet=True)
+    assert found.weight == 0.0  # without quiet before it, this may be the middle of a sound
+    front = front_end()
+    pushed(front, np.zeros((4, 6400), np.float32), quiet=True)
     same = np.repeat(burst(9000).astype(np.float32)[None], 4, axis=0)
-    found = pushed(ear, same, quiet=False)
+    found = pushed(front, same, quiet=False)
     assert found.weight > 100.0
     middle = found.lags.shape[1] // 2
     np.testing.assert_allclose(found.lags[:, middle], found.weight, rtol=1e-4)
 
 
 def test_stationary_noise_is_no_onset() -> None:
-    ear = front_end()
+    front = front_end()
     steady = noise(48000, 0.01)
-    per_frame = pushed(ear, steady, quiet=True).weight / 60.0
-    ear = front_end()
-    pushed(ear, steady[:, :32000], quiet=True)
-    louder = pushed(ear, 10.0 * steady[:, 32000:32800], quiet=False).weight
+    per_frame = pushed(front, steady, quiet=True).weight / 60.0
+    front = front_end()
+    pushed(front, steady[:, :32000], quiet=True)
+    louder = pushed(front, 10.0 * steady[:, 32000:32800], quiet=False).weight
     assert per_frame < 0.02 * louder
 
 
-def test_noise_of_one_tone_does_not_hide_a_sound() -> None:
+def test_a_hum_does_not_mask_a_sound() -> None:
     hum = (0.3 * np.sin(2 * np.pi * 700.0 * np.arange(18400) / RATE_HZ)).astype(np.float32)
     sounds = {}
     for spec in (NORTH, SOUTH):
         samples = echoing(spec) + hum[6400:] + noise(12000, 1e-4)
-        sounds[spec.name] = listened(spec, samples, hum[:6400] + noise(6400, 1e-4, 5))
+        sounds[spec.name] = sound_of(spec, samples, hum[:6400] + noise(6400, 1e-4, 5))
     assert np.linalg.norm(located(sounds) - SOURCE_M) < NEAR_M
 
 
 @settings(deadline=None, max_examples=15)
 @given(size=st.integers(50, 3000))
-def test_it_does_not_matter_how_samples_are_cut(size: int) -> None:
+def test_the_result_does_not_depend_on_how_samples_are_cut(size: int) -> None:
     samples = echoing(NORTH, 0.001)
     quiet = noise(6400, 0.001)
     whole, cut = front_end(), front_end()
@@ -118,51 +119,51 @@ def test_it_does_not_matter_how_samples_are_cut(size: int) -> None:
     assert np.abs(pushed(cut, samples[:, ::-1], False).lags - one.lags).max() > 0.1 * one.weight
 
 
-def test_reset_forgets_all() -> None:
+def test_reset_gives_the_state_of_a_new_front_end() -> None:
     fresh, used = front_end(), front_end()
     pushed(used, noise(20000, 0.1, 3), quiet=False)
     used.reset()
     results = []
-    for ear in (fresh, used):
-        pushed(ear, noise(6400, 0.001), quiet=True)
-        results.append(pushed(ear, echoing(NORTH, 0.001), quiet=False))
+    for front in (fresh, used):
+        pushed(front, noise(6400, 0.001), quiet=True)
+        results.append(pushed(front, echoing(NORTH, 0.001), quiet=False))
     np.testing.assert_array_equal(results[0].lags, results[1].lags)
 
 
-def test_after_a_second_without_any_quiet_onsets_count() -> None:
-    ear = front_end()
-    pushed(ear, noise(20000, 0.01), quiet=False)
-    assert pushed(ear, noise(800, 0.1), quiet=False).weight > 100.0
+def test_onsets_count_after_a_second_without_quiet() -> None:
+    front = front_end()
+    pushed(front, noise(20000, 0.01), quiet=False)
+    assert pushed(front, noise(800, 0.1), quiet=False).weight > 100.0
 
 
-def test_silence_and_dead_channels_are_no_evidence() -> None:
-    ear = front_end()
-    pushed(ear, np.zeros((4, 6400), np.float32), quiet=True)
-    silent = pushed(ear, np.zeros((4, 6400), np.float32), quiet=False)
+def test_silence_and_dead_channels_give_zeros() -> None:
+    front = front_end()
+    pushed(front, np.zeros((4, 6400), np.float32), quiet=True)
+    silent = pushed(front, np.zeros((4, 6400), np.float32), quiet=False)
     assert silent.weight == 0.0
     assert not silent.lags.any()
     samples = echoing(NORTH)
     samples[2] = 0.0
-    found = pushed(ear, samples, quiet=False)
+    found = pushed(front, samples, quiet=False)
     assert np.isfinite(found.lags).all()
     with_dead = [1, 3, 5]  # pairs (0, 2), (1, 2), (2, 3)
     assert not found.lags[with_dead].any()
     assert np.abs(found.lags[0]).max() > 0.1 * found.weight
 
 
-def test_high_bands_go_by_the_envelope() -> None:
+def test_a_high_band_uses_the_envelope() -> None:
     high = ArraySpec("high", NORTH.microphones_m, (4000.0, 16000.0))
     assert np.iscomplexobj(front_end(high, 44100.0).nothing.lags)
     assert not np.iscomplexobj(front_end().nothing.lags)
     assert NORTH.band_hz == BAND_HZ
 
 
-def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_arrays_those_with_the_strongest_onsets_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     east = tetra("east", [3.9, 4.8, 1.2])
     estimator = Onset([NORTH, SOUTH, east], GRID, C_M_S)
     loudness = {"north": 1.0, "south": 1.0, "east": 0.02}
     sounds = {
-        spec.name: listened(
+        spec.name: sound_of(
             spec, np.float32(loudness[spec.name]) * echoing(spec) + noise(12000, 0.002), noise(6400, 0.002)
         )
         for spec in (NORTH, SOUTH, east)
@@ -170,7 +171,7 @@ def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.Mo
     everyone = estimator.locate(sounds)
     assert not everyone.unneeded
     assert [heard.spec.name for heard in everyone.evidence] == ["east", "north", "south"]
-    monkeypatch.setattr(estimators, "MOST_ARRAYS", 2)
+    monkeypatch.setattr(onset, "MOST_ARRAYS", 2)
     found = estimator.locate(sounds)
     assert set(found.unneeded) == {"east"}
     assert [heard.spec.name for heard in found.evidence] == ["north", "south"]
@@ -179,36 +180,38 @@ def test_of_many_arrays_those_that_hear_most_clearly_tell(monkeypatch: pytest.Mo
     assert found.outliers == without.outliers
 
 
-def test_gains_of_microphones_do_not_matter() -> None:
+def test_gains_of_microphones_do_not_change_the_position() -> None:
     gain = np.array([[1.0], [5.0], [0.3], [1.0]], np.float32)
-    even = {s.name: listened(s, echoing(s, 0.002), noise(6400, 0.002)) for s in (NORTH, SOUTH)}
-    odd = {s.name: listened(s, gain * echoing(s, 0.002), gain * noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    even = {s.name: sound_of(s, echoing(s, 0.002), noise(6400, 0.002)) for s in (NORTH, SOUTH)}
+    odd = {s.name: sound_of(s, gain * echoing(s, 0.002), gain * noise(6400, 0.002)) for s in (NORTH, SOUTH)}
     assert np.linalg.norm(located(odd) - SOURCE_M) < NEAR_M
     pairs = microphone_pairs(4)
     heights = []
     for sounds in (even, odd):
         onsets = sounds["north"].onsets[0]
         heights.append((onsets.lags / onsets.heights(pairs)).max(axis=1))
-    np.testing.assert_allclose(heights[1], heights[0], rtol=0.3)  # as they are they would differ by up to 17 times
+    np.testing.assert_allclose(
+        heights[1], heights[0], rtol=0.3
+    )  # without normalisation they would differ by up to 17 times
 
 
-def test_where_microphones_are_far_apart_each_counts_the_same() -> None:
+def test_microphones_far_apart_count_the_same() -> None:
     wide = ArraySpec("wide", 10.0 * NORTH.microphones_m, BAND_HZ)
     for spec, same in ((wide, True), (NORTH, False)):
-        ear = front_end(spec)
-        pushed(ear, noise(6400, 0.001), quiet=True)
-        found = pushed(ear, np.array([[5.0], [1.0], [1.0], [1.0]], np.float32) * echoing(NORTH, 0.001), quiet=False)
+        front = front_end(spec)
+        pushed(front, noise(6400, 0.001), quiet=True)
+        found = pushed(front, np.array([[5.0], [1.0], [1.0], [1.0]], np.float32) * echoing(NORTH, 0.001), quiet=False)
         assert (found.levels.max() < 1.01 * found.levels.min()) == same
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_what_onsets_do_not_tell_whole_segments_do(ended: bool) -> None:
+def test_whole_segments_locate_an_ended_sound_without_onsets(ended: bool) -> None:
     estimator = Onset([NORTH, SOUTH], GRID, C_M_S)
     sounds = {}
     for seed, spec in enumerate((NORTH, SOUTH)):
-        ear = front_end(spec)
-        pushed(ear, noise(6400, 0.01, seed), quiet=True)
-        only_noise = pushed(ear, noise(6400, 0.01, seed + 2), quiet=False)
+        front = front_end(spec)
+        pushed(front, noise(6400, 0.01, seed), quiet=True)
+        only_noise = pushed(front, noise(6400, 0.01, seed + 2), quiet=False)
         segment = heard(spec, SOURCE_M, burst(9000)) + noise(9000, 0.01, seed + 4)
         sounds[spec.name] = Sound((segment,), RATE_HZ, (only_noise,), ended=ended)
     found = estimator.locate(sounds)
@@ -219,8 +222,8 @@ def test_what_onsets_do_not_tell_whole_segments_do(ended: bool) -> None:
         assert np.linalg.norm(found.position_m - SOURCE_M) < NEAR_M
 
 
-def test_of_what_onsets_are_sure_nobody_asks_the_segments() -> None:
-    sounds = {s.name: listened(s, echoing(s), noise(6400, 0.0)) for s in (NORTH, SOUTH)}
+def test_segments_are_not_used_where_onsets_are_sure() -> None:
+    sounds = {s.name: sound_of(s, echoing(s), noise(6400, 0.0)) for s in (NORTH, SOUTH)}
     other = {name: replace(sound, segments=(noise(9000, 0.1),)) for name, sound in sounds.items()}
     found = [Onset([NORTH, SOUTH], GRID, C_M_S).locate(each) for each in (sounds, other)]
     np.testing.assert_array_equal(found[0].position_m, found[1].position_m)

@@ -11,8 +11,11 @@ from livessl.core.correlate.gcc_phat import CrossSpectra, GCCPhat, microphone_pa
 from livessl.core.correlate.spectra import averaged, cepstral, minimum_phase_cepstrum, whole_segment
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
-from livessl.core.locate.estimators import ESTIMATORS, Localization, Sound, SrpPhat, third_octaves_below_hz
+from livessl.core.locate.estimator import Localization, Sound, create
+from livessl.core.locate.map_estimator import third_octaves_below_hz
 from livessl.core.locate.srp import SRPMapper
+from livessl.core.locate.srp_phat import SrpPhat
+from livessl.core.methods import METHODS
 from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
@@ -35,7 +38,7 @@ def test_folded_real_cepstrum_is_the_complex_one_without_its_odd_part() -> None:
     n_fft = 1024
     spectrum = np.fft.rfft(np.random.default_rng(1).standard_normal((3, 400)), n_fft, axis=1)
     folded = minimum_phase_cepstrum(np.abs(spectrum), n_fft)
-    # the complex route, by a phase that is right but for turns: these are odd too, and cancel
+    # the complex cepstrum, with a phase that is right up to multiples of 2 pi: these are odd too and cancel
     full = np.fft.fft(np.fft.irfft(spectrum, n_fft, axis=1), axis=1)
     complex_cepstrum = np.fft.ifft(np.log(np.abs(full)) + 1j * np.angle(full), axis=1).real
     expected = complex_cepstrum.copy()
@@ -57,7 +60,7 @@ def test_minimum_phase_sound_is_its_own_minimum_phase_part() -> None:
     assert np.abs(rebuilt - reversed_spectrum).max() > 0.5
 
 
-def test_the_source_cancels_in_a_pair() -> None:
+def test_the_spectrum_of_the_source_cancels_in_a_pair() -> None:
     n_fft = 8192
     rng = np.random.default_rng(2)
     source = np.fft.rfft(rng.standard_normal(3000), n_fft)
@@ -67,24 +70,24 @@ def test_the_source_cancels_in_a_pair() -> None:
     assert np.abs(of_sounds - of_channels).max() > 0.1
 
 
-def test_cepstral_front_end_undoes_a_minimum_phase_channel() -> None:
+def test_the_cepstral_front_end_removes_a_minimum_phase_channel() -> None:
     rng = np.random.default_rng(3)
     sound = rng.standard_normal(30000)
     echo = np.zeros(200)
-    echo[[0, 37, 90]] = 1.0, 0.5, 0.3  # the sum of what follows is less than the first: minimum phase
-    heard_by_two = np.stack([sound, through(echo, sound)]).astype(np.float32)
+    echo[[0, 37, 90]] = 1.0, 0.5, 0.3  # minimum phase, because the echoes are weaker than the first sound in sum
+    two_channels = np.stack([sound, through(echo, sound)]).astype(np.float32)
     reach = 100
     peaks = []
     for front_end in (whole_segment, cepstral):
-        cross = CrossSpectra(front_end(heard_by_two, RATE_HZ, reach), PAIR, RATE_HZ, BAND_HZ)
+        cross = CrossSpectra(front_end(two_channels, RATE_HZ, reach), PAIR, RATE_HZ, BAND_HZ)
         values = cross.correlations(reach).real[0]
         assert values.argmax() == reach  # no delay
         peaks.append(values[reach])
-    assert peaks[1] > 0.97  # a frame's edges leave some
+    assert peaks[1] > 0.97  # the edges of frames leave a remainder
     assert peaks[0] < 0.93
 
 
-def test_cepstral_frames_are_short_and_remember(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cepstral_frames_are_short_and_share_a_running_cepstrum(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cepstral(noise(16000), RATE_HZ, 100).values.shape[0] == 2  # halves of 0.5 s
     assert cepstral(noise(32000), RATE_HZ, 100).values.shape[0] == 3  # 0.6 s each, 0.2 s left out
     sound = noise(32000)
@@ -95,7 +98,7 @@ def test_cepstral_frames_are_short_and_remember(monkeypatch: pytest.MonkeyPatch)
     assert np.abs(np.angle(moved[1] / usual[1])).max() > 0.1
 
 
-def test_averaged_is_the_mean_of_its_frames() -> None:
+def test_the_averaged_gcc_is_the_mean_of_its_frames() -> None:
     sound = noise(5 * 200 + 200)
     reach = 50
     together = CrossSpectra(averaged(sound, RATE_HZ, reach), PAIR, RATE_HZ, BAND_HZ).correlations(reach)
@@ -112,7 +115,7 @@ def test_averaged_is_the_mean_of_its_frames() -> None:
 
 @pytest.mark.parametrize("front_end", [whole_segment, averaged, cepstral])
 @pytest.mark.parametrize("count", [1, 3, 399, 401, 1000])
-def test_any_length_and_silence_are_taken(front_end: spectra.FrontEnd, count: int) -> None:
+def test_any_length_and_silence_give_finite_values(front_end: spectra.FrontEnd, count: int) -> None:
     for samples in (noise(count), np.zeros((2, count), dtype=np.float32)):
         spectra = front_end(samples, RATE_HZ, 30)
         assert spectra.values.shape[1:] == (2, spectra.n_fft // 2 + 1)
@@ -121,16 +124,16 @@ def test_any_length_and_silence_are_taken(front_end: spectra.FrontEnd, count: in
         assert samples.any() or not values.any()
 
 
-@pytest.mark.parametrize("method", sorted(ESTIMATORS))
-def test_every_method_finds_a_sound_in_free_air(method: str) -> None:
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_every_method_locates_a_sound_in_free_field(method: str) -> None:
     grid = Grid(BOUNDS_M, 0.1)
     sound = burst(9000)
     sounds = {spec.name: Sound((heard(spec, SOURCE_M, sound),), RATE_HZ) for spec in (NORTH, SOUTH)}
-    found = ESTIMATORS[method]([NORTH, SOUTH], grid, C_M_S).locate(sounds)
-    assert np.linalg.norm(found.position_m - SOURCE_M) < 0.05  # half a cell: frames' edges cost some
+    found = create(method, [NORTH, SOUTH], grid, C_M_S).locate(sounds)
+    assert np.linalg.norm(found.position_m - SOURCE_M) < 0.05  # half a cell: the edges of frames cost accuracy
 
 
-def test_alias_free_band_is_that_of_the_gradient() -> None:
+def test_the_alias_free_frequency_follows_from_the_gradient_of_the_delay() -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform([0.1, 0.1, 0.1], [4.0, 5.0, 2.5], (40, 3))
     pairs = microphone_pairs(4)
@@ -145,11 +148,11 @@ def test_alias_free_band_is_that_of_the_gradient() -> None:
     expected = 1.0 / (2.0 * 0.5 * np.linalg.norm(gradient, axis=0))
     limit = alias_free_hz(points, NORTH.microphones_m, pairs, 0.5, C_M_S)
     np.testing.assert_allclose(limit, expected, rtol=1e-5)
-    assert limit.min() >= C_M_S / (4.0 * 0.5)  # the worst is on the way between two microphones
+    assert limit.min() >= C_M_S / (4.0 * 0.5)  # the lowest limit is between two microphones
 
 
-def test_alias_free_band_of_the_papers_arrays() -> None:
-    # algorithm notes: 0.5 m spacing, broadside, 3 m away, 0.5 m and 0.1 m grid
+def test_the_alias_free_frequency_of_the_papers_arrays() -> None:
+    # a pair 0.5 m apart, broadside, 3 m away, on grids of 0.5 m and 0.1 m
     microphones = np.array([[-0.25, 0.0, 0.0], [0.25, 0.0, 0.0]])
     point = np.array([[0.0, 3.0, 0.0]])
     for spacing_m, expected_hz in ((0.5, 2065.0), (0.1, 10326.0)):
@@ -157,7 +160,7 @@ def test_alias_free_band_of_the_papers_arrays() -> None:
     assert np.isinf(alias_free_hz(np.array([[2.0, 0.0, 0.0]]), microphones, PAIR, 0.5, C_M_S)[0, 0])  # endfire
 
 
-def test_cut_offs_keep_what_lies_below_and_no_norm() -> None:
+def test_cut_offs_keep_the_lower_band_without_normalising() -> None:
     correlate = GCCPhat(NORTH, RATE_HZ, C_M_S)
     samples = heard(NORTH, SOURCE_M, burst(4000))
     cut_offs_hz = third_octaves_below_hz(BAND_HZ)
@@ -171,7 +174,7 @@ def test_cut_offs_keep_what_lies_below_and_no_norm() -> None:
         np.testing.assert_allclose(one.values.max(axis=1), share, atol=0.02)
 
 
-def test_the_mapper_reads_each_node_below_its_limit() -> None:
+def test_the_mapper_looks_each_point_up_below_its_limit() -> None:
     grid = Grid(BOUNDS_M, 0.5)
     correlate = GCCPhat(NORTH, RATE_HZ, C_M_S)
     gccs = correlate.below([heard(NORTH, SOURCE_M, burst(4000))], (3000.0, 1500.0))
@@ -190,18 +193,20 @@ def test_the_mapper_reads_each_node_below_its_limit() -> None:
     assert clear.mean() > 0.9
 
 
-def test_on_a_fine_grid_the_limit_changes_hardly_anything() -> None:
+def test_the_band_limit_changes_hardly_anything_on_a_fine_grid() -> None:
     sound = burst(4000)
     grid = Grid(BOUNDS_M, 0.1)
     sounds = {spec.name: Sound((heard(spec, SOURCE_M, sound),), RATE_HZ) for spec in (NORTH, SOUTH)}
     (free, all_), (limited, less), (_, usual) = (located([NORTH, SOUTH], grid, sounds, b) for b in (False, True, None))
-    np.testing.assert_array_equal(usual, all_)  # off where it does not matter
-    assert np.linalg.norm(limited.position_m - free.position_m) < 1e-6  # refined by the whole band from the same node
+    np.testing.assert_array_equal(usual, all_)  # not limited where it does not matter
+    assert (
+        np.linalg.norm(limited.position_m - free.position_m) < 1e-6
+    )  # refined with the whole band from the same grid point
     assert less.argmax() == all_.argmax()
     assert not np.array_equal(less, all_)
 
 
-def test_on_a_coarse_grid_the_limit_is_on() -> None:
+def test_the_band_is_limited_on_a_coarse_grid() -> None:
     grid = Grid(BOUNDS_M, 0.5)
     sounds = {"north": Sound((heard(NORTH, SOURCE_M, burst(4000)),), RATE_HZ)}
     (_, all_), (_, less), (_, usual) = (located([NORTH], grid, sounds, b) for b in (False, True, None))
@@ -212,7 +217,7 @@ def test_on_a_coarse_grid_the_limit_is_on() -> None:
 def located(
     specs: list[ArraySpec], grid: Grid, sounds: dict[str, Sound], band_limit: bool | None
 ) -> tuple[Localization, Float32Array]:
-    """The place, and the fused map."""
+    """Return the localization and the fused map."""
     estimator = SrpPhat(specs, grid, C_M_S, band_limit=band_limit)
     found = estimator.locate(sounds)
     return found, estimator.power_maps(found.evidence).fused
@@ -228,20 +233,20 @@ def test_joint_arrays_have_every_pair() -> None:
 
 
 @pytest.mark.parametrize("clocks", [{"north": "rack", "south": "desk"}, {"north": "rack"}, {}])
-def test_joint_arrays_of_two_clocks_are_refused(clocks: dict[str, str]) -> None:
+def test_joint_arrays_of_two_clocks_are_an_error(clocks: dict[str, str]) -> None:
     with pytest.raises(
         ValueError, match="array 'both': joint processing expects arrays sampled by one clock, got 'north'"
     ):
         joined([NORTH, SOUTH], clocks, "both")
 
 
-def test_joint_arrays_of_two_bands_are_refused() -> None:
+def test_joint_arrays_of_two_bands_are_an_error() -> None:
     other = ArraySpec("south", SOUTH.microphones_m.copy(), (200.0, 6000.0))
     with pytest.raises(ValueError, match="arrays of one band"):
         joined([NORTH, other], {"north": "rack", "south": "rack"}, "both")
 
 
-def test_joint_arrays_of_too_many_microphones_are_refused() -> None:
+def test_joint_arrays_of_too_many_microphones_are_an_error() -> None:
     names = ["north", "south", "east", "west", "top"]
     arrays = [ArraySpec(name, NORTH.microphones_m + k, BAND_HZ) for k, name in enumerate(names)]
     clocks = dict.fromkeys(names, "rack")

@@ -1,4 +1,4 @@
-"""The listening kernels: compiled and on NumPy they say the same, and what their definitions say."""
+"""The kernels, compiled and on NumPy, agree with each other and with their definitions."""
 
 from __future__ import annotations
 
@@ -9,12 +9,19 @@ import pytest
 
 from livessl.core.correlate.gcc_phat import microphone_pairs
 from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.kernels.arguments import NO_LAG, OnsetParameters, OnsetState
 from livessl.core.types import ComplexArray, Float32Array
 
 KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="NumPy")]
 LOW, BINS = 3, 40
-LEAST, DECAY = np.float32(1e-9), np.float32(0.95)
-LOUD, STRONGEST = np.float32(3.0), np.float32(10.0)
+PARAMETERS = OnsetParameters(
+    least=np.float32(1e-9),
+    decay=np.float32(0.95),
+    loud=np.float32(3.0),
+    strongest=np.float32(10.0),
+    warm_up=8,
+    noise_hops=20,
+)
 
 
 def spectra_of(frames: int, microphones: int = 3, seed: int = 0) -> ComplexArray:
@@ -25,10 +32,10 @@ def spectra_of(frames: int, microphones: int = 3, seed: int = 0) -> ComplexArray
 
 @pytest.mark.parametrize("kernels", KERNELS)
 @pytest.mark.parametrize("noise", [0.0, 3.0, np.inf])
-def test_cross_spectra_are_weighed_sums_of_what_is_whitened(kernels: ModuleType, noise: float) -> None:
+def test_cross_spectra_are_weighed_sums_of_whitened_spectra(kernels: ModuleType, noise: float) -> None:
     spectra = spectra_of(4)
     spectra[:, 0] *= 3.0  # a louder microphone
-    spectra[:, 1, LOW + 7] = 0.0  # where a channel is silent nothing is known
+    spectra[:, 1, LOW + 7] = 0.0  # a silent bin has no phase
     weights = np.random.default_rng(1).random((4, BINS)).astype(np.float32)
     weights[2] = 0.0
     pairs, whitened, levels = microphone_pairs(3), np.empty((3, BINS), np.complex64), np.empty(3)
@@ -39,13 +46,13 @@ def test_cross_spectra_are_weighed_sums_of_what_is_whitened(kernels: ModuleType,
     padded = np.pad(power.mean(axis=1), ((0, 0), (1, 1)), mode="edge")
     mean = ((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / 3.0)[:, None]
     share = np.minimum(1.0, noise / mean)
-    assert noise != 3.0 or 0.05 < (share == 1.0).mean() < 0.95  # of that, some is all noise and some is not
+    assert noise != 3.0 or 0.05 < (share == 1.0).mean() < 0.95  # some bins are all noise and some are not
     power = (1.0 - share) * power + share * mean
     unit = np.divide(inside, np.sqrt(power), out=np.zeros_like(inside), where=inside != 0)
     for row, (i, k) in enumerate(pairs):
         np.testing.assert_allclose(whitened[row], (weights * np.conj(unit[:, i]) * unit[:, k]).sum(axis=0), atol=2e-5)
     np.testing.assert_allclose(levels, (weights[:, None] * np.square(np.abs(unit))).sum(axis=(0, 2)), rtol=1e-5)
-    assert np.abs(whitened.imag).max() > 0.5  # a sign that is turned is seen
+    assert np.abs(whitened.imag).max() > 0.5  # a wrong sign would show
     assert whitened[0, 7] == whitened[2, 7] == 0.0
     if noise == 0.0:
         assert levels[0] == pytest.approx(weights.sum(), rel=1e-5)
@@ -54,35 +61,39 @@ def test_cross_spectra_are_weighed_sums_of_what_is_whitened(kernels: ModuleType,
 
 
 def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array, ...]:
-    """Weights of some windows, six to a frame, and what is known after them."""
-    heard, noise, past = np.zeros(2, np.int64), np.zeros(BINS, np.float32), np.zeros(BINS, np.float32)
+    """Weights of some windows, six to a frame, and the state after them."""
+    state = OnsetState(np.zeros(2, np.int64), np.zeros(BINS, np.float32), np.zeros(BINS, np.float32))
     all_weights, all_noises = [], []
     for number, (still, loud) in enumerate(zip(quiet, level, strict=True)):
         weights, noises = np.full((2, 6, BINS), np.nan, np.float32)
         spectra = np.float32(loud) * spectra_of(6, seed=number)
-        kernels.onset_weights(
-            spectra, LOW, still, heard, LEAST, DECAY, 8, 20, LOUD, STRONGEST, noise, past, weights, noises
-        )
+        kernels.onset_weights(spectra, LOW, still, PARAMETERS, state, weights, noises)
         all_weights.append(weights)
         all_noises.append(noises)
-    return np.concatenate(all_weights), np.concatenate(all_noises), noise, past, heard.astype(np.float32)
+    return (
+        np.concatenate(all_weights),
+        np.concatenate(all_noises),
+        state.noise,
+        state.past,
+        state.windows.astype(np.float32),
+    )
 
 
-def test_weights_are_the_same_by_both() -> None:
+def test_both_kinds_of_kernels_give_the_same_weights() -> None:
     quiet, level = [True, True, False, False, True, True], [0.01, 0.02, 1.0, 0.1, 0.5, 0.01]
     said = [weighed(kernels, quiet, level) for kernels in (with_numba, with_numpy)]
     for one, other in zip(*said, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-4, atol=1e-6)
     weights, noises, last = said[0][:3]
-    assert (noises[2] != noises[1]).any()  # of each window what was known before it
+    assert (noises[2] != noises[1]).any()  # the noise as known before each window
     np.testing.assert_allclose(noises[-1], last, rtol=0.2)
     assert not weights[:8].any()  # before the noise is known
-    assert weights[12:18].mean() > 10.0 * weights[18:24].mean()  # what comes first, and what comes after it
-    assert weights.max() == STRONGEST
+    assert weights[12:18].mean() > 10.0 * weights[18:24].mean()  # the onset, and what follows it
+    assert weights.max() == PARAMETERS.strongest
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-def test_windows_are_cut_a_hop_apart_and_filled_up(kernels: ModuleType) -> None:
+def test_windows_are_a_hop_apart_and_padded_with_zeros(kernels: ModuleType) -> None:
     samples = np.random.default_rng(0).standard_normal((2, 100)).astype(np.float32)
     window, windows = np.hanning(30).astype(np.float32), np.full((4, 2, 64), np.nan, np.float32)
     kernels.cut_windows(samples, 20, window, windows)
@@ -92,7 +103,7 @@ def test_windows_are_cut_a_hop_apart_and_filled_up(kernels: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-def test_mean_square_leaves_out_what_is_near(kernels: ModuleType) -> None:
+def test_mean_square_excludes_lags_near_the_peak(kernels: ModuleType) -> None:
     lags_s = np.arange(-20, 21) / 1000.0
     values = np.ones((2, 41), np.float32)
     values[0, 18:23] = 5.0  # within 2.5 ms of zero
@@ -100,3 +111,18 @@ def test_mean_square_leaves_out_what_is_near(kernels: ModuleType) -> None:
     assert kernels.mean_square(values, lags_s, at_s, 2.5e-3) == pytest.approx(1.0)
     assert kernels.mean_square(values, lags_s, at_s, -1.0) == pytest.approx((5 * 25 + 77) / 82)
     assert kernels.mean_square(values, lags_s, at_s, 3.0) == 0.0
+
+
+def test_both_kinds_of_kernels_give_the_same_cell_intervals() -> None:
+    axes = tuple(np.arange(count, dtype=np.float32) * np.float32(0.11) for count in (7, 9, 5))
+    microphones_m = np.random.default_rng(0).uniform(0.0, 1.0, (4, 3)).astype(np.float32)
+    pairs = microphone_pairs(4).astype(np.int32)
+    ends = []
+    for kernels in (with_numba, with_numpy):
+        low, high = np.empty((2, len(pairs), 4 * 5 * 3), np.uint16)
+        kernels.cell_intervals(axes, microphones_m, pairs, np.float32(300.0), np.float32(500.5), 2, low, high)
+        assert (low <= high).all()
+        assert (low < high).any()
+        assert high.max() < NO_LAG
+        ends.append((low, high))
+    np.testing.assert_array_equal(ends[0], ends[1])

@@ -1,4 +1,4 @@
-"""How sure a place is: probability, refusal and covariance, on evidence made for the purpose."""
+"""Confidence, refusal and covariance of a position, on synthetic evidence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
 SOURCE_M = np.array([1.13, 3.31, 1.47])
 
 
-def heard_at(spec: ArraySpec, height: float, noise: float = 0.1) -> Evidence:
+def evidence_of(spec: ArraySpec, height: float, noise: float = 0.1) -> Evidence:
     gcc = ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M), RATE_HZ)
     scatter = np.random.default_rng(len(spec.name)).standard_normal(gcc.values.shape)
     values = (height * gcc.values + noise * scatter).astype(np.float32)
@@ -35,32 +35,32 @@ def judged(*evidence: Evidence, rival_share: float = 0.3) -> Judgement:
     return judge(functional, evidence, SOURCE_M, power, rival_share * power, GRID)
 
 
-@given(margin=st.floats(0.0, 0.3), standing=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
-def test_more_evidence_is_more_confidence(margin: float, standing: float, more: float) -> None:
-    confidence = ConfidenceFeatures(margin, standing).confidence
+@given(margin=st.floats(0.0, 0.3), ratio=st.floats(0.0, 9.0), more=st.floats(0.01, 0.1))
+def test_confidence_grows_with_margin_and_peak_to_rms_ratio(margin: float, ratio: float, more: float) -> None:
+    confidence = ConfidenceFeatures(margin, ratio).confidence
     assert 0.0 < confidence < 1.0
-    assert ConfidenceFeatures(margin + more, standing).confidence > confidence
-    assert ConfidenceFeatures(margin, standing + more).confidence > confidence
+    assert ConfidenceFeatures(margin + more, ratio).confidence > confidence
+    assert ConfidenceFeatures(margin, ratio + more).confidence > confidence
 
 
-def test_clear_evidence_is_located_and_noise_is_refused() -> None:
-    clear = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0))
+def test_clear_evidence_is_accepted_and_noise_is_refused() -> None:
+    clear = judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 1.0))
     assert clear.refused is None
     assert clear.features.confidence > 0.95
-    drowned = judged(heard_at(NORTH, 0.02), heard_at(SOUTH, 0.02), rival_share=0.95)
+    drowned = judged(evidence_of(NORTH, 0.02), evidence_of(SOUTH, 0.02), rival_share=0.95)
     assert drowned.features.confidence < LEAST_CONFIDENCE
     assert drowned.refused is not None
     assert f"{drowned.features.confidence:.2f}" in drowned.refused
 
 
-def test_an_array_that_hears_only_noise_hardly_takes_away() -> None:
-    alone = judged(heard_at(NORTH, 1.0)).features
-    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
-    assert both.standing == pytest.approx(alone.standing, abs=1.0)  # noise stands no higher than once its own rms
-    assert judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features.standing > alone.standing + 2.0
+def test_an_array_with_only_noise_hardly_lowers_the_peak_to_rms_ratio() -> None:
+    alone = judged(evidence_of(NORTH, 1.0)).features
+    both = judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 0.0)).features
+    assert both.peak_to_rms == pytest.approx(alone.peak_to_rms, abs=1.0)  # noise reaches at most its own RMS
+    assert judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 1.0)).features.peak_to_rms > alone.peak_to_rms + 2.0
 
 
-def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
+def test_crossing_lines_of_sight_determine_the_distance_whatever_the_margin() -> None:
     assert (
         ConfidenceFeatures(0.01, 5.0, crossing_deg=45.0).confidence
         > ConfidenceFeatures(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
@@ -73,43 +73,43 @@ def test_lines_that_cross_tell_distance_whatever_the_margin() -> None:
     assert crossing_deg([east, west], beyond) == pytest.approx(0.0, abs=1e-3)
 
 
-def test_arrays_that_hear_only_noise_leave_it_unsure() -> None:
-    both = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 1.0)).features
-    one = judged(heard_at(NORTH, 1.0), heard_at(SOUTH, 0.0)).features
+def test_one_array_with_a_clear_peak_is_not_sure() -> None:
+    both = judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 1.0)).features
+    one = judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 0.0)).features
     assert both.is_sure
-    assert one.shared < 2.0 < both.shared
+    assert one.second_array < 2.0 < both.second_array
     assert not one.is_sure
-    assert not judged(heard_at(NORTH, 1.0)).features.is_sure
+    assert not judged(evidence_of(NORTH, 1.0)).features.is_sure
 
 
-def test_pairs_that_disagree_widen_the_ellipsoid() -> None:
-    """Delays off by 10 us, 3 mm of sound: far below a lobe, so that the heights hardly fall."""
-    evidence = [heard_at(NORTH, 1.0, 0.0), heard_at(SOUTH, 1.0, 0.0)]
+def test_pairs_that_disagree_widen_the_covariance() -> None:
+    """Delays off by 10 us, 3 mm of sound: far below a lobe, so that the heights hardly change."""
+    evidence = [evidence_of(NORTH, 1.0, 0.0), evidence_of(SOUTH, 1.0, 0.0)]
     off_s = 1e-5 * np.random.default_rng(0).standard_normal((2, 6))
     torn = [
         Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
         for spec, off in zip((NORTH, SOUTH), off_s, strict=True)
     ]
     agreed, disagreed = (judged(*each).covariance_m2 for each in (evidence, torn))
-    np.testing.assert_allclose(agreed, 0.005**2 * np.eye(3), atol=1e-6)  # what is left however clear
-    assert np.trace(disagreed) > 1.5 * np.trace(agreed)  # half of it and more is what the pairs tell
+    np.testing.assert_allclose(agreed, 0.005**2 * np.eye(3), atol=1e-6)  # what remains with the clearest evidence
+    assert np.trace(disagreed) > 1.5 * np.trace(agreed)  # more than half of it comes from the misfit
 
 
-def test_one_array_has_no_delays_to_spare() -> None:
-    """Three delays, three coordinates: pairs that agree are no wonder, and the ellipsoid is as wide as without it."""
-    alone = judged(heard_at(NORTH, 1.0, 0.0)).covariance_m2
+def test_the_covariance_of_one_array_does_not_shrink_when_its_pairs_agree() -> None:
+    """Three delays determine three coordinates: that the pairs agree says nothing."""
+    alone = judged(evidence_of(NORTH, 1.0, 0.0)).covariance_m2
     assert np.linalg.eigvalsh(alone)[-1] > 0.05**2
 
 
-def test_nothing_heard_is_refused_without_a_warning() -> None:
-    silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (heard_at(NORTH, 1.0),)]
+def test_silence_is_refused_without_a_warning() -> None:
+    silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (evidence_of(NORTH, 1.0),)]
     nothing = judged(*silent)
     assert nothing.refused is not None
     assert nothing.features == ConfidenceFeatures(0.0, 0.0)
     assert np.isfinite(nothing.covariance_m2).all()
 
 
-def test_neighbourhood_is_a_metre_around_and_inside_the_grid() -> None:
+def test_neighbourhood_reaches_a_metre_and_stays_inside_the_grid() -> None:
     box = refine.neighbourhood(SOURCE_M, GRID)
     for axis, (first, last) in enumerate(box):
         nodes = GRID.axis_m(axis)

@@ -1,4 +1,4 @@
-"""One array of several is wrong: it is found out, named and left out; and where nobody can tell which, that is said."""
+"""An array that disagrees is left out and named; where it is unknown which one is wrong, the position is refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from livessl.core.correlate.band import dead_channels
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimators import Localization, Onset, Sound
+from livessl.core.locate.estimator import Localization, Sound
+from livessl.core.locate.onset import Onset
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
@@ -20,11 +21,11 @@ EAST = tetra("east", [3.9, 2.6, 2.1], yaw_deg=-40.0)
 SOURCE_M = np.array([1.13, 3.31, 0.83])
 
 NEAR_M = 0.01
-"""Onsets weigh moments of 32 ms, at the edges of which a burst is cut: a centimetre, where whole segments give 1 mm."""
+"""Onset windows of 32 ms cut the burst at its edges, which costs a centimetre; whole segments are right to 1 mm."""
 
 
 def turned(spec: ArraySpec, yaw_deg: float, name: str | None = None) -> ArraySpec:
-    """As a site file has it that is wrong about the pose."""
+    """Return the array as a site file with a wrong yaw describes it."""
     cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return ArraySpec(name or spec.name, (spec.microphones_m - spec.centre_m) @ turn.T + spec.centre_m, BAND_HZ)
@@ -33,7 +34,7 @@ def turned(spec: ArraySpec, yaw_deg: float, name: str | None = None) -> ArraySpe
 def sounds_of(
     specs: Sequence[ArraySpec], source_m: FloatArray = SOURCE_M, suspect: Collection[str] = ()
 ) -> dict[str, Sound]:
-    """What arrays hear that stand as these say."""
+    """Sounds of arrays at these positions."""
     sound = burst(6400, seed=2)
     return {spec.name: Sound((heard(spec, source_m, sound),), RATE_HZ, suspect=spec.name in suspect) for spec in specs}
 
@@ -50,7 +51,7 @@ SOUNDS = sounds_of([NORTH, SOUTH, EAST])
 
 
 @pytest.mark.parametrize("yaw_deg", [30.0, -30.0])
-def test_a_turned_array_is_outvoted_and_named(yaw_deg: float) -> None:
+def test_a_turned_array_is_left_out_and_named(yaw_deg: float) -> None:
     good = locate([NORTH, SOUTH, EAST], SOUNDS)
     assert good.outliers == {}
     assert error_m(good) < NEAR_M
@@ -61,10 +62,10 @@ def test_a_turned_array_is_outvoted_and_named(yaw_deg: float) -> None:
     assert found.outliers == {"east": pytest.approx(28.0, abs=4.0)}
     assert error_m(found) == error_m(locate([NORTH, SOUTH], SOUNDS))
     assert error_m(found) < NEAR_M
-    assert {heard.spec.name for heard in found.evidence} == {"north", "south", "east"}  # the maps show all
+    assert {heard.spec.name for heard in found.evidence} == {"north", "south", "east"}  # maps can be drawn for all
 
 
-def test_two_arrays_that_do_not_meet_are_refused() -> None:
+def test_two_arrays_that_disagree_are_refused() -> None:
     assert locate([NORTH, SOUTH], SOUNDS).refused is None
     found = locate([NORTH, turned(SOUTH, -30.0)], SOUNDS)
     assert found.refused is not None
@@ -72,8 +73,8 @@ def test_two_arrays_that_do_not_meet_are_refused() -> None:
     assert found.outliers == {}
 
 
-def test_a_little_is_outvoted_by_two_and_not_refused_of_two() -> None:
-    """Five degrees at 2.5 m are 0.2 m, which drags the place along: three can leave it out, two must live with it."""
+def test_a_slightly_turned_array_is_left_out_of_three_but_not_refused_of_two() -> None:
+    """Five degrees at 2.5 m shift the position by up to 0.2 m: with three arrays one can be left out, with two none."""
     aside = turned(EAST, 5.0)
     found = locate([NORTH, SOUTH, aside], SOUNDS)
     assert found.outliers is not None
@@ -86,12 +87,12 @@ def test_a_little_is_outvoted_by_two_and_not_refused_of_two() -> None:
     assert (agree.refused, agree.outliers) == (None, {})
 
 
-def test_one_array_has_nobody_to_disagree_with() -> None:
+def test_one_array_alone_is_no_outlier() -> None:
     assert locate([NORTH], SOUNDS).outliers == {}
 
 
-def test_a_doubted_array_is_heard_last() -> None:
-    """It is taken back as soon as it agrees, and then nothing is lost by the doubt."""
+def test_a_suspect_array_is_used_again_once_it_agrees() -> None:
+    """The position is then the same as without suspicion."""
     good = locate([NORTH, SOUTH, EAST], SOUNDS)
     again = locate([NORTH, SOUTH, EAST], sounds_of([NORTH, SOUTH, EAST], suspect=["east"]))
     assert again.outliers == {}
@@ -101,8 +102,8 @@ def test_a_doubted_array_is_heard_last() -> None:
     assert list(still.outliers) == ["east"]
 
 
-def test_where_any_two_of_three_agree_doubt_decides() -> None:
-    """All in one plane, two directions always meet: three arrays show that one is wrong, and not which."""
+def test_where_any_two_of_three_agree_the_suspect_one_is_left_out() -> None:
+    """In one plane two directions always cross: three arrays show that one is wrong, but not which."""
     flat = [ArraySpec(s.name, s.microphones_m * [1, 1, 0] + [0, 0, 1.3], BAND_HZ) for s in (NORTH, SOUTH, EAST)]
     plane = Grid((GRID.bounds_m[0], GRID.bounds_m[1], (1.3, 1.3)), 0.1)
     source_m = np.array([1.13, 3.31, 1.3])
@@ -111,7 +112,7 @@ def test_where_any_two_of_three_agree_doubt_decides() -> None:
     estimator = Onset(believed, plane, C_M_S)
     divided = estimator.locate(sounds)
     assert divided.refused is not None
-    assert "cannot be told which is wrong" in divided.refused
+    assert "it is unknown which is wrong" in divided.refused
     decided = estimator.locate(sounds_of(flat, source_m, suspect=["east"]))
     assert decided.refused is None
     assert decided.outliers is not None
@@ -126,8 +127,8 @@ def with_dead(sound: Sound, channel: int, samples: Float32Array) -> Sound:
 
 
 @pytest.mark.parametrize("rms", [0.0, 1e-4])
-def test_a_dead_microphone_is_left_out_of_its_pairs(rms: float) -> None:
-    """30 dB below the others or more; a louder one, though it hears only noise, is not known to be dead."""
+def test_pairs_of_a_dead_microphone_are_left_out(rms: float) -> None:
+    """Dead means 30 dB below the others; a louder microphone that records only noise is not recognized as dead."""
     noise = np.random.default_rng(5).standard_normal(6400).astype(np.float32)
     for level, left_out in ((rms, True), (0.05, False)):
         sounds = SOUNDS | {"south": with_dead(SOUNDS["south"], 2, level * noise)}
@@ -136,7 +137,7 @@ def test_a_dead_microphone_is_left_out_of_its_pairs(rms: float) -> None:
         silent = ~south.values.any(axis=1)
         assert silent.tolist() == [left_out and 2 in pair for pair in south.pairs.tolist()]
         if left_out:
-            assert error_m(found) < 2 * NEAR_M  # of the baselines of one array half are left
+            assert error_m(found) < 2 * NEAR_M  # half of the baselines of one array remain
             assert found.refused is None
 
 
@@ -145,11 +146,11 @@ def test_dead_is_far_below_the_second_loudest() -> None:
     samples = rng.standard_normal((4, 800)).astype(np.float32)
     assert not dead_channels([samples]).any()
     samples[1] *= 0.02  # 34 dB
-    samples[3] *= 100.0  # a loose contact is no measure
+    samples[3] *= 100.0  # a loose contact crackles
     assert dead_channels([samples, samples]).tolist() == [False, True, False, False]
     samples[1] *= 2.5  # 26 dB
     assert not dead_channels([samples]).any()
     offset = np.array([0.0, 3.0, 0.0, 0.0], dtype=np.float32)[:, None]
     samples[1] = 0.0
     assert dead_channels([samples + offset]).tolist() == [False, True, False, False]
-    assert not dead_channels([np.zeros((4, 800), dtype=np.float32)]).any()  # nothing to compare with
+    assert not dead_channels([np.zeros((4, 800), dtype=np.float32)]).any()  # there is nothing to compare with

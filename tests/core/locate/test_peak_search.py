@@ -1,4 +1,4 @@
-"""The search finds the very node that the whole map would, by either kind of kernel and every rule."""
+"""The search finds the highest point of the whole map exactly, with compiled kernels and with NumPy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, ideal_gcc, tetra, 
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.geometry import Grid
 from livessl.core.kernels import with_numba, with_numpy
+from livessl.core.kernels.arguments import BLOCKS, RUNS
 from livessl.core.locate import peak_search, refine, srp
-from livessl.core.locate.peak_search import PeakSearch, Rule
+from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import ArraySpec, Evidence, Float32Array
 
@@ -30,7 +31,7 @@ def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def arrays(count: int, seed: int) -> list[ArraySpec]:
-    """Of four microphones, and now and then of two, three or six."""
+    """Random arrays, most of four microphones, some of two, three or six."""
     rng = np.random.default_rng(seed)
     specs = []
     for number in range(count):
@@ -44,7 +45,7 @@ def arrays(count: int, seed: int) -> list[ArraySpec]:
 
 
 def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[Evidence]:
-    """What arrays hear of one talker, of two, or of nothing but their own noise; with reflections that differ."""
+    """Evidence of one talker, of two, or of noise alone, with reflections that differ between arrays."""
     rng = np.random.default_rng(seed)
     evidence = []
     sources_m = rng.uniform([0.2, 0.2, 0.2], [4.0, 4.9, 2.5], ({"talker": 1, "two": 2, "noise": 0}[kind], 3))
@@ -59,12 +60,9 @@ def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[Evidence]:
     return evidence
 
 
-def fused_map(evidence: list[Evidence], grid: Grid, rule: Rule) -> Float32Array:
+def fused_map(evidence: list[Evidence], grid: Grid) -> Float32Array:
     maps = [SRPMapper(h.spec, grid, h.gcc.pairs, h.gcc.lags_s, C_M_S)(h.gcc) for h in evidence]
-    if rule is Rule.PRODUCT:
-        maps = [np.maximum(one, 0) for one in maps]
-    join = {Rule.SUM: np.add, Rule.PRODUCT: np.multiply, Rule.MINIMUM: np.minimum}[rule]
-    return np.asarray(join.reduce(maps))
+    return np.asarray(np.add.reduce(maps))
 
 
 def searching(evidence: list[Evidence], grid: Grid) -> PeakSearch:
@@ -76,20 +74,19 @@ def searching(evidence: list[Evidence], grid: Grid) -> PeakSearch:
 
 @pytest.mark.parametrize("kind", ["talker", "two", "noise"])
 @pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_peak_is_the_whole_maps(kernels: ModuleType, count: int, kind: str) -> None:
+def test_the_peak_is_that_of_the_whole_map(kernels: ModuleType, count: int, kind: str) -> None:
     for seed in range(6):
         specs = arrays(count, seed)
         evidence = sounds(specs, kind, seed)
         grid = Grid(ROOM, [0.1, 0.06, 0.23][seed % 3])
         searched = searching(evidence, grid)
-        for rule in Rule:
-            power = fused_map(evidence, grid, rule)
-            (found,) = searched.among(evidence, rule)(1)
-            assert found.node == power.argmax()
-            assert found.power == power.max()
+        power = fused_map(evidence, grid)
+        (found,) = searched.among(evidence)(1)
+        assert found.node == power.argmax()
+        assert found.power == power.max()
 
 
-def test_both_kernels_say_the_same() -> None:
+def test_both_kinds_of_kernels_find_the_same_peaks() -> None:
     grid = Grid(ROOM, 0.11)
     evidence = sounds(arrays(3, 5), "two", 5)
     said = []
@@ -98,18 +95,16 @@ def test_both_kernels_say_the_same() -> None:
             patch.setattr(peak_search, "kernels", kind)
             searched = searching(evidence, grid)
             box = np.array([[3, 20], [5, 30], [0, 24]])
-            peaks_by_rule = [searched.among(evidence, rule)(6, 2, [box]) for rule in Rule]
-            numbers = [np.array([(peak.node, peak.power) for peak in found]) for found in peaks_by_rule]
-            said.append([searched._cell_places, searched._leaf_places, searched._top_places, *numbers])
-    for one, other in zip(*said, strict=True):
-        np.testing.assert_array_equal(one, other)
+            said.append(searched.among(evidence)(6, 2, [box]))
+    assert said[0] == said[1]
+    assert len(said[0]) == 6
 
 
 def test_several_peaks_are_those_of_the_map(kernels: ModuleType) -> None:
     grid = Grid(ROOM, 0.1)
     for seed in range(4):
         evidence = sounds(arrays(2, seed), "two", seed)
-        power = fused_map(evidence, grid, Rule.SUM)
+        power = fused_map(evidence, grid)
         box = np.array([[0, 20], [-3, 25], [2, 90]])
         for without in ([], [box]):
             found = searching(evidence, grid).among(evidence)(5, 3, without)
@@ -117,7 +112,7 @@ def test_several_peaks_are_those_of_the_map(kernels: ModuleType) -> None:
             assert all(first.power >= second.power for first, second in pairwise(found))
 
 
-def test_without_room_there_is_no_peak(kernels: ModuleType) -> None:
+def test_no_peak_is_found_where_boxes_cover_the_grid(kernels: ModuleType) -> None:
     grid = Grid(ROOM, 0.3)
     evidence = sounds(arrays(2, 1), "talker", 1)
     everything = np.array([[0, 99], [0, 99], [0, 99]])
@@ -125,13 +120,12 @@ def test_without_room_there_is_no_peak(kernels: ModuleType) -> None:
     assert len(searching(evidence, grid).among(evidence)(3, 50)) == 1  # the second would lie outside
 
 
-@pytest.mark.parametrize("rule", Rule)
-def test_of_equals_the_first_is_taken(kernels: ModuleType, rule: Rule) -> None:
-    """Silence: every node is zero, and it is found out at once."""
+def test_the_first_of_equal_points_is_the_peak(kernels: ModuleType) -> None:
+    """In silence the power is zero everywhere."""
     grid = Grid(ROOM, 0.05)
     spec = arrays(1, 3)[0]
     silent = GCCPhat(spec, RATE_HZ, C_M_S)([np.zeros((len(spec.microphones_m), 2048), np.float32)])
-    (found,) = searching([Evidence(spec, silent)], grid).among([Evidence(spec, silent)], rule)(1)
+    (found,) = searching([Evidence(spec, silent)], grid).among([Evidence(spec, silent)])(1)
     assert (found.node, found.power) == (0, 0.0)
 
 
@@ -146,12 +140,12 @@ def test_of_equals_the_first_is_taken(kernels: ModuleType, rule: Rule) -> None:
 def test_any_box_is_searched(kernels: ModuleType, bounds: tuple[tuple[float, float], ...]) -> None:
     grid = Grid((bounds[0], bounds[1], bounds[2]), 0.1)
     evidence = sounds(arrays(2, 4), "talker", 4)
-    power = fused_map(evidence, grid, Rule.SUM)
+    power = fused_map(evidence, grid)
     (found,) = searching(evidence, grid).among(evidence)(1)
     assert [found.node, found.power] == [int(power.argmax()), float(power.max())]
 
 
-def test_arrays_of_different_rates_and_some_of_all(kernels: ModuleType) -> None:
+def test_arrays_of_different_rates_and_subsets_of_arrays(kernels: ModuleType) -> None:
     specs = arrays(3, 7)
     source_m = np.array([2.31, 1.17, 0.83])
     grid = Grid(ROOM, 0.1)
@@ -161,12 +155,12 @@ def test_arrays_of_different_rates_and_some_of_all(kernels: ModuleType) -> None:
     ]
     searched = searching(evidence, grid)
     for chosen in (evidence, evidence[1:], evidence[::-1], evidence[2:]):
-        power = fused_map([Evidence(h.spec, h.gcc) for h in chosen], grid, Rule.SUM)
+        power = fused_map([Evidence(h.spec, h.gcc) for h in chosen], grid)
         (found,) = searched.among(chosen)(1)
         assert [found.node, found.power] == [int(power.argmax()), float(power.max())]
 
 
-def test_a_search_that_costs_too_much_is_given_up_and_says_so(kernels: ModuleType) -> None:
+def test_a_search_that_gives_up_is_not_proven(kernels: ModuleType) -> None:
     grid = Grid(ROOM, 0.1)
     evidence = sounds(arrays(6, 3), "noise", 3)
     searched = searching(evidence, grid)
@@ -175,47 +169,51 @@ def test_a_search_that_costs_too_much_is_given_up_and_says_so(kernels: ModuleTyp
     assert whole.proven
     assert not some.proven
     assert some.power <= whole.power
-    assert some.power == fused_map(evidence, grid, Rule.SUM)[some.node]
+    assert some.power == fused_map(evidence, grid)[some.node]
 
 
 def test_memory_does_not_grow_with_the_grid() -> None:
     specs = arrays(2, 2)
-    coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.1, 0.02))
-    assert coarse._cell_places.nbytes == fine._cell_places.nbytes
+    coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.05, 0.01))
+    assert coarse.table_bytes == fine.table_bytes
     hall = PeakSearch(specs, Grid(((0.0, 60.0), (0.0, 80.0), (0.0, 20.0)), 0.5), C_M_S)
-    assert hall._cell_places[:, 0].size < 2 * peak_search.MOST_CELLS
+    pairs = sum(len(spec.microphones_m) * (len(spec.microphones_m) - 1) // 2 for spec in specs)
+    bytes_per_cell = (
+        2 * pairs * (1 + 8 + 1 / 64)
+    )  # a place of 16 bits for the cell, for its halves and its cube's share
+    assert hall.table_bytes < 2 * peak_search.MOST_CELLS * bytes_per_cell
 
 
-def test_lags_that_sixteen_bits_cannot_count_are_refused() -> None:
+def test_more_lags_than_sixteen_bits_can_count_are_an_error() -> None:
     searched = PeakSearch(arrays(1, 1), Grid(ROOM, 0.5), C_M_S)
     with pytest.raises(ValueError, match="array 'a0': expected fewer than 65535 lags, got 70000; its microphones"):
         searched.prepare("a0", np.arange(70_000) / 1e6)
 
 
-def test_lags_that_are_not_looked_at_are_noticed(kernels: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The comparison above has teeth: runs half as long lose the peak of some map."""
-    exact = peak_search._run_places
-    monkeypatch.setattr(peak_search, "_run_places", lambda low, high, block: exact(low, (low + high) // 2, block))
+def test_a_bound_over_too_few_lags_loses_peaks(kernels: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison with the whole map notices a wrong bound."""
+    exact = peak_search.run_places
+    monkeypatch.setattr(peak_search, "run_places", lambda low, high, block: exact(low, (low + high) // 2, block))
     grid = Grid(ROOM, 0.1)
     lost = 0
     for seed in range(20):
         evidence = sounds(arrays(2, seed), "noise", seed)
         searched = searching(evidence, grid)
-        lost += searched.among(evidence)(1)[0].node != fused_map(evidence, grid, Rule.SUM).argmax()
+        lost += searched.among(evidence)(1)[0].node != fused_map(evidence, grid).argmax()
     assert lost > 0
 
 
 @pytest.mark.parametrize("width", [90, 256, 1063, 5000])
-def test_maxima_are_those_of_all_lags_between(kernels: ModuleType, width: int) -> None:
+def test_a_running_maximum_covers_all_lags_between_its_ends(kernels: ModuleType, width: int) -> None:
     rng = np.random.default_rng(width)
     values = rng.standard_normal((2, width)).astype(np.float32)
-    block = np.repeat(peak_search._block(width), 2)
-    maxima = np.zeros((2, len(with_numpy.RUNS) * with_numpy.BLOCKS), np.float32)
+    block = np.repeat(peak_search.block_lags(width), 2)
+    maxima = np.zeros((2, len(RUNS) * BLOCKS), np.float32)
     kernels.running_maxima(values, block, maxima)
     ends = np.sort(rng.integers(0, width, (2, 500)), axis=0).astype(np.uint16)
-    for low, high, place in zip(*ends, peak_search._run_places(ends[0], ends[1], int(block[0])), strict=True):
-        run = with_numpy.RUNS[place // with_numpy.BLOCKS] * block[0]
-        first = place % with_numpy.BLOCKS * block[0]
+    for low, high, place in zip(*ends, peak_search.run_places(ends[0], ends[1], int(block[0])), strict=True):
+        run = RUNS[place // BLOCKS] * block[0]
+        first = place % BLOCKS * block[0]
         assert first <= low <= high < first + run
         assert run <= max(1.25 * (high - low + 2 * block[0]), block[0])
         np.testing.assert_array_equal(maxima[:, place], values[:, first : first + run].max(axis=1))

@@ -1,4 +1,4 @@
-"""The peak: found, refined and judged; and a covariance that means what it says."""
+"""Peaks found in a map, refined below the grid, and a covariance that matches the scatter of the answers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ def covariance_of(evidence: list[Evidence], grid: Grid = GRID, place_m: FloatArr
 
 
 # The slope of a cubic through lags h apart errs by h^3 R^(4) / 12, so a top by (w h)^2 h / 20 = 34 ns for 6 kHz at an
-# eighth of 16 kHz: 12 um of way. Over 0.3 m that is 40 urad, 0.1 mm at 2.5 m; where directions cross flat, 5 times:
+# eighth of 16 kHz: 12 um of sound path. Over 0.3 m that is 40 urad, 0.1 mm at 2.5 m; five times that where directions
+# cross at a small angle:
 NEAR_M = 5e-4
 
 
@@ -97,7 +98,7 @@ def test_refining_climbs_and_stays_inside(seed: int) -> None:
     assert value == pytest.approx(functional.value(position_m[None])[0], rel=1e-12)
 
 
-def test_source_outside_is_found_at_the_wall() -> None:
+def test_a_source_outside_the_grid_is_found_on_its_boundary() -> None:
     functional = SRPFunctional(evidence_of((NORTH, SOUTH), np.array([-0.2, 3.1, 1.4])), C_M_S)
     node = int(functional.value(GRID.nodes_m()).argmax())
     position_m, _ = refine.refine(functional, GRID.node_m(node), GRID)
@@ -130,7 +131,7 @@ def test_refining_in_a_plane_keeps_its_height() -> None:
     assert np.linalg.eigvalsh(covariance[:2, :2]).min() > 0
 
 
-def test_a_single_point_is_its_own_answer() -> None:
+def test_a_grid_of_one_point_returns_that_point() -> None:
     point = Grid(((1.0, 1.0), (2.0, 2.0), (1.5, 1.5)), 0.1)
     evidence = evidence_of((NORTH, SOUTH))
     position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), point.node_m(0), point)
@@ -153,20 +154,20 @@ def stands_out(power: Float32Array, at_m: FloatArray) -> float:
     return refine.confidence(find, find(1)[0], GRID, at_m)
 
 
-def test_confidence_is_how_far_the_peak_stands_out() -> None:
+def test_the_confidence_is_the_margin_of_the_peak_over_the_next_place() -> None:
     at_m = np.array(FIRST_M)
     assert stands_out(hills((FIRST_M, 2.0)), at_m) > 0.99
     assert stands_out(hills((FIRST_M, 2.0), (SECOND_M, 2.0)), at_m) < 0.01
     assert stands_out(hills((FIRST_M, 2.0), (SECOND_M, 0.5)), at_m) == pytest.approx(0.75, abs=0.01)
-    # what is within a metre along every axis is the same place
+    # within a metre along every axis it is the same place
     near_m, far_m = (1.05 + 0.7, 3.05, 1.25), (1.05 + 1.2, 3.05, 1.25)
     assert stands_out(hills((FIRST_M, 2.0), (near_m, 2.0)), at_m) > 0.9
     assert stands_out(hills((FIRST_M, 2.0), (far_m, 2.0)), at_m) < 0.01
-    # louder arrays make no surer ones
+    # the level does not matter
     assert stands_out(100 * hills((FIRST_M, 2.0), (SECOND_M, 0.5)), at_m) == pytest.approx(0.75, abs=0.01)
 
 
-def test_confidence_of_nothing_is_none() -> None:
+def test_the_confidence_of_an_empty_map_is_zero() -> None:
     assert stands_out(np.zeros(GRID.size, dtype=np.float32), np.array(FIRST_M)) == 0.0
     assert stands_out(np.full(GRID.size, -1.0, dtype=np.float32), np.array(FIRST_M)) == 0.0
     assert stands_out(hills((SECOND_M, 1.0)), np.array(FIRST_M)) == 0.0  # the peak is elsewhere
@@ -174,7 +175,7 @@ def test_confidence_of_nothing_is_none() -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(noise=st.floats(0.0, 1.0), seed=st.integers(0, 10**6), both=st.booleans())
-def test_covariance_is_one_and_within_the_volumes(noise: float, seed: int, both: bool) -> None:
+def test_the_covariance_is_positive_and_no_wider_than_the_volume(noise: float, seed: int, both: bool) -> None:
     place_m = np.random.default_rng(seed).uniform(GRID.lower_m, GRID.upper_m)
     covariance = covariance_of(evidence_of((NORTH, SOUTH) if both else (NORTH,), SOURCE_M, noise, seed), GRID, place_m)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-15)
@@ -183,13 +184,13 @@ def test_covariance_is_one_and_within_the_volumes(noise: float, seed: int, both:
     assert np.linalg.eigvalsh(prior - covariance).min() > -1e-9
 
 
-def test_without_evidence_the_covariance_is_the_volumes() -> None:
+def test_the_covariance_without_evidence_is_that_of_the_volume() -> None:
     gcc = evidence_of((NORTH,))[0].gcc
     nothing = Evidence(NORTH, GCC(gcc.pairs.copy(), gcc.lags_s.copy(), 0.0 * gcc.values))
     np.testing.assert_allclose(covariance_of([nothing]), np.diag(np.array([4.2, 5.1, 2.7]) ** 2 / 12), rtol=1e-9)
 
 
-def test_one_array_knows_the_direction_better_than_the_distance() -> None:
+def test_one_array_determines_the_direction_better_than_the_distance() -> None:
     covariance = covariance_of(evidence_of((NORTH,), noise=0.05))
     variance, axes = np.linalg.eigh(covariance)
     towards = (SOURCE_M - NORTH.centre_m) / np.linalg.norm(SOURCE_M - NORTH.centre_m)
@@ -210,17 +211,17 @@ def test_covariance_of_one_pair_in_closed_form() -> None:
     spec = ArraySpec("pair", posed(line(0.4, 2), [2.0, 2.0, 1.0]), BAND_HZ)
     grid = Grid(((0.0, 4.0), (4.0, 4.0), (1.0, 1.0)), 0.1)
     source_m = np.array([2.0, 4.0, 1.0])
-    (heard_by,) = evidence_of((spec,), source_m, noise=0.003)
-    (term,) = SRPFunctional([heard_by], C_M_S).pair_terms(source_m)
+    (evidence,) = evidence_of((spec,), source_m, noise=0.003)
+    (term,) = SRPFunctional([evidence], C_M_S).pair_terms(source_m)
     lobe_s = 2 * np.pi / np.sqrt(mean_square_angular_frequency(BAND_HZ))
-    noise = (heard_by.gcc.values[0][np.abs(heard_by.gcc.lags_s) > lobe_s] ** 2).mean()
+    noise = (evidence.gcc.values[0][np.abs(evidence.gcc.lags_s) > lobe_s] ** 2).mean()
     # d tau / dx = 2 sin(gamma / 2) / c for the angle gamma that the pair subtends
     slope_s_m = 2 * 0.2 / np.hypot(0.2, 2.0) / C_M_S
     kappa = mean_square_angular_frequency(BAND_HZ)
     assert -term.curvature[0] == pytest.approx(kappa, rel=0.5)  # three differences of noise 0.003 against 0.029
     variance_s2 = noise * -term.curvature[0] / (term.values[0] * -term.curvature[0]) ** 2 * term.values[0]
     expected = 1 / (slope_s_m**2 / variance_s2 + 12 / 4.0**2)
-    assert covariance_of([heard_by], grid, source_m)[0, 0] == pytest.approx(expected, rel=1e-6)
+    assert covariance_of([evidence], grid, source_m)[0, 0] == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -245,16 +246,16 @@ def squared_distances() -> FloatArray:
 
 # The scale takes an array's pairs for as many delays as are independent, K - 1 of K (K - 1) / 2: it holds where one
 # microphone's noise is in all of its pairs alike. Where every pair's noise is its own (low SNR), the pairs together
-# know K / 2 = 2 times as much. The truth lies between, so the median may be half the chi-square's. The median of 200
-# draws has a standard deviation of 1 / (2 p(2.37) sqrt(200)) = 0.19, 8 %; three of them on either side:
+# determine K / 2 = 2 times as much. The truth lies between, so the median may be half the chi-square's. The median of
+# 200 draws has a standard deviation of 1 / (2 p(2.37) sqrt(200)) = 0.19, 8 %; three of them on either side:
 LOWEST, HIGHEST = 0.76 * CHI2_3_MEDIAN / 2, 1.24 * CHI2_3_MEDIAN
 
 
-def test_covariance_is_the_scatter_of_the_answers(squared_distances: FloatArray) -> None:
+def test_the_covariance_matches_the_scatter_of_the_answers(squared_distances: FloatArray) -> None:
     assert LOWEST < np.median(squared_distances) < HIGHEST
     assert np.mean(squared_distances < 11.34) > 0.98  # 99 % of a chi-square with three degrees of freedom
 
 
 @pytest.mark.parametrize("wrong", [1 / 3, 3.0])
-def test_covariance_three_times_wrong_would_show(squared_distances: FloatArray, wrong: float) -> None:
+def test_a_covariance_wrong_by_a_factor_of_three_would_show(squared_distances: FloatArray, wrong: float) -> None:
     assert not LOWEST < np.median(squared_distances) / wrong < HIGHEST

@@ -1,4 +1,4 @@
-"""Two sources at once: both found, and of one source no second made."""
+"""Two sources that sound together are both found; one source yields no second."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ import pytest
 from free_field import C_M_S, RATE_HZ, band_mean_cos, burst, heard, tetra, true_lags_s
 from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimators import Localization, Onset, Sound
-from livessl.core.locate.second_source import Moments, clearness, confidence
+from livessl.core.locate.estimator import Localization, Sound
+from livessl.core.locate.onset import Onset
+from livessl.core.locate.peak_search import PeakSearch
+from livessl.core.locate.place import highest_place
+from livessl.core.locate.second_source import FrameGCCs, SecondSourceSearch, confidence, prominence
 from livessl.core.types import FRAME_S, GCC, ArraySpec, Evidence, FloatArray
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
@@ -36,9 +39,9 @@ def sounds_of(
     specs: Sequence[ArraySpec] = (NORTH, SOUTH),
     frames: int = 8,
 ) -> dict[str, Sound]:
-    """What is heard of sources that sound together, each of a level, frame by frame; or only all frames together.
+    """Sounds of sources that sound together, each given by position and level; a second source is wanted if `apart`.
 
-    The first sounds in all `frames`, a second in eight.
+    The first sounds in all `frames`, the second in eight.
     """
     frame, sounds = round(FRAME_S * RATE_HZ), {}
     for number, spec in enumerate(specs):
@@ -46,11 +49,11 @@ def sounds_of(
         for seed, (place_m, level) in enumerate(sources):
             length = (8 if seed else frames) * frame
             samples[:, :length] += np.float32(level) * heard(spec, place_m, burst(length, seed))
-        front_end = estimator.listener(spec.name, RATE_HZ)
+        front_end = estimator.onset_front_end(spec.name, RATE_HZ)
         silence = np.random.default_rng(9).normal(0.0, 1e-4, (4, 8 * frame)).astype(np.float32)
         front_end.push(silence, quiet=True)
-        moments = tuple(front_end.push(part, quiet=False) for part in np.split(samples, frames, axis=1))
-        sounds[spec.name] = Sound((samples,), RATE_HZ, moments, sources=2 if apart else 1)
+        onsets = tuple(front_end.push(part, quiet=False) for part in np.split(samples, frames, axis=1))
+        sounds[spec.name] = Sound((samples,), RATE_HZ, onsets, sources=2 if apart else 1)
     return sounds
 
 
@@ -66,7 +69,7 @@ def test_two_sources_are_both_found(estimator: Onset, level: float) -> None:
     if error_m(*places[0]) > 0.5:
         places = [(found, OTHER_M), (second, ONE_M)]
     for one, place_m in places:
-        assert error_m(one, place_m) < 0.1  # each pulls at the other's phases: a tenth of what is asked of them
+        assert error_m(one, place_m) < 0.1  # each disturbs the phases of the other
     assert found.confidence > 0.8
     assert found.refused is None
     assert 0.5 <= second.confidence <= 1.0
@@ -82,7 +85,7 @@ def test_one_source_has_no_second(estimator: Onset, place_m: FloatArray) -> None
     assert (found.confidence, found.refused) == (alone.confidence, alone.refused)
 
 
-def test_one_source_has_no_second_however_many_arrays_hear_it(estimator: Onset) -> None:
+def test_one_source_has_no_second_with_four_arrays(estimator: Onset) -> None:
     specs = [NORTH, SOUTH, EAST, WEST]
     everywhere = Onset(specs, GRID, C_M_S)
     assert everywhere.locate(sounds_of(everywhere, [(ONE_M, 1.0)], specs=specs)).others == ()
@@ -98,8 +101,8 @@ def test_a_short_sound_beside_a_long_one_is_not_refused(estimator: Onset) -> Non
     assert error_m(second, ONE_M) < 0.1
 
 
-def test_a_source_is_clear_where_it_is_and_in_the_moment_it_has() -> None:
-    """In eight moments the first alone, in one the second too: its share there, and nothing of it elsewhere."""
+def test_prominence_is_high_only_at_the_source_and_in_a_frame_in_which_it_sounds() -> None:
+    """The first source sounds alone in eight frames, with the second in one."""
     sampling = LagSampling.shared(NORTH.band_hz, RATE_HZ, NORTH.aperture_m / C_M_S)
     axis_s = sampling.fine_lags_s
     first_s, second_s, elsewhere_s = (
@@ -111,24 +114,25 @@ def test_a_source_is_clear_where_it_is_and_in_the_moment_it_has() -> None:
 
     values = np.stack([of(first_s)] * 8 + [of(first_s) + of(second_s)]).astype(np.float32)
     for scale in (1.0, 1e3):
-        moments = Moments(NORTH, axis_s, values * np.float32(scale), np.full(9, scale))
-        clear = moments.clearness(second_s, first_s)
+        frames = FrameGCCs(NORTH, axis_s, values * np.float32(scale), np.full(9, scale))
+        clear = frames.prominence(second_s, first_s)
         rms = float(np.sqrt(np.square(values[-1]).mean()))
-        assert clear == pytest.approx(1.0 / rms, rel=0.2)  # the share of the first takes a sixth of one pair along
-        assert moments.clearness(elsewhere_s, first_s) < 0.5 * clear
-        alone = Moments(NORTH, axis_s, values[:8] * np.float32(scale), np.full(8, scale))
-        assert alone.clearness(second_s, first_s) < 0.1 * clear
+        assert clear == pytest.approx(1.0 / rms, rel=0.2)  # removing the first takes a sixth of one pair along
+        assert frames.prominence(elsewhere_s, first_s) < 0.5 * clear
+        alone = FrameGCCs(NORTH, axis_s, values[:8] * np.float32(scale), np.full(8, scale))
+        assert alone.prominence(second_s, first_s) < 0.1 * clear
 
 
-def test_two_arrays_must_hear_a_second_source_clearly() -> None:
-    assert confidence(clearness([2.5, 2.5])) == confidence(clearness([2.5, 0.0, 2.5, 1.0])) > 0.9
-    assert confidence(clearness([3.0, 0.0])) < 0.5
-    assert confidence(clearness([1.0, 1.0, 1.0, 1.0, 1.0])) < 0.1
+def test_a_second_source_must_be_prominent_at_two_arrays() -> None:
+    assert confidence(prominence([2.5, 2.5])) == confidence(prominence([2.5, 0.0, 2.5, 1.0])) > 0.9
+    assert confidence(prominence([3.0, 0.0])) < 0.5
+    assert confidence(prominence([1.0, 1.0, 1.0, 1.0, 1.0])) < 0.1
 
 
-def test_of_places_that_stand_high_the_one_that_is_clear_in_a_moment_is_told(estimator: Onset) -> None:
-    """In eight moments the first, and somewhere else what reverberation leaves; in one the second."""
-    left_m, evidence, moments = np.array([1.9, 1.1, 2.2]), [], []
+def test_the_place_that_is_prominent_in_a_frame_wins_over_a_higher_one() -> None:
+    """Eight frames hold the first source and a remainder of reverberation elsewhere, one frame the second source."""
+    left_m, evidence, frames = np.array([1.9, 1.1, 2.2]), [], []
+    search = PeakSearch([NORTH, SOUTH], GRID, C_M_S)
     for spec in (NORTH, SOUTH):
         axis_s = LagSampling.shared(spec.band_hz, RATE_HZ, spec.aperture_m / C_M_S).fine_lags_s
         first, second, left = (
@@ -136,22 +140,23 @@ def test_of_places_that_stand_high_the_one_that_is_clear_in_a_moment_is_told(est
             for at_m in (ONE_M, OTHER_M, left_m)
         )
         values = np.stack([first + 0.25 * left] * 8 + [second]).astype(np.float32)
-        moments.append(Moments(spec, axis_s, values, np.full(9, 1e3)))
+        frames.append(FrameGCCs(spec, axis_s, values, np.full(9, 1e3)))
         evidence.append(Evidence(spec, GCC(microphone_pairs(4), axis_s, values.mean(axis=0))))
-        estimator.listener(spec.name, RATE_HZ)
-    place = estimator._place(evidence)
+        search.prepare(spec.name, axis_s)
+    place = highest_place(evidence, search, GRID, C_M_S)
     assert np.linalg.norm(place.position_m - ONE_M) < 0.1
-    rest = estimator._place([each.without(true_lags_s(each.spec.microphones_m, ONE_M)) for each in moments])
-    assert np.linalg.norm(rest.position_m - left_m) < 0.1  # it stands highest
-    other, confidence = estimator._beside(place, moments)
+    without = [each.without(true_lags_s(each.spec.microphones_m, ONE_M)) for each in frames]
+    rest = highest_place(without, search, GRID, C_M_S)
+    assert np.linalg.norm(rest.position_m - left_m) < 0.1  # it is the highest
+    other, confidence = SecondSourceSearch(search, GRID, C_M_S).beside(place, frames)
     assert np.linalg.norm(other.position_m - OTHER_M) < 0.1
     assert confidence > 0.9
 
 
-def test_nobody_asked_for_a_second(estimator: Onset) -> None:
+def test_no_second_source_is_returned_unless_wanted(estimator: Onset) -> None:
     assert estimator.locate(sounds_of(estimator, [(ONE_M, 1.0), (OTHER_M, 1.0)], apart=False)).others == ()
 
 
-def test_one_array_tells_no_second(estimator: Onset) -> None:
+def test_one_array_alone_finds_no_second_source(estimator: Onset) -> None:
     sounds = sounds_of(estimator, [(ONE_M, 1.0), (OTHER_M, 1.0)])
     assert estimator.locate({"north": sounds["north"]}).others == ()

@@ -1,4 +1,4 @@
-"""The map and the functional: sign, channels, weights, and both against closed forms."""
+"""SRP as a map and as a functional: sign, channels, weights, and comparison with closed forms."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def off_axis_deg(spec: ArraySpec, place_m: FloatArray) -> float:
     return float(np.degrees(np.arccos(towards @ right / np.linalg.norm(towards) / np.linalg.norm(right))))
 
 
-def test_steering_delay_is_how_much_later_the_second_hears_it() -> None:
+def test_a_steering_delay_is_positive_if_the_second_microphone_is_further_away() -> None:
     microphones_m = np.array([[0.0, 0.0, 0.0], [0.0, 3.43, 0.0], [1.0, 0.0, 0.0]])
     delays = steering_delays_s(
         np.array([[0.0, -1.0, 0.0], [0.0, 4.43, 0.0]]), microphones_m, microphone_pairs(3), 343.0
@@ -56,8 +56,8 @@ def test_steering_delay_is_how_much_later_the_second_hears_it() -> None:
 def test_map_peaks_at_the_source_and_mirrored_lags_do_not() -> None:
     gcc = GCCPhat(NORTH, RATE_HZ, C_M_S)([heard(NORTH, SOURCE_M, burst(3000))])
     nodes_m = GRID.nodes_m()
-    # Half a cell, 87 mm of diagonal, is 2.5 degrees at the 1.8 m from array to source; more of range one array hardly
-    # tells, so only the direction counts.
+    # Half a cell, 87 mm of diagonal, is 2.5 degrees at the 1.8 m from array to source; one array hardly
+    # determines the distance, so only the direction counts.
     assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, gcc).argmax()]) < 2 * 2.5
     mirrored = GCC(gcc.pairs, gcc.lags_s.copy(), gcc.values[:, ::-1].copy())
     assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, mirrored).argmax()]) > 90
@@ -65,14 +65,14 @@ def test_map_peaks_at_the_source_and_mirrored_lags_do_not() -> None:
     assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, swapped).argmax()]) > 90
 
 
-def test_two_arrays_peak_at_the_nearest_node() -> None:
+def test_the_map_of_two_arrays_peaks_at_a_neighbouring_grid_point() -> None:
     power = sum(mapped(spec, ideal(spec)) for spec in (NORTH, SOUTH))
     nodes_m = GRID.nodes_m()
-    # not the nearest of all, perhaps: half a cell along an axis may cost less in one direction than in another
+    # perhaps not the nearest of all: half a cell along an axis may cost less in one direction than in another
     assert (np.abs(nodes_m[int(np.argmax(power))] - SOURCE_M) <= GRID.cell_m).all()
 
 
-def test_map_is_the_functional_to_half_a_fine_lag() -> None:
+def test_the_map_is_the_functional_to_half_a_fine_lag() -> None:
     spec = ArraySpec("pair", line(0.3, 2) + NORTH.centre_m, BAND_HZ)
     for array in (spec, NORTH):
         gcc = ideal(array)
@@ -83,10 +83,10 @@ def test_map_is_the_functional_to_half_a_fine_lag() -> None:
         bend = np.abs(np.diff(gcc.values, 2, axis=1)).max(axis=1) / 8
         bound = (steepest + bend).sum() * 2 / len(array.microphones_m)
         assert np.abs(on_grid - smooth).max() <= bound + 1e-6  # of float32
-        assert np.abs(on_grid - smooth).max() > 0.5 * bound / len(gcc.pairs)  # and the bound is no wide one
+        assert np.abs(on_grid - smooth).max() > 0.5 * bound / len(gcc.pairs)  # and the bound is tight
 
 
-def test_functional_is_the_closed_form() -> None:
+def test_the_functional_is_the_closed_form() -> None:
     points_m = np.random.default_rng(2).uniform(GRID.lower_m, GRID.upper_m, (500, 3))
     functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     expected = exact(NORTH, points_m) + exact(SOUTH, points_m)
@@ -94,12 +94,12 @@ def test_functional_is_the_closed_form() -> None:
     # weight 1/2 in each of 2 arrays.
     np.testing.assert_allclose(functional.value(points_m), expected, atol=6 * 3.5e-5)
     assert functional.value(SOURCE_M[None])[0] == pytest.approx(6.0, abs=6 * 3.5e-5)
-    # a tenth of a per mille more of speed shows
+    # an error of a tenth of a per mille in the speed of sound shows
     other = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], 1.0001 * C_M_S)
     assert np.abs(other.value(points_m) - expected).max() > 2 * 6 * 3.5e-5
 
 
-def test_functional_has_no_kinks() -> None:
+def test_the_functional_has_no_kinks() -> None:
     """Over half-millimetres its curvature is the closed form's: a roof at every fine lag would stop a climb."""
     functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     h_m = 5e-4
@@ -109,7 +109,7 @@ def test_functional_has_no_kinks() -> None:
     assert np.abs(second - expected).max() < 0.1 * np.abs(expected).max()
 
 
-def test_source_scores_the_number_of_independent_delays() -> None:
+def test_the_power_at_the_source_is_the_number_of_independent_delays() -> None:
     x, y, z = (float(coordinate) for coordinate in SOURCE_M)
     point = Grid(((x, x), (y, y), (z, z)), 1.0)
     for count in (2, 3, 8, 16):
@@ -121,7 +121,7 @@ def test_source_scores_the_number_of_independent_delays() -> None:
     assert pair_weight(4) == 0.5
 
 
-def test_gradient_is_the_closed_forms() -> None:
+def test_the_gradient_is_that_of_the_closed_form() -> None:
     functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     rng = np.random.default_rng(3)
     h_m = 1e-4
@@ -138,7 +138,7 @@ def test_gradient_is_the_closed_forms() -> None:
     assert np.abs(np.array(gradients) + expected).max() > scale  # the sign
 
 
-def test_hessian_at_the_peak_is_the_closed_forms() -> None:
+def test_the_hessian_at_the_peak_is_that_of_the_closed_form() -> None:
     functional = SRPFunctional([Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)], C_M_S)
     gradient, hessian = functional.derivatives(SOURCE_M)
     h_m = 1e-3
@@ -157,7 +157,7 @@ def test_hessian_at_the_peak_is_the_closed_forms() -> None:
     assert np.abs(np.linalg.solve(hessian, gradient)).max() < 1e-3
 
 
-def test_pair_terms_are_each_arrays_own() -> None:
+def test_pair_terms_are_those_of_each_array() -> None:
     evidence = [Evidence(spec, ideal(spec)) for spec in (NORTH, SOUTH)]
     terms = SRPFunctional(evidence, C_M_S).pair_terms(SOURCE_M + 0.01)
     assert [term.array for term in terms] == ["north", "south"]
@@ -178,7 +178,7 @@ def test_order_of_the_arrays_does_not_matter() -> None:
     np.testing.assert_allclose(one.value(points_m), sum(alone))
 
 
-def test_channels_and_microphones_change_places_together_only() -> None:
+def test_swapped_channels_need_swapped_microphones() -> None:
     order = np.array([2, 0, 3, 1])
     moved = ArraySpec("moved", NORTH.microphones_m[order], BAND_HZ)
     samples = heard(NORTH, SOURCE_M, burst(3000))
@@ -192,7 +192,7 @@ def test_channels_and_microphones_change_places_together_only() -> None:
     assert off_axis_deg(NORTH, GRID.node_m(int(one.argmax()))) > 20
 
 
-def test_plane_is_a_slice_of_space() -> None:
+def test_the_map_of_a_plane_is_a_slice_of_the_volume() -> None:
     height_m = float(GRID.axis_m(2)[13])
     plane = Grid((BOUNDS_M[0], BOUNDS_M[1], (height_m, height_m)), 0.1)
     gcc = ideal(NORTH)
@@ -200,7 +200,7 @@ def test_plane_is_a_slice_of_space() -> None:
     np.testing.assert_allclose(mapped(NORTH, gcc, plane).reshape(plane.shape)[:, :, 0], whole, atol=1e-6)
 
 
-def test_node_on_a_microphone_is_finite() -> None:
+def test_the_functional_is_finite_on_a_microphone() -> None:
     place = NORTH.microphones_m[2]
     functional = SRPFunctional([Evidence(NORTH, ideal(NORTH))], C_M_S)
     assert np.isfinite(functional.value(place[None])).all()

@@ -19,7 +19,8 @@ from livessl.core.correlate.band import band_power
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
-from livessl.core.locate.estimators import Localization, PowerMaps, Sound, SrpPhat
+from livessl.core.locate.estimator import Localization, PowerMaps, Sound
+from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
 from livessl.core.stream.array_stream import ArrayStream
 from livessl.core.stream.evidence import KEPT_ARRAYS, RELEASE_FRAMES
@@ -77,7 +78,7 @@ class Scripted:
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         self.prepared.append((array, sample_rate_hz))
 
-    def listener(self, array: str, sample_rate_hz: float) -> None:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> None:
         return None
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -723,7 +724,7 @@ class Gauge:
 class Gauged(Scripted):
     """Listens."""
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         return Gauge()
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
@@ -816,7 +817,7 @@ class Correlating(Scripted):
         self.sums: list[tuple[float, float]] = []
         self.refused = refused
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         assert (array, sample_rate_hz) == ("north", RATE_HZ)
         self.heard.append(None)  # a new one, that has heard nothing
         return FrontEnd(self.heard)
@@ -1074,7 +1075,7 @@ class Duet(Scripted):
             return found
         return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
 
-    def listener(self, array: str, sample_rate_hz: float) -> Any:
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         return FrontEnd([])
 
 

@@ -11,9 +11,8 @@ import pytest
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
 from livessl.cli.evaluate import add_arguments, evaluate
 from livessl.core.geometry import speed_of_sound_m_s
-from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.lab.evaluate.campaign import Job, compute, read_clips, run_campaign
-from livessl.lab.evaluate.localizer import METHODS, LocalizerSettings, development_fit, rivals_fit
+from livessl.lab.evaluate.localizer import METHODS, LocalizerSettings, development_fit
 from livessl.lab.evaluate.localizer_report import area_under_roc, read_columns, summary, write_localizer_report
 from livessl.lab.evaluate.scenarios import ARRAYS, ROOM_C, ROOMS, SCENARIOS, Case
 
@@ -159,22 +158,6 @@ def test_fit_finds_the_odds_that_made_the_events() -> None:
     # standard errors here, from the inverse of the information, are 0.06, 0.08 and 0.02
     np.testing.assert_allclose(fitted, (-3.0, 2.0, 1.0), atol=0.3)
     assert abs(development_fit({"margin": margin, "standing": standing, "error_m": -error_m + 2.0}, 0.5)[2] - 1.0) > 0.3
-
-
-def test_fit_finds_the_odds_of_rivals() -> None:
-    rng = np.random.default_rng(2)
-    features = [
-        ConfidenceFeatures(margin, standing) for margin, standing in rng.uniform((0.0, 2.0), (0.3, 9.0), (20000, 2))
-    ]
-    likely = [each.heard / (1.0 + np.exp(0.5 - 20.0 * each.margin)) for each in features]
-    columns = {
-        "margin": np.array([each.margin for each in features]),
-        "standing": np.array([each.standing for each in features]),
-        "error_m": np.where(rng.random(20000) < likely, 0.1, 2.0),
-    }
-    # five standard errors, from the inverse of the information there: 0.04 and 0.7
-    np.testing.assert_allclose(rivals_fit(columns, 0.5), (-0.5, 20.0), atol=0.2, rtol=0.16)
-    assert abs(rivals_fit(columns | {"margin": columns["margin"][::-1]}, 0.5)[1] - 20.0) > 3.5
 
 
 @pytest.mark.parametrize(

@@ -47,18 +47,6 @@ def test_angle_error_where_there_is_no_direction() -> None:
     assert prediction.angle_error_deg(80.0, 0.2, RATE_HZ) > 0
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 60.0])
-def test_small_angle_error_is_the_first_order(angle_deg: float) -> None:
-    exact, small = (
-        float(error(angle_deg, 3.0, RATE_HZ))
-        for error in (prediction.angle_error_deg, prediction.small_angle_error_deg)
-    )
-    # arcsin(s + e) - arcsin(s) = e / cos + e^2 s / (2 cos^3) + ..., so they differ by small^2 tan / 2 and a third order
-    second = np.degrees(np.radians(small) ** 2 * np.tan(np.radians(angle_deg)) / 2)
-    assert exact - small == pytest.approx(second, abs=3 * np.degrees(np.radians(small) ** 3))
-    assert np.isinf(prediction.small_angle_error_deg(90.0, 3.0, RATE_HZ))
-
-
 def test_diffuse_correlation_of_the_paper() -> None:
     kd = 2 * np.pi * 100.0 * 5.0 / 343.0
     assert kd == pytest.approx(9.159, abs=5e-4)

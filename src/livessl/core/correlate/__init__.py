@@ -1,4 +1,4 @@
-"""From one array's samples to generalized cross-correlations (GCC).
+"""Generalized cross-correlations (GCC) of the samples of one array.
 
-It knows no position and no other array.
+Nothing here knows a position or another array.
 """

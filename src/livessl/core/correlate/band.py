@@ -1,6 +1,6 @@
-"""Frequency bands: which bins lie inside, the power in a band, dead channels, and when a band wants the envelope.
+"""Frequency bands: the bins inside, the power in a band, dead channels, and which bands use the envelope.
 
-It is light, because every check of a site file loads it.
+Checking a site file loads this module, so it imports nothing that locates.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import scipy.fft
 from livessl.core.types import BoolArray, Float32Array, FloatArray
 
 ENVELOPE_ABOVE: Final = 0.25
-"""Lower band edge over band width from which the envelope is used; 100 to 6000 Hz has 0.017, 4 to 16 kHz 0.33."""
+"""Ratio of lower band edge to band width above which the envelope is used: 0.017 for 100 to 6000 Hz, 0.33 for 4 to
+16 kHz."""
 
 DEAD: Final = 1e-3
-"""A microphone 30 dB below the second loudest of its array hears nothing: half a metre from a source, another
-half a metre makes 6 dB."""
+"""Power relative to the second loudest microphone of the array, 30 dB lower, below which a microphone is dead. Distance
+cannot explain so much: half a metre from a source, another half a metre makes 6 dB."""
 
 
 def uses_envelope(band_hz: tuple[float, float]) -> bool:
-    """Whether R is the magnitude instead of the real part: see `GCCPhat`."""
+    """Return whether a band's GCC is the magnitude instead of the real part: see `GCCPhat`."""
     low, high = band_hz
     return low > ENVELOPE_ABOVE * (high - low)
 
@@ -30,7 +31,7 @@ def uses_envelope(band_hz: tuple[float, float]) -> bool:
 def band_power(samples: Float32Array, sample_rate_hz: float, band_hz: tuple[float, float]) -> FloatArray:
     """Mean power of each channel inside a band, by Parseval's theorem.
 
-    Rumble and offsets below the band would else decide what is loud; the paper's sounds lie inside it.
+    Without the band, rumble and offsets would decide what is loud.
 
     Parameters
     ----------
@@ -53,17 +54,17 @@ def band_power(samples: Float32Array, sample_rate_hz: float, band_hz: tuple[floa
 
 
 def band_bins(n_fft: int, sample_rate_hz: float, band_hz: tuple[float, float]) -> tuple[int, int]:
-    """First bin inside a band and first above it, of an `n_fft`-point real FFT; never the bin at 0 Hz."""
+    """First bin inside a band and first bin above it, in an `n_fft`-point real FFT; the bin at 0 Hz is never inside."""
     low = max(1, int(np.ceil(band_hz[0] * n_fft / sample_rate_hz)))
     high = min(n_fft // 2, int(np.floor(band_hz[1] * n_fft / sample_rate_hz)))
     return low, high + 1
 
 
 def dead_channels(segments: Sequence[Float32Array]) -> BoolArray:
-    """Which channels of an array's sound, in segments (K, n) each, are dead: (K,).
+    """Find the dead channels of an array's sound, given in segments (K, n): (K,).
 
-    The second loudest is what the others are held against: the loudest may be a broken one that crackles. Where fewer
-    than two are left, none is called dead, for there is nothing to compare. A constant offset is no sound.
+    Channels are compared with the second loudest, because the loudest may be broken and crackle. In silence, and with
+    sound on one channel alone, none is called dead. A constant offset does not count as sound.
     """
     powers = [np.einsum("kn,kn->k", each, each) - each.shape[1] * each.mean(axis=1) ** 2 for each in segments]
     power = np.sum(powers, axis=0, dtype=np.float64)

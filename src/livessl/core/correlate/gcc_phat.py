@@ -1,7 +1,7 @@
 """Generalized cross-correlation with phase transform (GCC-PHAT), band-limited, on a fine lag axis.
 
-The sign of a lag is defined here and nowhere else: *positive lag of pair (i, k): channel k hears it later*. The paper's
-SRP equation has the opposite one, which would mirror the map.
+The sign of a lag is defined here and nowhere else: *positive lag of pair (i, k): the sound reaches channel k later*.
+The paper's SRP equation has the opposite sign, which would mirror the map.
 """
 
 from __future__ import annotations
@@ -21,35 +21,46 @@ from livessl.core.kernels import kernels
 from livessl.core.types import GCC, ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
-"""Fine lags a sample. Nearest-lag look-up then errs by 1/16 sample: 8 degrees of phase at 6 kHz and 16 kHz sampling."""
+"""Fine lags per sample. The nearest lag is then at most 1/16 sample off: 8 degrees of phase at 6 kHz and 16 kHz
+sampling."""
 
 _NYQUIST_MARGIN: Final = 1.25
-"""Near-Nyquist lags are so much denser than the band's upper edge asks for; the interpolation needs the room."""
+"""Factor by which near-Nyquist lags are denser than the band's upper edge requires, for accurate
+interpolation."""
 
 _BEYOND: Final = 4
-"""Near-Nyquist lags further out than any that is asked for, on each side."""
+"""Near-Nyquist lags beyond the largest fine lag, on each side, for the interpolation there."""
 
 _RIDGE: Final = 1e-10
-"""Keeps the least-squares weights small where the lags determine more than the band holds."""
+"""Ridge that keeps the least-squares weights small where lags are nearly dependent, relative to the diagonal."""
 
 _PRODUCT_BINS: Final = 2048
-"""Up to so many bins, a third of a second, lags come by a matrix that is kept; above it by a short inverse FFT."""
+"""Most bins, a third of a second of sound, for which lags are computed by a cached matrix; above it by a short inverse
+FFT."""
 
 _TOGETHER_S: Final = 0.25
-"""Sounds up to so long are correlated together: matrices are read once for all, and spectra still fit in the cache."""
+"""Longest sound, in seconds, that is correlated together with those of other arrays: matrices are read once for all,
+and spectra still fit in the cache."""
 
 _ROUNDING: Final = 1e-6
-"""Of a lag: arrays of one shape, turned this way and that, are equally wide but for their last digits."""
+"""Fraction of a fine lag that is rounded away: apertures of one shape in different poses differ in the
+last digits."""
 
 _SAMPLINGS: Final = 16
-"""Samplings kept for all arrays: a site's have few shapes."""
+"""Lag samplings that are cached; the arrays of a site have few shapes."""
 
 _MATRICES: Final = 16
-"""Matrices kept: a site's windows have few lengths."""
+"""Matrices that each lag sampling caches; the windows of a site have few lengths."""
 
 
 def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:
-    """Raise ValueError where a sampling rate does not exceed twice the upper edge of an array's band."""
+    """Check that a sampling rate exceeds twice the upper edge of an array's band.
+
+    Raises
+    ------
+    ValueError
+        If it does not.
+    """
     high = spec.band_hz[1]
     if high >= sample_rate_hz / 2:
         raise ValueError(
@@ -59,15 +70,15 @@ def require_band(spec: ArraySpec, sample_rate_hz: float) -> None:
 
 
 class GCCPhat:
-    """GCC-PHAT of one array at one sampling rate, with its constants worked out once.
+    """GCC-PHAT of one array at one sampling rate.
 
     R_ik(tau) = 1/B sum_{f in band} Re[ conj(X_i) X_k / |X_i X_k| e^{j 2 pi f tau} ], so that a pure delay gives 1 at
-    its lag (Knapp and Carter 1976, PHAT weighting, averaged over the B bins of the band). It is worked out at a few
+    its lag (Knapp and Carter 1976, PHAT weighting, averaged over the B bins of the band). It is computed at a few
     near-Nyquist lags and interpolated to `OVERSAMPLING` lags a sample (`LagSampling`).
 
-    Where the band begins above `ENVELOPE_ABOVE` times its own width, R is the magnitude of the same sum instead of its
-    real part: a carrier's periods would be side lobes nearly as high as the peak, and a centimetre of error in a
-    microphone's place would turn their signs against each other.
+    If the band begins above `ENVELOPE_ABOVE` times its own width, R is the magnitude of the same sum instead of its
+    real part: otherwise the periods of the carrier would be side lobes nearly as high as the peak, and an error of a
+    centimetre in a microphone's position would reverse their sign.
 
     Parameters
     ----------
@@ -76,9 +87,14 @@ class GCCPhat:
     sample_rate_hz : float
         Must exceed twice the band's upper edge.
     c_m_s : float
-        Speed of sound.
+        Speed of sound, m/s.
     front_end : FrontEnd
-        What a segment's spectra are: the whole segment's, or those of frames, whose GCCs are averaged.
+        Computes the spectrum of a whole segment, or the spectra of its frames, whose GCCs are averaged.
+
+    Raises
+    ------
+    ValueError
+        If the sampling rate is too low for the band.
     """
 
     def __init__(
@@ -94,17 +110,17 @@ class GCCPhat:
         self.lags_s = self._sampling.fine_lags_s
 
     def __call__(self, segments: Sequence[Float32Array]) -> GCC:
-        """GCC of a sound's segments, each (K, n) and without gaps: their mean, weighted by length.
+        """GCC of a sound's segments (K, n): their mean, weighted by length.
 
         Silence and dead channels give zeros, never NaN.
         """
         return self.below(segments, ())[0]
 
     def of_each(self, sounds: Sequence[Float32Array]) -> list[GCC]:
-        """GCC of each of several arrays' sounds (K, n) by one transform and one product of matrices.
+        """GCC of each of several arrays' sounds (K, n), by one transform and one matrix product.
 
-        The arrays are all alike (`is_like`), and their sounds equally long. Values differ from those of each alone by
-        rounding.
+        The arrays must be alike (`is_like`) and their sounds equally long. Values differ by rounding from those of each
+        array alone.
         """
         count = len(self.pairs)
         first_channels = len(sounds[0]) * np.arange(len(sounds))
@@ -115,17 +131,17 @@ class GCCPhat:
         return [GCC(self.pairs, self.lags_s, values[first : first + count]) for first in range(0, len(pairs), count)]
 
     def is_like(self, other: GCCPhat) -> bool:
-        """Whether the two correlate by the same matrices."""
+        """Return whether both use the same matrices."""
         if self._front_end is not other._front_end or len(self.pairs) != len(other.pairs):
             return False
         return self._sampling is other._sampling  # and so band and rate are the same
 
     def is_short(self, sound: Float32Array) -> bool:
-        """Whether a sound (K, n) is better correlated together with others."""
+        """Return whether a sound (K, n) is faster to correlate together with others."""
         return bool(sound.shape[1] <= _TOGETHER_S * self._rate_hz)
 
     def below(self, segments: Sequence[Float32Array], cut_offs_hz: Sequence[float]) -> list[GCC]:
-        """GCC of the whole band, and then of what of it lies below each cut-off, all over the whole band's B."""
+        """GCC of the whole band, and of the part below each cut-off, all divided by the B bins of the whole band."""
         shape = (1 + len(cut_offs_hz), len(self.pairs), self._sampling.count)
         total: ComplexArray | Float32Array
         total = np.zeros(shape, np.complex64) if self._envelope else np.zeros(shape, np.float32)
@@ -139,7 +155,7 @@ class GCCPhat:
 
 
 def correlated(sounds: Sequence[tuple[GCCPhat, Sequence[Float32Array]]]) -> list[GCC]:
-    """GCC of each array's segments by its correlator: of windows of arrays of one shape all at once."""
+    """GCC of each array's segments by its correlator; windows of arrays of one shape are correlated together."""
     (first, segments), *others = sounds
     alike = all(correlate.is_like(first) and len(each) == 1 for correlate, each in sounds)
     if others and alike and first.is_short(segments[0]):
@@ -150,24 +166,24 @@ def correlated(sounds: Sequence[tuple[GCCPhat, Sequence[Float32Array]]]) -> list
 
 
 class CrossSpectra:
-    """Whitened cross-spectra of all pairs in the band, summed over frames.
+    """Whitened cross spectra of all pairs in the band, summed over frames.
 
     Parameters
     ----------
     spectra : Spectra
-        With `n_fft` above the frames' length by the lags wanted.
+        `n_fft` exceeds the frames' length by the largest lag.
     pairs : (P, 2) int64
     sample_rate_hz : float
     band_hz : (float, float)
     weights : (L, B) float32 or None
-        Of each frame's bins in the band; the correlations are then sums and no means.
+        Weights of each frame's bins in the band; correlations are then sums. None makes them means.
     noise : (L, B) float32 or None
-        Power in each frame's bins in the band up to which magnitudes count, too; without it only phases do.
+        Power of the noise in each frame's bins in the band; magnitudes count where it dominates. None uses phases only.
 
     Attributes
     ----------
     levels : (K,) float64
-        What the correlation of each microphone with itself would be at lag 0, as a sum.
+        Correlation of each microphone with itself at lag 0, as a sum.
     """
 
     def __init__(
@@ -195,7 +211,7 @@ class CrossSpectra:
         kernels.cross_spectra(spectra.values, self.low, pairs, weights, noise, self.whitened, self.levels)
 
     def bins_below(self, cut_off_hz: float) -> int:
-        """How many of the band's bins lie at or below a cut-off."""
+        """Number of the band's bins at or below a cut-off."""
         bins = self.whitened.shape[1]
         return max(0, int(min(bins, cut_off_hz * self.n_fft / self.sample_rate_hz + 1 - self.low)))
 
@@ -205,11 +221,11 @@ class CrossSpectra:
         Parameters
         ----------
         reach : int
-            Lags from -reach to reach samples.
+            Largest lag in samples.
         cut_off_hz : float
             Bins above it count as zero.
         envelope : bool
-            Whether the analytic signal of the correlation is wanted; else its imaginary part is zero.
+            Whether to return the analytic signal; otherwise the imaginary part is zero.
 
         Returns
         -------
@@ -218,7 +234,13 @@ class CrossSpectra:
         return self.around_zero(self.n_fft, reach, cut_off_hz, envelope=envelope).astype(np.complex64)
 
     def around_zero(self, count: int, reach: int, cut_off_hz: float, *, envelope: bool) -> ComplexArray | Float32Array:
-        """The same at lags n_fft/count samples apart, by an inverse FFT of `count` points: real, or analytic."""
+        """The same as `correlations` at lags n_fft/count samples apart, by an inverse FFT of `count` points.
+
+        Returns
+        -------
+        (P, 2 reach + 1)
+            float32, or complex64 for the analytic signal.
+        """
         kept = self.bins_below(cut_off_hz)
         spectrum = np.zeros((len(self.whitened), count if envelope else count // 2 + 1), dtype=np.complex64)
         spectrum[:, self.low : self.low + kept] = self.whitened[:, :kept]
@@ -229,18 +251,18 @@ class CrossSpectra:
 
 
 class LagSampling:
-    """The lags a band-limited GCC is worked out at, and the interpolation from these to fine ones.
+    """The lags at which a band-limited GCC is computed, and the interpolation from these to fine lags.
 
-    A GCC without content above f2 is known from lags 1/(2 f2) apart (Dietzen et al. 2021). Taken a quarter denser than
-    that and a little further out than needed, a fixed matrix leads from them to any number of fine lags; its weights
-    are those that err least, in the mean square over the frequencies of the band: 2e-6 of the GCC.
+    A GCC without content above f2 is determined by lags 1/(2 f2) apart (Dietzen et al. 2021). With lags a quarter
+    denser than that, and some beyond the largest, a fixed matrix interpolates to the fine lags. Its weights minimise
+    the mean square error over the frequencies of the band, which is 2e-6 of the GCC.
 
     Parameters
     ----------
     band_hz : (float, float)
     sample_rate_hz : float
     largest_lag_s : float
-        Beyond it no direction lies.
+        Largest lag of any direction, in seconds.
     """
 
     def __init__(self, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> None:
@@ -259,13 +281,13 @@ class LagSampling:
 
     @classmethod
     def shared(cls, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> LagSampling:
-        """One for all that are alike, as arrays of one shape are: its matrices are then in the cache, and but once."""
+        """Return a cached sampling, the same for arrays of one shape, so that their matrices stay in the CPU cache."""
         return _alike(band_hz, sample_rate_hz, _fine_lags(sample_rate_hz, largest_lag_s))
 
     def sample(
         self, cross: CrossSpectra, cut_off_hz: float = np.inf, *, envelope: bool = False
     ) -> ComplexArray | Float32Array:
-        """GCC at the near-Nyquist lags: (P, count), float32; or its analytic signal, complex64."""
+        """GCC at the near-Nyquist lags, (P, count) float32, or its analytic signal, complex64."""
         kept, bins = cross.bins_below(cut_off_hz), cross.whitened.shape[1]
         if bins > _PRODUCT_BINS:
             count = cross.n_fft // FFT_FACTOR * self._per_factor
@@ -276,13 +298,13 @@ class LagSampling:
         return samples.view(np.complex64) if envelope else samples
 
     def fine(self, samples: ComplexArray | Float32Array) -> Float32Array:
-        """GCC at the fine lags, (P, L), from those at the near-Nyquist lags; magnitudes of analytic ones."""
+        """Interpolate to the fine lags, (P, L), from the near-Nyquist lags; of an analytic signal the magnitude."""
         if np.iscomplexobj(samples):
             return np.asarray(np.hypot(samples.real @ self._weights, samples.imag @ self._weights), dtype=np.float32)
         return np.asarray(samples @ self._weights)
 
     def _matrix(self, cross: CrossSpectra, *, envelope: bool) -> Float32Array:
-        """Real form of e^{j 2 pi f tau}: rows (Re, Im) of each bin, columns the lags, of the envelope (Re, Im) each."""
+        """Real form of e^{j 2 pi f tau}: rows (Re, Im) for each bin, columns for the lags, or (Re, Im) of them."""
         key = (cross.n_fft, envelope)
         if key not in self._matrices:
             frequency_hz = (cross.low + np.arange(cross.whitened.shape[1])) * (self._rate_hz / cross.n_fft)
@@ -300,7 +322,7 @@ class LagSampling:
 
 
 def _fine_lags(sample_rate_hz: float, largest_lag_s: float) -> int:
-    """Fine lags on each side of zero: with band and rate, all that a sampling depends on."""
+    """Fine lags on each side of zero; a sampling depends on them, the band and the rate alone."""
     return int(np.ceil(largest_lag_s * sample_rate_hz * OVERSAMPLING - _ROUNDING)) + 2 * OVERSAMPLING
 
 

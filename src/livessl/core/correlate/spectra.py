@@ -1,4 +1,4 @@
-"""Front ends: from a segment of sound to the spectra that are correlated. Each sees one segment, and no geometry."""
+"""Front ends, which compute the spectra of a segment that are then correlated. They know no geometry."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from livessl.core.types import ComplexArray, Float32Array, FloatArray
 
 AVERAGED_FRAME_S: Final = 0.025
-"""Frames of the averaged GCC, Hann-weighted, half overlapping (DiBiase 2000; the paper's 25 ms and 50 %)."""
+"""Length, in seconds, of the frames of the averaged GCC (DiBiase 2000; the paper's 25 ms, which overlap by half)."""
 
 CEPSTRAL_FRAME_S: Final = 0.6
-"""Longest frame of the cepstral front end; a shorter segment is halved instead."""
+"""Longest frame of the cepstral front end, in seconds; a segment of less than two frames is halved instead."""
 
 MEMORY: Final = 0.06
-"""Weight of a frame's innovation in the channel's running cepstrum: the paper's "memory parameter"."""
+"""Weight of a frame in the channel's running cepstrum: the paper's "memory parameter"."""
 
 FFT_FACTOR: Final = 16
-"""Transforms' lengths are multiples of it, so that lags may lie FFT_FACTOR/m samples apart, m whole."""
+"""Factor of all transform lengths, so that lags can lie FFT_FACTOR/m samples apart for whole m."""
 
 _FLOOR: Final = 1e-6
-"""Least magnitude whose logarithm is taken, relative to the frame's largest: 120 dB down is no sound."""
+"""Least magnitude whose logarithm is taken, relative to the frame's largest; 120 dB below it there is no sound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +34,9 @@ class Spectra:
     Parameters
     ----------
     values : (L, K, F) complex64
-        L frames, K microphones, F = n_fft/2 + 1 bins.
+        Spectra of L frames and K microphones, with F = n_fft/2 + 1 bins.
     n_fft : int
-        Length of the transform; what exceeds the frame is room for lags.
+        Length of the transform; it exceeds the frame by the room for lags.
     """
 
     values: ComplexArray
@@ -44,28 +44,28 @@ class Spectra:
 
 
 class FrontEnd(Protocol):
-    """Turns a segment (K, n) into spectra with room for `lags` samples of lag."""
+    """Computes the spectra of a segment (K, n) with room for `lags` samples of lag."""
 
     def __call__(self, samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:
-        """Spectra of one segment, or of its frames."""
+        """Return the spectra of one segment, or of its frames."""
         ...
 
 
 def fast_length(count: int) -> int:
-    """Least length, at least `count`, that is fast to transform and a multiple of `FFT_FACTOR`."""
+    """Return the least length from `count` on that is fast to transform and a multiple of `FFT_FACTOR`."""
     return FFT_FACTOR * scipy.fft.next_fast_len(-(-count // FFT_FACTOR), real=True)
 
 
 def whole_segment(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:  # noqa: ARG001 - a FrontEnd
-    """One frame: the segment, as it is."""
+    """Return the spectrum of the whole segment, as one frame."""
     n_fft = fast_length(samples.shape[1] + lags)
     return Spectra(scipy.fft.rfft(samples, n_fft, axis=1)[None], n_fft)
 
 
 def averaged(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:
-    """Hann frames of 25 ms that overlap by half; a segment shorter than a frame is one.
+    """Return the spectra of Hann frames of 25 ms that overlap by half; a segment shorter than a frame is one frame.
 
-    The segment's last incomplete frame is filled with zeros, so that every sample counts.
+    The last frame is padded with zeros, so that every sample counts.
     """
     count = samples.shape[1]
     length = max(2, round(AVERAGED_FRAME_S * sample_rate_hz))
@@ -80,10 +80,10 @@ def averaged(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra
 
 
 def cepstral(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:
-    """Frames whose channels' running minimum-phase part has been taken out (Stephenne and Champagne 1997).
+    """Return the spectra of frames without the channels' minimum-phase part (Stephenne and Champagne 1997).
 
-    Rectangular frames of 0.6 s, or of half the segment where that is shorter, end to end; samples that fill no frame
-    are left out. The channel's cepstrum begins as the first frame's and moves by `MEMORY` with each further one.
+    Frames are rectangular, end to end, and 0.6 s long, or half the segment if that is shorter; samples that fill no
+    frame are left out. A channel's cepstrum begins as the first frame's and moves by `MEMORY` with each further one.
     """
     length = max(1, min(round(CEPSTRAL_FRAME_S * sample_rate_hz), samples.shape[1] // 2))
     count = samples.shape[1] // length
@@ -100,11 +100,11 @@ def cepstral(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra
 
 
 def minimum_phase_cepstrum(magnitude: FloatArray, n_fft: int) -> FloatArray:
-    """Cepstrum of the minimum-phase part of a spectrum, from its magnitude alone: the folded real cepstrum.
+    """Cepstrum of the minimum-phase part of a spectrum from its magnitude: the folded real cepstrum.
 
-    c_mp[0] = c[0], c_mp[n] = c[n] + c[-n] for n > 0, and 0 for n < 0. The phase's part of the complex cepstrum c is
-    odd, so it cancels in the sum, and no phase need be unwrapped (Oppenheim and Schafer, Discrete-Time Signal
-    Processing, ch. 12).
+    c_mp[0] = c[0], c_mp[n] = c[n] + c[-n] for n > 0, and 0 for n < 0. The part of the complex cepstrum c that comes
+    from the phase is odd, so it cancels in the sum, and no phase needs to be unwrapped (Oppenheim and Schafer,
+    Discrete-Time Signal Processing, ch. 12).
 
     Parameters
     ----------

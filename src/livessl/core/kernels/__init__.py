@@ -1,4 +1,4 @@
-"""The kernels in use: compiled where numba is installed, else on NumPy. Same names, same arguments, same answers."""
+"""The kernels in use: compiled where numba is installed, otherwise on NumPy, with the same names and arguments."""
 
 from __future__ import annotations
 

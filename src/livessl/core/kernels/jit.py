@@ -1,4 +1,4 @@
-"""How our kernels are compiled by numba, and kept from one start to the next. Needs numba."""
+"""Compiles functions by numba and keeps the machine code from one start to the next. Needs numba."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import numba
 
 
 def jit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """What compiles a function at its first call, to run without Python's lock; `options` are numba's.
+    """Return a decorator that compiles a function at its first call, to run without Python's global lock.
 
     The machine code is kept in `NUMBA_CACHE_DIR`, beside the source, or in the user's cache: the first of them that can
-    be written. Where none can, each process compiles anew.
+    be written. If none can, each process compiles anew.
+
+    Parameters
+    ----------
+    **options
+        Options of `numba.njit`.
     """
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:

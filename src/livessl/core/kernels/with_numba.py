@@ -1,7 +1,6 @@
-"""The kernels, compiled by numba: what `livessl.core.kernels.with_numpy` does, faster.
+"""The kernels compiled by numba. Each has a twin of the same name and arguments in `with_numpy`, which documents it.
 
-Each function has its twin there, which says what it does: the same arguments, the same answers; of the searching and
-mapping ones to the last bit.
+The kernels of maps and of the search give the same answers as their twins to the last bit, the others to rounding.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, SILENT_POWER
 from livessl.core.kernels.jit import jit
-from livessl.core.kernels.with_numpy import BLOCKS, MINIMUM, NO_LAG, PRODUCT, RUNS, SILENT_POWER
 
 NAME: Final = "numba"
 
@@ -19,8 +18,9 @@ _compiled = jit(error_model="numpy")
 
 
 @_compiled
-def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low, high):  # type: ignore[no-untyped-def]
-    """Lowest and highest lag of every pair over the nodes of every cell."""
+def cell_intervals(axes, microphones_m, pairs, scale, offset, edge, low, high):  # type: ignore[no-untyped-def]
+    """Find the lowest and highest lag of every pair over the points of every cell."""
+    x_m, y_m, z_m = axes
     n_x, n_y, n_z = len(x_m), len(y_m), len(z_m)
     cells_y, cells_z = -(-n_y // edge), -(-n_z // edge)
     distance = np.empty((len(microphones_m), n_z), np.float32)
@@ -48,7 +48,7 @@ def cell_intervals(x_m, y_m, z_m, microphones_m, pairs, scale, offset, edge, low
 
 @_compiled
 def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
-    """Windows of sound, weighed, and zeros after them."""
+    """Cut weighed windows out of samples, with zeros after them."""
     length = len(window)
     for t in range(len(windows)):
         for m in range(len(samples)):
@@ -62,7 +62,7 @@ def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
 def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
     spectra, low, pairs, weights, noise, whitened, levels
 ):
-    """Whitened cross spectra, weighed and summed over frames, and the microphones' own sums."""
+    """Sum whitened cross spectra over frames, and each microphone's own."""
     microphones, bins = spectra.shape[1], whitened.shape[1]
     real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
     power = np.empty((microphones, bins), np.float32)
@@ -108,9 +108,11 @@ def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def onset_weights(  # type: ignore[no-untyped-def]
-    spectra, low, quiet, heard, least, decay, warm_up, noise_hops, loud, strongest, noise, past, weights, noises,
-):  # fmt: skip
-    """Weights of the next windows by how direct they are."""
+    spectra, low, quiet, parameters, state, weights, noises
+):
+    """Weigh the next windows by how direct their sound is."""
+    windows, noise, past = state
+    least, warm_up, noise_hops = parameters.least, parameters.warm_up, parameters.noise_hops
     microphones, bins = spectra.shape[1], len(noise)
     one, zero, two, every = np.float32(1.0), np.float32(0.0), np.float32(2.0), np.float32(noise_hops)
     power = np.empty(bins + 2, np.float32)
@@ -125,55 +127,55 @@ def onset_weights(  # type: ignore[no-untyped-def]
         power[0], power[bins + 1] = power[1], power[bins]
         for b in range(bins):
             smooth[b] = (power[b] + power[b + 1] + power[b + 2]) / np.float32(3 * microphones)
-        if heard[0] == 0:
+        if windows[0] == 0:
             noise[:], past[:] = smooth, smooth
-        if heard[1] >= warm_up or heard[0] >= noise_hops:
+        if windows[1] >= warm_up or windows[0] >= noise_hops:
             for b in range(bins):
                 interference = max(max(noise[b], past[b]), least)
                 direct = max(smooth[b] - interference, zero)
-                weight[b] = min(direct * direct / (interference * (interference + two * direct)), strongest)
+                weight[b] = min(direct * direct / (interference * (interference + two * direct)), parameters.strongest)
         else:
             weight[:] = zero
         noises[t] = noise
-        heard[0] += 1
-        heard[1] += quiet
-        share = one / np.float32(min(heard[1], noise_hops)) if quiet else one / every
-        settled = quiet and heard[1] > warm_up
+        windows[0] += 1
+        windows[1] += quiet
+        share = one / np.float32(min(windows[1], noise_hops)) if quiet else one / every
+        settled = quiet and windows[1] > warm_up
         for b in range(bins):
             now = smooth[b]
-            past[b] = max(past[b] * decay, now)
+            past[b] = max(past[b] * parameters.decay, now)
             if settled:
-                now = min(now, loud * max(noise[b], least))
+                now = min(now, parameters.loud * max(noise[b], least))
             elif not quiet:
                 now = min(now, noise[b])
             noise[b] += (now - noise[b]) * share
 
 
 def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
-    """What `add_power` wants of the places that nodes look up: these."""
+    """Return the table that `add_power` needs for the places of points: the places themselves."""
     return places
 
 
 @_compiled
 def look_up(values, places, out):  # type: ignore[no-untyped-def]
-    """Bare look-ups: how fast a map could be at best."""
+    """Look values up: the least that a map can cost, for benchmarks."""
     for n in range(len(places)):
         out[n] = values[places[n]]
 
 
 @_compiled
 def add_power(values, table, weight, power):  # type: ignore[no-untyped-def]
-    """Add one array's power at every node."""
-    for node in range(len(table)):
+    """Add one array's power at every grid point."""
+    for point in range(len(table)):
         total = np.float32(0.0)
         for p in range(table.shape[1]):
-            total += values[p, table[node, p]]
-        power[node] += weight * total
+            total += values[p, table[point, p]]
+        power[point] += weight * total
 
 
 @_compiled
 def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
-    """Mean square of a GCC, further than something from one lag of each pair."""
+    """Mean square of a GCC away from one lag of each pair."""
     total, count = 0.0, 0
     for p in range(len(values)):
         row, square = values[p], np.float32(0.0)
@@ -186,8 +188,9 @@ def mean_square(values, lags_s, but_s, apart_s):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, last, weight, values):  # type: ignore[no-untyped-def]
+def smooth_power(points_m, c_m_s, rows):  # type: ignore[no-untyped-def]
     """Summed power at points off the grid."""
+    microphones_m, pairs, first_s, step_s, start, last, weight, values = rows
     power = np.zeros(len(points_m))
     distance = np.empty(len(microphones_m))
     for n in range(len(points_m)):
@@ -211,7 +214,7 @@ def smooth_power(points_m, microphones_m, pairs, c_m_s, first_s, step_s, start, 
 
 @_compiled
 def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
-    """Maxima over runs of blocks of lags."""
+    """Find the maxima of each row over runs of blocks of lags."""
     length = values.shape[1]
     for r in range(len(values)):
         row, of_blocks, size = values[r], maxima[r], block[r]
@@ -232,43 +235,28 @@ def running_maxima(values, block, maxima):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _joined(rule, total, power):  # type: ignore[no-untyped-def]
-    if rule == MINIMUM:
-        return min(total, power)
-    if rule == PRODUCT:
-        return total * max(power, np.float32(0.0))
-    return total + power
-
-
-@_compiled
-def _start(rule):  # type: ignore[no-untyped-def]
-    if rule == MINIMUM:
-        return np.float32(np.inf)
-    return np.float32(1.0) if rule == PRODUCT else np.float32(0.0)
-
-
-@_compiled
-def bounds(maxima, places, rows, first_row, weight, rule, bound):  # type: ignore[no-untyped-def]
-    """What no node of each of some cells exceeds."""
-    bound[:] = _start(rule)
+def upper_bounds(maxima, places, rows, bound):  # type: ignore[no-untyped-def]
+    """Bound the power of the points of each of some cells."""
+    site_pair, first_row, weight = rows.site_pair, rows.first_row, rows.weight
+    bound[:] = np.float32(0.0)
     total = np.empty(len(bound), np.float32)
     for a in range(len(weight)):
         total[:] = np.float32(0.0)
         for r in range(first_row[a], first_row[a + 1]):
-            row, of_cells = maxima[r], places[rows[r]]
+            row, of_cells = maxima[r], places[site_pair[r]]
             for c in range(len(bound)):
                 total[c] += row[of_cells[c]]
         for c in range(len(bound)):
-            bound[c] = _joined(rule, bound[c], weight[a] * total[c])
+            bound[c] += weight[a] * total[c]
 
 
 @_compiled
-def _covered(first, nodes, shape, boxes):  # type: ignore[no-untyped-def]
-    """Whether a cube of nodes lies wholly in one of the boxes."""
+def _covered(first, points, shape, boxes):  # type: ignore[no-untyped-def]
+    """Whether a cube of points lies wholly in one of the boxes."""
     for box in boxes:
         inside = True
         for axis in range(3):
-            last = min(first[axis] + nodes, shape[axis]) - 1
+            last = min(first[axis] + points, shape[axis]) - 1
             inside = inside and first[axis] >= box[axis, 0] and last <= box[axis, 1]
         if inside:
             return True
@@ -276,15 +264,15 @@ def _covered(first, nodes, shape, boxes):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    first, edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row, weight, rule,
-    values, boxes, best, best_node, distance, total, fused,
-):  # fmt: skip
-    """The best node of one cell, if it is better than what is known."""
+def _best_of_cell(first, edge, axes, rows, values, boxes, best, best_point, scratch):  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    """Find the best point of one cell, if it is better than the best so far."""
+    x_m, y_m, z_m = axes
+    distance, total, power = scratch
+    microphones_m, first_microphone, pairs = rows.microphones_m, rows.first_microphone, rows.pairs
     n_x, n_y, n_z = min(edge, len(x_m) - first[0]), min(edge, len(y_m) - first[1]), min(edge, len(z_m) - first[2])
     count = n_x * n_y * n_z
-    fused[:count] = _start(rule)
-    for a in range(len(weight)):
+    power[:count] = np.float32(0.0)
+    for a in range(len(rows.weight)):
         for m in range(first_microphone[a], first_microphone[a + 1]):
             to = distance[m - first_microphone[a]]
             n = 0
@@ -300,99 +288,111 @@ def _best_of_cell(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
             for n in range(count):
                 to[n] = np.sqrt(to[n])
         total[:count] = np.float32(0.0)
-        for r in range(first_row[a], first_row[a + 1]):
+        scale, offset, weight = rows.scale[a], rows.offset[a], rows.weight[a]
+        for r in range(rows.first_row[a], rows.first_row[a + 1]):
             nearer, further, row = distance[pairs[r, 0]], distance[pairs[r, 1]], values[r]
             for n in range(count):
-                total[n] += row[np.uint32(np.int32((further[n] - nearer[n]) * scale[a] + offset[a]))]
+                total[n] += row[np.uint32(np.int32((further[n] - nearer[n]) * scale + offset))]
         for n in range(count):
-            fused[n] = _joined(rule, fused[n], weight[a] * total[n])
+            power[n] += weight * total[n]
     for n in range(count):
-        if fused[n] >= best:
+        if power[n] >= best:
             x, y, z = first[0] + n // (n_y * n_z), first[1] + n // n_z % n_y, first[2] + n % n_z
-            node = (x * len(y_m) + y) * len(z_m) + z
-            better = fused[n] > best or node < best_node
+            point = (x * len(y_m) + y) * len(z_m) + z
+            better = power[n] > best or point < best_point
             if better and not _covered((x, y, z), 1, (len(x_m), len(y_m), len(z_m)), boxes):
-                best, best_node = fused[n], node
-    return best, best_node
+                best, best_point = power[n], point
+    return best, best_point
 
 
 @_compiled
-def highest(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    values, maxima, rows, first_row, weight, rule, places, leaf_places, top_bound, cell_bound, bounded,
-    x_m, y_m, z_m, edge, per_top, microphones_m, first_microphone, pairs, scale, offset, boxes, most,
-):  # fmt: skip
-    """The highest node outside some boxes, by branch and bound."""
-    shape = (len(x_m), len(y_m), len(z_m))
-    top_edge = edge * per_top
-    tops_y, tops_z = -(-shape[1] // top_edge), -(-shape[2] // top_edge)
-    children = per_top**3
-    child_bound = np.empty(children, np.float32)
-    leaf_edge = edge // 2 if leaf_places.shape[2] else edge
+def _best_of_cube(  # type: ignore[no-untyped-def]
+    cube, at, values, maxima, rows, cells, cell_bound, boxes, most_look_ups, spent, best, best_point, scratch
+):
+    """Find the best point of the cells of one cube whose bounds are known, and whether the search gives up there."""
+    shape = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2]))
+    edge, per_cube, leaf_places = cells.edge, cells.per_cube, cells.leaf_places
+    halves = leaf_places.shape[2] > 0
+    leaf_edge = edge // 2 if halves else edge
     leaf_bound = np.empty(max(1, leaf_places.shape[2]), np.float32)
-    distance = np.empty((np.diff(first_microphone).max(), edge**3), np.float32)
-    total, fused = np.empty(edge**3, np.float32), np.empty(edge**3, np.float32)
-    spent = 0
-    best, best_node = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
-    first_top = np.argmax(top_bound)
-    order = np.array([first_top])
-    for turn in range(2):  # the most promising top cell first: what it yields leaves few others to be sorted
-        if turn == 1:
-            left = np.flatnonzero(top_bound >= best)
-            order = left[np.argsort(-top_bound[left])]
-        for top in order:
-            if top_bound[top] < best:
+    left = cell_bound.copy()
+    while True:
+        cell = np.argmax(left)
+        bound = left[cell]
+        if bound < best or bound == -np.inf:
+            return best, best_point, spent, False
+        left[cell] = -np.inf
+        c_x, c_y, c_z = cell // (per_cube * per_cube), cell // per_cube % per_cube, cell % per_cube
+        first = (at[0] + c_x * edge, at[1] + c_y * edge, at[2] + c_z * edge)
+        if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
+            continue  # a cube at the volume's edge has cells outside it
+        if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_point:
+            continue
+        if _covered(first, edge, shape, boxes):
+            continue
+        if halves:
+            spent += len(leaf_bound) * len(rows.site_pair)
+            upper_bounds(maxima, leaf_places[cube * per_cube**3 + cell], rows, leaf_bound)
+        else:
+            leaf_bound[0] = bound
+        while True:
+            leaf = np.argmax(leaf_bound)
+            if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
                 break
-            if turn == 1 and top == first_top:
+            leaf_bound[leaf] = -np.inf
+            l_x, l_y, l_z = leaf // 4 * leaf_edge, leaf // 2 % 2 * leaf_edge, leaf % 2 * leaf_edge
+            corner = (first[0] + l_x, first[1] + l_y, first[2] + l_z)
+            if corner[0] >= shape[0] or corner[1] >= shape[1] or corner[2] >= shape[2]:
                 continue
-            t_x, t_y, t_z = top // (tops_y * tops_z), top // tops_z % tops_y, top % tops_z
-            t_x, t_y, t_z = t_x * top_edge, t_y * top_edge, t_z * top_edge
-            if top_bound[top] == best and (t_x * shape[1] + t_y) * shape[2] + t_z > best_node:
+            if spent > most_look_ups and best > -np.inf:
+                return best, best_point, spent, True
+            spent += leaf_edge**3 * len(rows.site_pair)
+            best, best_point = _best_of_cell(
+                corner, leaf_edge, cells.axes, rows, values, boxes, best, best_point, scratch
+            )
+
+
+@_compiled
+def highest(values, maxima, rows, cells, bounds, boxes, most_look_ups):  # type: ignore[no-untyped-def]
+    """Find the highest point outside some boxes, by branch and bound."""
+    shape = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2]))
+    of_cubes, of_cells, known = bounds
+    cube_edge = cells.edge * cells.per_cube
+    cubes_y, cubes_z = -(-shape[1] // cube_edge), -(-shape[2] // cube_edge)
+    scratch = (
+        np.empty((np.diff(rows.first_microphone).max(), cells.edge**3), np.float32),
+        np.empty(cells.edge**3, np.float32),
+        np.empty(cells.edge**3, np.float32),
+    )
+    spent = 0
+    best, best_point = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
+    first_cube = np.argmax(of_cubes)
+    order = np.array([first_cube])
+    for turn in range(2):  # the most promising cube first: with its best point few others are left to be sorted
+        if turn == 1:
+            left = np.flatnonzero(of_cubes >= best)
+            order = left[np.argsort(-of_cubes[left])]
+        for cube in order:
+            if of_cubes[cube] < best:
+                break
+            if turn == 1 and cube == first_cube:
                 continue
-            if _covered((t_x, t_y, t_z), top_edge, shape, boxes):
+            c_x, c_y, c_z = cube // (cubes_y * cubes_z), cube // cubes_z % cubes_y, cube % cubes_z
+            at = (c_x * cube_edge, c_y * cube_edge, c_z * cube_edge)
+            if of_cubes[cube] == best and (at[0] * shape[1] + at[1]) * shape[2] + at[2] > best_point:
                 continue
-            if not bounded[top]:
-                if spent > most and best > -np.inf:
-                    return best_node, best, False
-                spent += children * len(rows)
-                bounds(maxima, places[top], rows, first_row, weight, rule, cell_bound[top])
-                bounded[top] = True
-            child_bound[:] = cell_bound[top]
-            while True:
-                child = np.argmax(child_bound)
-                bound = child_bound[child]
-                if bound < best or bound == -np.inf:
-                    break
-                child_bound[child] = -np.inf
-                c_x, c_y, c_z = child // (per_top * per_top), child // per_top % per_top, child % per_top
-                first = (t_x + c_x * edge, t_y + c_y * edge, t_z + c_z * edge)
-                if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
-                    continue  # a cube at the volume's edge has cells outside it
-                if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_node:
-                    continue
-                if _covered(first, edge, shape, boxes):
-                    continue
-                if leaf_places.shape[2] == 0:
-                    leaf_bound[0] = bound
-                else:
-                    spent += len(leaf_bound) * len(rows)
-                    bounds(maxima, leaf_places[top * children + child], rows, first_row, weight, rule, leaf_bound)
-                while True:
-                    leaf = np.argmax(leaf_bound)
-                    if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
-                        break
-                    leaf_bound[leaf] = -np.inf
-                    at = (
-                        first[0] + leaf // 4 * leaf_edge,
-                        first[1] + leaf // 2 % 2 * leaf_edge,
-                        first[2] + leaf % 2 * leaf_edge,
-                    )
-                    if at[0] >= shape[0] or at[1] >= shape[1] or at[2] >= shape[2]:
-                        continue
-                    if spent > most and best > -np.inf:
-                        return best_node, best, False
-                    spent += leaf_edge**3 * len(rows)
-                    best, best_node = _best_of_cell(
-                        at, leaf_edge, x_m, y_m, z_m, microphones_m, first_microphone, pairs, scale, offset, first_row,
-                        weight, rule, values, boxes, best, best_node, distance, total, fused,
-                    )  # fmt: skip
-    return best_node, best, True
+            if _covered(at, cube_edge, shape, boxes):
+                continue
+            if not known[cube]:
+                if spent > most_look_ups and best > -np.inf:
+                    return best_point, best, False
+                spent += cells.per_cube**3 * len(rows.site_pair)
+                upper_bounds(maxima, cells.cell_places[cube], rows, of_cells[cube])
+                known[cube] = True
+            best, best_point, spent, gives_up = _best_of_cube(
+                cube, at, values, maxima, rows, cells, of_cells[cube], boxes, most_look_ups, spent, best, best_point,
+                scratch,
+            )  # fmt: skip
+            if gives_up:
+                return best_point, best, False
+    return best_point, best, True

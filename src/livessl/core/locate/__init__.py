@@ -1,4 +1,4 @@
-"""From the correlations of several arrays to a position, its covariance and its confidence.
+"""Locates sources: a position, its covariance and its confidence from the correlations of several arrays.
 
-It sees one sound at a time and keeps no state between sounds.
+Nothing here keeps state between sounds.
 """

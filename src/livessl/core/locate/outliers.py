@@ -1,8 +1,8 @@
-"""Whether arrays agree on a place, and which of them the others outvote. It sees evidence, and no sound.
+"""Finds the position that most arrays agree on, and the arrays that are outliers. It sees correlations and no sound.
 
-Each array has a place of its own where its evidence stands highest. What the arrays lose at the place they are said to
-have in common, each against its own, is next to nothing where they agree; an array that is turned or moved, or hears
-something else, loses nearly all of its standing there, or makes the others lose theirs.
+Each array's map has a highest place of its own. At the common position an array that agrees loses next to nothing of
+its peak-to-RMS ratio. An array that is turned or moved, or records something else, loses nearly all of it there, or
+makes the others lose theirs.
 """
 
 from __future__ import annotations
@@ -14,79 +14,43 @@ from typing import Final
 import numpy as np
 
 from livessl.core.geometry import Grid, angle_deg
-from livessl.core.locate.confidence import NEAR_M, array_power, standing
+from livessl.core.locate.confidence import NEAR_M, array_power, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
-from livessl.core.locate.srp import SRPFunctional, pair_weight
+from livessl.core.locate.place import Place
+from livessl.core.locate.srp import pair_weight
 from livessl.core.types import Evidence, FloatArray
 
-MOST_LOST: Final = 0.8
-"""Where arrays lose more standing than this at a place, one without which the others lose so much less is outvoted.
-One of three turned by 30 degrees makes them lose more in 19 events of 20, even at 10 dB in a room that rings for 2 s;
-all that are right lose more there in one event of ten, and next to never elsewhere."""
+MAX_LOSS: Final = 0.8
+"""Summed loss of peak-to-RMS ratio above which arrays are taken to disagree. An array is an outlier if the loss without
+it is smaller by more than this."""
 
-MOST_LOST_UNSETTLED: Final = 1.5
-"""Where arrays lose more standing than this and none can be outvoted, they do not agree. Those that are right lose more
-in one event of fifty at 10 dB in a room that rings for 2 s, and hardly ever elsewhere."""
+MAX_UNRESOLVED_LOSS: Final = 1.5
+"""Summed loss of peak-to-RMS ratio above which a position is refused where no outlier can be named. It lies above
+`MAX_LOSS` because arrays that are all right lose that much too in noise and long reverberation."""
 
-MOST_LOST_DOUBTED: Final = 0.6
-"""What an array that is doubted may cost in standing to be taken back in."""
+MAX_SUSPECT_LOSS: Final = 0.6
+"""Further loss of peak-to-RMS ratio up to which a suspect array is used again."""
 
-LEAST_LEAD: Final = 0.05
-"""Where leaving out another array would be as good but for so little, and lead elsewhere, nobody can tell who is wrong:
-two directions may meet in a false place as well as in the right one. By more than this the right one leads in all
-events without noise and in 85 % at 10 dB."""
+MIN_LEAD: Final = 0.05
+"""Loss of peak-to-RMS ratio by which one outlier must explain the disagreement better than another that would lead
+elsewhere. Within it both explanations are as good: two directions may meet in a false position as well as in the right
+one."""
 
-SUSPECTS: Final = 3
-"""Of more arrays, those that lose most are tried without."""
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """The highest place of some arrays' summed maps.
-
-    Parameters
-    ----------
-    evidence : tuple of Evidence
-        Theirs, in the order of their names.
-    functional : SRPFunctional
-        Of it.
-    position_m : (3,) float64
-    power, rival_power : float
-        The functional there, and the highest outside its `peaks.neighbourhood`.
-    proven : bool
-        Whether no node of the grid is higher.
-    """
-
-    evidence: tuple[Evidence, ...]
-    functional: SRPFunctional
-    position_m: FloatArray
-    power: float
-    rival_power: float
-    proven: bool
-
-    @property
-    def is_heard_by_all(self) -> bool:
-        """Whether each of the arrays hears something there: noise alone stands as high as its rms."""
-        terms = self.functional.pair_terms(self.position_m)
-        each = (standing(heard, array_power(heard, term)) for heard, term in zip(self.evidence, terms, strict=True))
-        return min(each) >= 1.0
-
-    def apart_m(self, other: Place) -> float:
-        """How far it is from another."""
-        return float(np.linalg.norm(self.position_m - other.position_m))
+MAX_CANDIDATES: Final = 3
+"""Most arrays that are tried as outliers in one round, those that lose most first: each costs a search."""
 
 
 @dataclass(frozen=True, slots=True)
-class Agreed:
-    """A place, and who does not agree.
+class Consensus:
+    """A place, and the arrays that do not agree on it.
 
     Parameters
     ----------
     place : Place
-    outvoted : mapping of name to float
-        Arrays that the place was found without, and by what angle, in degrees, each hears the sound elsewhere.
+    outliers : mapping of str to float
+        Arrays that were left out of the place, and the angle in degrees between each one's own direction and the place.
     refused : str or None
-        Why the place should not be relied on, where it should not.
+        Why the place should not be relied on, in words; None if it may be.
     """
 
     place: Place
@@ -94,114 +58,139 @@ class Agreed:
     refused: str | None = None
 
 
-def agreed(
-    everyone: Sequence[Evidence],
+def consensus(
+    evidence: Sequence[Evidence],
     suspect: Collection[str],
     search: PeakSearch,
     grid: Grid,
     locate: Callable[[Sequence[Evidence]], Place],
-) -> Agreed:
-    """The place that most arrays agree on.
+) -> Consensus:
+    """Find the place that most arrays agree on.
 
-    Arrays that are doubted are heard last, as long as the others are more than half of all. Where arrays do not agree,
-    each of the suspects is left out in turn, and the one without which the others lose least is outvoted. More than
-    half of all are always left.
+    While arrays disagree, each candidate is left out in turn, and the one without which the others lose least becomes
+    an outlier. More than half of all arrays always remain. Suspect arrays are tried last, as long as the others are
+    more than half of all.
 
     Parameters
     ----------
-    everyone : sequence of Evidence
-    doubted : collection of str
-        Arrays that have disagreed lately.
+    evidence : sequence of Evidence
+        Evidence of all arrays.
+    suspect : collection of str
+        Arrays that were outliers in many of the last events.
     search : PeakSearch
     grid : Grid
-        That it searches.
+        Grid of the search.
     locate : callable
-        From the evidence of some of them to their place.
+        Returns the place of the evidence of some arrays.
     """
-    own = _Own(search, grid)
-    first = [heard for heard in everyone if heard.spec.name not in suspect]
-    last = [heard for heard in everyone if heard.spec.name in suspect]
-    if 2 * len(first) <= len(everyone):
-        first, last = list(everyone), []
-    out: list[Evidence] = []
-    place = locate(first)
-    while len(everyone) > 1:
-        lost = own.lost(place)
-        suspects = sorted(place.evidence, key=lambda heard: -lost[heard.spec.name])[:SUSPECTS]
-        disagreement = sum(lost[heard.spec.name] for heard in suspects)
-        refused = _divided(everyone) if disagreement > MOST_LOST_UNSETTLED else None
-        if disagreement <= MOST_LOST:
+    own = _OwnPeaks(search, grid)
+    trusted, last = _by_trust(evidence, suspect)
+    outliers: list[Evidence] = []
+    place = locate(trusted)
+    while len(evidence) > 1:
+        loss = own.loss(place)
+        candidates = sorted(place.evidence, key=lambda part: -loss[part.spec.name])[:MAX_CANDIDATES]
+        disagreement = sum(loss[part.spec.name] for part in candidates)
+        if disagreement <= MAX_LOSS:
             break
-        if 2 * (len(place.evidence) - 1) <= len(everyone):
-            if refused:
-                return Agreed(place, refused=refused)
-            break
-        places = [locate([heard for heard in place.evidence if heard is not suspect]) for suspect in suspects]
-        losses = [sum(own.lost(without).values()) for without in places]
-        best = int(np.argmin(losses))
-        if sum(lost.values()) - losses[best] <= MOST_LOST:
-            break
-        rivals = (
-            other.apart_m(places[best]) > NEAR_M
-            for other, loss in zip(places, losses, strict=True)
-            if loss - losses[best] < LEAST_LEAD
-        )
-        if any(rivals):
-            if refused:
-                return Agreed(place, refused=refused)
-            break
-        out.append(suspects[best])
-        place = places[best]
-    for heard in last:
-        together = locate([*place.evidence, heard])
-        if sum(own.lost(together).values()) - sum(own.lost(place).values()) > MOST_LOST_DOUBTED:
-            out.append(heard)
+        if 2 * (len(place.evidence) - 1) > len(evidence):
+            places = [locate([part for part in place.evidence if part is not one]) for one in candidates]
+            losses = [sum(own.loss(without).values()) for without in places]
+            best = int(np.argmin(losses))
+            if sum(loss.values()) - losses[best] <= MAX_LOSS:
+                break
+            if not _is_ambiguous(places, losses, best):
+                outliers.append(candidates[best])
+                place = places[best]
+                continue
+        if disagreement > MAX_UNRESOLVED_LOSS:
+            return Consensus(place, refused=_refusal(evidence))
+        break
+    place, disagreeing = _with_suspects(place, last, own, locate)
+    outliers += disagreeing
+    return Consensus(place, {part.spec.name: own.angle_deg(part, place.position_m) for part in outliers})
+
+
+def _by_trust(evidence: Sequence[Evidence], suspect: Collection[str]) -> tuple[list[Evidence], list[Evidence]]:
+    """Split off the evidence of suspect arrays, unless that is half of all or more."""
+    trusted = [part for part in evidence if part.spec.name not in suspect]
+    if 2 * len(trusted) <= len(evidence):
+        return list(evidence), []
+    return trusted, [part for part in evidence if part.spec.name in suspect]
+
+
+def _with_suspects(
+    place: Place, suspect: Sequence[Evidence], own: _OwnPeaks, locate: Callable[[Sequence[Evidence]], Place]
+) -> tuple[Place, list[Evidence]]:
+    """Add the evidence of suspect arrays that agree with a place; return the new place and those that disagree."""
+    disagreeing = []
+    for part in suspect:
+        together = locate([*place.evidence, part])
+        if sum(own.loss(together).values()) - sum(own.loss(place).values()) > MAX_SUSPECT_LOSS:
+            disagreeing.append(part)
         else:
             place = together
-    return Agreed(place, {heard.spec.name: own.angle_deg(heard, place.position_m) for heard in out})
+    return place, disagreeing
 
 
-class _Own:
-    """Where each array's evidence stands highest, looked for when it is asked for."""
+def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -> bool:
+    """Whether leaving out another candidate is about as good as the best one and leads elsewhere."""
+    return any(
+        place.apart_m(places[best]) > NEAR_M
+        for place, loss in zip(places, losses, strict=True)
+        if loss - losses[best] < MIN_LEAD
+    )
+
+
+class _OwnPeaks:
+    """Each array's own highest place; every one is searched for when it is first needed."""
 
     def __init__(self, search: PeakSearch, grid: Grid) -> None:
         self._search = search
         self._grid = grid
         self._highest: dict[str, tuple[float, FloatArray]] = {}
 
-    def lost(self, place: Place) -> dict[str, float]:
-        """What standing each array loses at a place; no less, and where all of it is little, perhaps more."""
+    def loss(self, place: Place) -> dict[str, float]:
+        """Peak-to-RMS ratio that each array loses at `place` against its own highest place.
+
+        Where the sum may exceed `MAX_LOSS` the larger losses are exact; all others are upper bounds, which need no
+        search.
+        """
         terms = place.functional.pair_terms(place.position_m)
         here = {
-            heard.spec.name: standing(heard, array_power(heard, term))
-            for heard, term in zip(place.evidence, terms, strict=True)
+            part.spec.name: peak_to_rms(part, array_power(part, term))
+            for part, term in zip(place.evidence, terms, strict=True)
         }
-        lost = {heard.spec.name: max(0.0, _most(heard) - here[heard.spec.name]) for heard in place.evidence}
-        if sum(sorted(lost.values())[-SUSPECTS:]) > MOST_LOST:
-            for heard in place.evidence:
-                name = heard.spec.name
-                if lost[name] > MOST_LOST / SUSPECTS:
-                    lost[name] = max(0.0, standing(heard, self._at(heard)[0]) - here[name])
-        return lost
+        loss = {part.spec.name: max(0.0, _upper_bound(part) - here[part.spec.name]) for part in place.evidence}
+        if sum(sorted(loss.values())[-MAX_CANDIDATES:]) > MAX_LOSS:
+            for part in place.evidence:
+                name = part.spec.name
+                if loss[name] > MAX_LOSS / MAX_CANDIDATES:
+                    loss[name] = max(0.0, peak_to_rms(part, self._at(part)[0]) - here[name])
+        return loss
 
-    def angle_deg(self, heard: Evidence, position_m: FloatArray) -> float:
-        """Angle at an array between its own place and another."""
-        return angle_deg(self._at(heard)[1] - heard.spec.centre_m, position_m - heard.spec.centre_m)
+    def angle_deg(self, evidence: Evidence, position_m: FloatArray) -> float:
+        """Angle at an array between its own highest place and a position, in degrees."""
+        centre_m = evidence.spec.centre_m
+        return angle_deg(self._at(evidence)[1] - centre_m, position_m - centre_m)
 
-    def _at(self, heard: Evidence) -> tuple[float, FloatArray]:
-        name = heard.spec.name
+    def _at(self, evidence: Evidence) -> tuple[float, FloatArray]:
+        name = evidence.spec.name
         if name not in self._highest:
-            (peak,) = self._search.among([heard])(1)
+            (peak,) = self._search.among([evidence])(1)
             self._highest[name] = (peak.power, self._grid.node_m(peak.node))
         return self._highest[name]
 
 
-def _most(heard: Evidence) -> float:
-    """Standing that no place has more of: all of an array's pairs at their highest."""
-    highest = heard.gcc.values.max(axis=1).sum(dtype=np.float64)
-    return standing(heard, pair_weight(len(heard.spec.microphones_m)) * float(highest))
+def _upper_bound(evidence: Evidence) -> float:
+    """Peak-to-RMS ratio that no place exceeds: that of all of an array's pairs at their highest lag."""
+    highest = evidence.gcc.values.max(axis=1).sum(dtype=np.float64)
+    return peak_to_rms(evidence, pair_weight(len(evidence.spec.microphones_m)) * float(highest))
 
 
-def _divided(everyone: Sequence[Evidence]) -> str:
-    names = " and ".join(repr(heard.spec.name) for heard in everyone) if len(everyone) == 2 else "the arrays"
-    return f"{names} point to different places, and it cannot be told which is wrong: are their poses right?"
+def _refusal(evidence: Sequence[Evidence]) -> str:
+    names = " and ".join(repr(part.spec.name) for part in evidence) if len(evidence) == 2 else "the arrays"
+    return (
+        f"{names} point to different places, and it is unknown which is wrong; check their poses in the site file "
+        "(arrays.NAME.position_m and orientation_deg)"
+    )

@@ -1,16 +1,16 @@
-"""The highest places of the summed power maps, exactly, without the maps: branch and bound over cells of the grid.
+"""The highest points of the summed power maps, exactly, without the maps: branch and bound over cells of the grid.
 
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
-pair can add at any node of the cell; their sum bounds the cell, and a cell below the best node known need not be looked
-into (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer). Mostly some two thousand
-of millions of nodes are visited. The cells are of one size in metres, so memory does not grow with a finer grid.
+pair can add at any point of the cell; the sum of these maxima bounds the cell, and a cell whose bound is below the best
+power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
+Usually some two thousand of millions of points are visited. The size of a cell in metres is fixed, so memory does not
+grow with a finer grid.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,8 @@ import numpy as np
 from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd
 from livessl.core.geometry import Grid
-from livessl.core.kernels import kernels, with_numpy
+from livessl.core.kernels import kernels
+from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, SearchBounds, SearchCells, SearchRows
 from livessl.core.locate.refine import FindPeaks, Peak, box_around, laplace_covariance_m2
 from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
 from livessl.core.types import (
@@ -32,28 +33,20 @@ from livessl.core.types import (
 )
 
 CELL_M: Final = 0.2
-"""Edge of a cell, about; more where there would be more than `MOST_CELLS`."""
+"""Approximate edge of a cell, in metres; larger where there would be more than `MOST_CELLS`."""
 
 MOST_CELLS: Final = 50_000
+"""Approximate number of cells above which cells become larger, to bound the memory of the tables."""
 
 MOST_LOOK_UPS: Final = 3_000_000
-"""After so many a search is given up, some 5 ms compiled. Two arrays never need so many, nor do many that hear a sound
-well; many that hear nothing but noise do."""
+"""Look-ups after which a search gives up, some 5 ms compiled. Two arrays never need so many, nor do many arrays with a
+clear sound; many arrays with nothing but noise do."""
 
 MOST_HALVES_BYTES: Final = 64_000_000
-"""Cells are halved along each axis, before nodes are looked at, where the tables of that take no more."""
+"""Largest tables, in bytes, with which cells are halved along each axis before their points are examined."""
 
-CELLS_PER_TOP: Final = 4
-"""Cells along an edge of the cubes of cells that are bounded first."""
-
-
-class Rule(IntEnum):
-    """How the arrays' maps are joined. All are monotone in every map, which is what the bounds ask for."""
-
-    SUM = with_numpy.SUM
-    PRODUCT = with_numpy.PRODUCT
-    """Of the positive parts."""
-    MINIMUM = with_numpy.MINIMUM
+CELLS_PER_CUBE: Final = 4
+"""Cells along the edge of the cubes of cells that are bounded first."""
 
 
 class PeakSearch:
@@ -62,110 +55,119 @@ class PeakSearch:
     Parameters
     ----------
     arrays : sequence of ArraySpec
-        All that may take part.
+        All arrays that may take part.
     grid : Grid
     c_m_s : float
+        Speed of sound, m/s.
     """
 
     def __init__(self, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> None:
         self._grid = grid
         self._c_m_s = c_m_s
-        self._axes = [grid.axis_m(axis).astype(np.float32) for axis in range(3)]
+        x_m, y_m, z_m = (grid.axis_m(axis).astype(np.float32) for axis in range(3))
+        axes = (x_m, y_m, z_m)
         volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
         half = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / 2 / grid.spacing_m))
-        self._edge = 2 * half
-        self._cells = [-(-n // self._edge) for n in grid.shape]
-        self._tops = [-(-n // CELLS_PER_TOP) for n in self._cells]
+        edge = 2 * half
+        self._cubes = [-(-n // (CELLS_PER_CUBE * edge)) for n in grid.shape]
         self._specs = {spec.name: spec for spec in arrays}
         self._pairs = {spec.name: microphone_pairs(len(spec.microphones_m)) for spec in arrays}
         counts = [len(pairs) for pairs in self._pairs.values()]
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total = sum(counts)
-        tops = int(np.prod(self._tops))
-        children = CELLS_PER_TOP**3
-        self._halves = half > 1 and 2 * 8 * children * tops * total <= MOST_HALVES_BYTES
-        self._cell_places = np.zeros((tops, total, children), np.uint16)
-        self._leaf_places = np.zeros((tops * children, total, 8 if self._halves else 0), np.uint16)
-        self._top_places = np.zeros((total, tops), np.uint16)
-        self._top_bound = np.zeros(tops, np.float32)
-        self._cell_bound = np.zeros((tops, children), np.float32)
-        self._bounded = np.zeros(tops, np.bool_)
-        self._values, self._maxima = _Room(), _Room()
+        cubes = int(np.prod(self._cubes))
+        children = CELLS_PER_CUBE**3
+        self._halves = half > 1 and 2 * 8 * children * cubes * total <= MOST_HALVES_BYTES
+        self._cells = SearchCells(
+            axes=axes,
+            edge=edge,
+            per_cube=CELLS_PER_CUBE,
+            cell_places=np.zeros((cubes, total, children), np.uint16),
+            leaf_places=np.zeros((cubes * children, total, 8 if self._halves else 0), np.uint16),
+        )
+        self._cube_places = np.zeros((total, cubes), np.uint16)
+        self._bounds = SearchBounds(
+            of_cubes=np.zeros(cubes, np.float32),
+            of_cells=np.zeros((cubes, children), np.float32),
+            known=np.zeros(cubes, np.bool_),
+        )
+        self._values, self._maxima = _Buffer(), _Buffer()
         self._lags: dict[str, LagPlaces] = {}
-        self._sets: dict[tuple[str, ...], _Rows] = {}
+        self._sets: dict[tuple[str, ...], _Among] = {}
 
     def prepare(self, array: str, lags_s: FloatArray) -> None:
-        """Work out an array's intervals for a lag axis (L,), evenly spaced around zero.
+        """Compute an array's tables for a lag axis (L,), in seconds, evenly spaced around zero.
 
         Raises
         ------
         ValueError
-            Where the axis is longer than 16 bits can count.
+            If the axis has more lags than 16 bits can count.
         """
-        if len(lags_s) >= with_numpy.NO_LAG:
+        if len(lags_s) >= NO_LAG:
             raise ValueError(
-                f"array {array!r}: expected fewer than {with_numpy.NO_LAG} lags, got {len(lags_s)}; "
+                f"array {array!r}: expected fewer than {NO_LAG} lags, got {len(lags_s)}; "
                 "its microphones are too far apart for its sampling rate"
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         rows = slice(first, first + len(pairs))
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
-        edge = self._edge // 2 if self._halves else self._edge
-        small = [-(-len(axis_m) // edge) for axis_m in self._axes]
+        cells = self._cells
+        edge = cells.edge // 2 if self._halves else cells.edge
+        small = [-(-n // edge) for n in self._grid.shape]
         low, high = (np.empty((len(pairs), *small), np.uint16) for _ in range(2))
         kernels.cell_intervals(
-            *self._axes, spec.microphones_m.astype(np.float32), pairs.astype(np.int32), places.scale, places.offset,
+            cells.axes, spec.microphones_m.astype(np.float32), pairs.astype(np.int32), places.scale, places.offset,
             edge, low.reshape(len(pairs), -1), high.reshape(len(pairs), -1),
         )  # fmt: skip
-        block = _block(len(lags_s))
+        block = block_lags(len(lags_s))
         if self._halves:
-            children = CELLS_PER_TOP * 2
-            leaf_places = _by_cube(_run_places(low, high, block), self._tops, children)
-            split = leaf_places.reshape(len(pairs), -1, *(n for _ in range(3) for n in (CELLS_PER_TOP, 2)))
+            children = CELLS_PER_CUBE * 2
+            leaf_places = _by_cube(run_places(low, high, block), self._cubes, children)
+            split = leaf_places.reshape(len(pairs), -1, *(n for _ in range(3) for n in (CELLS_PER_CUBE, 2)))
             by_cell = split.transpose(1, 2, 4, 6, 0, 3, 5, 7)
-            self._leaf_places[:, rows] = by_cell.reshape(len(self._leaf_places), len(pairs), 8)
+            cells.leaf_places[:, rows] = by_cell.reshape(len(cells.leaf_places), len(pairs), 8)
             low, high = _extreme(low, 2, np.minimum), _extreme(high, 2, np.maximum)
-        places_of_cells = _by_cube(_run_places(low, high, block), self._tops, CELLS_PER_TOP)
-        self._cell_places[:, rows] = places_of_cells.swapaxes(0, 1)
-        low, high = _extreme(low, CELLS_PER_TOP, np.minimum), _extreme(high, CELLS_PER_TOP, np.maximum)
-        self._top_places[rows] = _run_places(low, high, block).reshape(len(pairs), -1)
+        places_of_cells = _by_cube(run_places(low, high, block), self._cubes, CELLS_PER_CUBE)
+        cells.cell_places[:, rows] = places_of_cells.swapaxes(0, 1)
+        low, high = _extreme(low, CELLS_PER_CUBE, np.minimum), _extreme(high, CELLS_PER_CUBE, np.maximum)
+        self._cube_places[rows] = run_places(low, high, block).reshape(len(pairs), -1)
         self._sets.clear()
 
-    def among(
-        self, evidence: Sequence[Evidence], rule: Rule = Rule.SUM, most_look_ups: int = MOST_LOOK_UPS
-    ) -> FindPeaks:
-        """What finds the peaks of some arrays' evidence; good until the next call.
+    @property
+    def table_bytes(self) -> int:
+        """Memory of the tables of all arrays, in bytes."""
+        return self._cells.cell_places.nbytes + self._cells.leaf_places.nbytes + self._cube_places.nbytes
+
+    def among(self, evidence: Sequence[Evidence], most_look_ups: int = MOST_LOOK_UPS) -> FindPeaks:
+        """Return a function that finds the peaks of some arrays' evidence; it is valid until the next call.
 
         Parameters
         ----------
         evidence : sequence of Evidence
-            At least one, in the order in which the maps are to be joined. Each array must have been prepared.
-        rule : Rule
+            At least one, in the order in which the maps are to be summed. Each array must have been prepared.
         most_look_ups : int
-            For each peak: the search is then given up, and the peak not proven to be the highest.
+            Look-ups for each peak after which the search gives up; the peak is then not proven to be the highest.
         """
-        rows = self._rows(tuple(heard.spec.name for heard in evidence))
-        values = self._values.of(len(rows.rows), rows.lags)
-        maxima = self._maxima.of(len(rows.rows), rows.runs)
-        for array, heard in enumerate(evidence):
+        among = self._among(tuple(part.spec.name for part in evidence))
+        rows = among.rows
+        values = self._values.of(len(rows.site_pair), among.lags)
+        maxima = self._maxima.of(len(rows.site_pair), among.runs)
+        for array, part in enumerate(evidence):
             own = slice(rows.first_row[array], rows.first_row[array + 1])
-            count = heard.gcc.values.shape[1]
-            values[own, :count], values[own, count:] = heard.gcc.values, 0.0
-        kernels.running_maxima(values, rows.block, maxima)
-        kernels.bounds(maxima, self._top_places, rows.rows, rows.first_row, rows.weight, int(rule), self._top_bound)
-        self._bounded[:] = False
+            count = part.gcc.values.shape[1]
+            values[own, :count], values[own, count:] = part.gcc.values, 0.0
+        kernels.running_maxima(values, among.block, maxima)
+        kernels.upper_bounds(maxima, self._cube_places, rows, self._bounds.of_cubes)
+        self._bounds.known[:] = False
 
         def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
+                left_out = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
                 node, power, proven = kernels.highest(
-                    values, maxima, rows.rows, rows.first_row, rows.weight, int(rule), self._cell_places,
-                    self._leaf_places, self._top_bound, self._cell_bound, self._bounded,
-                    *self._axes, self._edge, CELLS_PER_TOP,
-                    rows.microphones_m, rows.first_microphone, rows.pairs, rows.scale, rows.offset,
-                    np.array(boxes, dtype=np.int64).reshape(-1, 3, 2), most_look_ups,
-                )  # fmt: skip
+                    values, maxima, rows, self._cells, self._bounds, left_out, most_look_ups
+                )
                 if power == -np.inf:
                     break
                 found.append(Peak(int(node), float(power), bool(proven)))
@@ -174,23 +176,20 @@ class PeakSearch:
 
         return find
 
-    def _rows(self, arrays: tuple[str, ...]) -> _Rows:
+    def _among(self, arrays: tuple[str, ...]) -> _Among:
         if arrays not in self._sets:
             if len(self._sets) >= _SETS:
                 self._sets.clear()
-            self._sets[arrays] = self._new_rows(arrays)
+            self._sets[arrays] = self._new_set(arrays)
         return self._sets[arrays]
 
-    def _new_rows(self, arrays: tuple[str, ...]) -> _Rows:
+    def _new_set(self, arrays: tuple[str, ...]) -> _Among:
         specs, places = [self._specs[name] for name in arrays], [self._lags[name] for name in arrays]
         first_row = np.cumsum([0, *(len(self._pairs[name]) for name in arrays)])
-        rows = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
-        most = 1 + int(self._top_places[rows].max())
-        return _Rows(
-            lags=max(one.count for one in places),
-            runs=-(-most // with_numpy.BLOCKS) * with_numpy.BLOCKS,
-            block=np.repeat([_block(one.count) for one in places], np.diff(first_row)),
-            rows=rows,
+        site_pair = np.concatenate([self._first_row[n] + np.arange(len(self._pairs[n])) for n in arrays])
+        most = 1 + int(self._cube_places[site_pair].max())
+        rows = SearchRows(
+            site_pair=site_pair,
             first_row=first_row,
             weight=np.array([pair_weight(len(spec.microphones_m)) for spec in specs], np.float32),
             microphones_m=np.concatenate([spec.microphones_m for spec in specs]).astype(np.float32),
@@ -199,87 +198,96 @@ class PeakSearch:
             scale=np.array([one.scale for one in places]),
             offset=np.array([one.offset for one in places]),
         )
+        return _Among(
+            lags=max(one.count for one in places),
+            runs=-(-most // BLOCKS) * BLOCKS,
+            block=np.repeat([block_lags(one.count) for one in places], np.diff(first_row)),
+            rows=rows,
+        )
 
 
-class _Room:
-    """Memory to work in, the same for every set of arrays: as much as the largest asked for."""
+@dataclass(frozen=True, slots=True)
+class _Among:
+    """The rows of a search over one set of arrays, and their lengths.
+
+    Parameters
+    ----------
+    lags : int
+        Lags of the longest row.
+    runs : int
+        Places among the running maxima of a row that cells may refer to, in whole levels.
+    block : (R,) int64
+        Lags in a block of each row.
+    rows : SearchRows
+    """
+
+    lags: int
+    runs: int
+    block: IntArray
+    rows: SearchRows
+
+
+class _Buffer:
+    """Working memory that grows to the largest size requested and is used for every set of arrays."""
 
     def __init__(self) -> None:
         self._all = np.empty(0, np.float32)
 
     def of(self, rows: int, columns: int) -> Float32Array:
-        """An array (rows, columns) with anything in it."""
+        """Return an array (rows, columns) with arbitrary content."""
         if self._all.size < rows * columns:
             self._all = np.empty(rows * columns, np.float32)
         return self._all[: rows * columns].reshape(rows, columns)
 
 
-def _block(lags: int) -> int:
-    """How many lags of an axis make one of its blocks."""
-    return -(-lags // with_numpy.BLOCKS)
+def block_lags(lags: int) -> int:
+    """Lags in a block of an axis with so many lags."""
+    return -(-lags // BLOCKS)
 
 
-def _run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
-    """Where among the running maxima the shortest run is that begins in the block of `low` and holds `high`."""
+def run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
+    """Place among the running maxima of the shortest run that begins in the block of `low` and holds `high`."""
     first = low // block
     return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
 
 
 def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
-    """Of intervals' ends (P, X, Y, Z), the extremes over cubes with `count` an edge."""
+    """Extremes of intervals' ends (P, X, Y, Z) over cubes with `count` along an edge."""
     for axis in (1, 2, 3):
         ends = extreme.reduceat(ends, np.arange(0, ends.shape[axis], count), axis=axis)
     return ends
 
 
 def _by_cube(table: UInt16Array, cubes: Sequence[int], count: int) -> UInt16Array:
-    """A table (P, X, Y, Z) as (P, T, count^3): cube after cube, filled up with zeros where one reaches out."""
+    """Reorder a table (P, X, Y, Z) cube after cube, (P, T, count^3), with zeros for what lies outside the table."""
     padded = np.zeros((len(table), *(count * n for n in cubes)), table.dtype)
     padded[:, : table.shape[1], : table.shape[2], : table.shape[3]] = table
     split = padded.reshape(len(table), *(n for along in cubes for n in (along, count)))
     return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(len(table), -1, count**3)
 
 
-_PLACE_OF_LENGTH: Final = np.array(
-    [with_numpy.BLOCKS * np.searchsorted(with_numpy.RUNS, blocks) for blocks in range(with_numpy.BLOCKS + 1)], np.uint16
-)
+_PLACE_OF_LENGTH: Final = np.array([BLOCKS * np.searchsorted(RUNS, blocks) for blocks in range(BLOCKS + 1)], np.uint16)
+"""Place among the running maxima of the first run of each length, in blocks."""
 
 _SETS: Final = 16
-"""Sets of arrays that are kept ready."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """What a search over one set of arrays needs: see `with_numpy.highest`."""
-
-    lags: int
-    runs: int
-    block: IntArray
-    rows: IntArray
-    first_row: IntArray
-    weight: Float32Array
-    microphones_m: Float32Array
-    first_microphone: IntArray
-    pairs: IntArray
-    scale: Float32Array
-    offset: Float32Array
+"""Sets of arrays whose rows are kept ready."""
 
 
 def warm_up() -> None:
-    """Run every kernel once, so that nothing is compiled, or read from the compiler's cache, while somebody waits.
+    """Run every kernel once, so that nothing is compiled, or read from the compiler's cache, while a user waits.
 
-    Without a cache, the first time on a machine, it takes some seconds; else a fraction of one.
+    The first time on a machine this takes some seconds, later a fraction of one.
     """
     spec = ArraySpec("warm-up", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), (100.0, 6000.0))
     grid = Grid(((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)), 0.5)
     lags_s = np.arange(-200, 201) / 400_000.0
-    heard = Evidence(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
+    evidence = Evidence(spec, GCC(np.array([[0, 1]]), lags_s, np.ones((1, len(lags_s)), dtype=np.float32)))
     search = PeakSearch([spec], grid, 343.0)
     search.prepare(spec.name, lags_s)
-    search.among([heard])(2)
-    ear = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
-    ear.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
-    SRPMapper(spec, grid, heard.gcc.pairs, lags_s, 343.0)(heard.gcc)
-    functional = SRPFunctional([heard], 343.0)
+    search.among([evidence])(2)
+    front_end = OnsetFrontEnd(spec, 16_000.0, LagSampling.shared(spec.band_hz, 16_000.0, spec.aperture_m / 343.0))
+    front_end.push(np.zeros((2, 1600), dtype=np.float32), quiet=True)
+    SRPMapper(spec, grid, evidence.gcc.pairs, lags_s, 343.0)(evidence.gcc)
+    functional = SRPFunctional([evidence], 343.0)
     functional.value(np.zeros((1, 3)))
-    laplace_covariance_m2(functional, [heard], np.array([0.5, 0.5, 0.5]), grid)
+    laplace_covariance_m2(functional, [evidence], np.array([0.5, 0.5, 0.5]), grid)

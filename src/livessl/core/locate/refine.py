@@ -1,4 +1,4 @@
-"""The peak of a power map: found on the grid, refined below it, with a covariance and a confidence."""
+"""Peaks of power maps: found in a whole map, refined below the grid, with a covariance and a margin."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
 from livessl.core.types import BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 CANDIDATES: Final = 2
-"""Nodes followed to the top: between two nodes a lower one on the grid may be the higher one in truth."""
+"""Grid points that are refined: of two tops between grid points, the one with the lower grid point may be higher."""
 
 RIVAL_DISTANCE_M: Final = 1.0
-"""A second peak is another place if it is further away than this."""
+"""Distance, in metres, beyond which a second peak is another place."""
 
 _NEWTON_STEPS: Final = 30
+"""Most Newton steps of one climb; a few suffice."""
+
 _CONVERGED_M: Final = 1e-4
-"""Steps below a tenth of a millimetre change nothing that anyone could measure."""
+"""Shortest step, in metres: a tenth of a millimetre cannot be measured."""
 
 _SUBDIVISIONS: Final = 4
+"""Parts into which a cell's edge is divided to find the start of a climb."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A node and the fused power there; and whether it is known to be the highest, or only of what was looked at."""
+    """A grid point, the fused power there, and whether it is proven to be the highest, not only of those examined."""
 
     node: int
     power: float
@@ -38,18 +41,18 @@ class Peak:
 
 
 class FindPeaks(Protocol):
-    """Finds the highest nodes, best first: each the highest of those far enough from the ones before it."""
+    """Finds the highest grid points, best first: each is the highest of those far enough from the ones before it."""
 
     def __call__(self, count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
-        """Up to `count` peaks that differ by more than `apart_nodes` along some axis, none of them in a box.
+        """Find up to `count` peaks that differ by more than `apart_nodes` along some axis, none of them in a box.
 
-        Boxes (3, 2) are the first and last node along each axis. Of equal nodes the first in the grid's order is taken.
+        A box (3, 2) is the first and last point along each axis. The first of equal points in the grid's order wins.
         """
         ...
 
 
 def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
-    """What finds the peaks of a whole map (G,)."""
+    """Return a function that finds the peaks of a whole map (G,)."""
 
     def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
         left = power.reshape(grid.shape).copy()
@@ -70,15 +73,16 @@ def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
 
 
 def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
-    """First and last node along each axis (3, 2) of what lies at most so many nodes from one."""
+    """Return the box (3, 2) of points at most `apart_nodes` from one along each axis: the first and last of each."""
     at = np.array(np.unravel_index(node, grid.shape))
     return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
 
 
 def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
-    """Nodes (3, 2), first and last along each axis, that are the same place as a position; 1 and 0 where there is none.
+    """Return the box (3, 2) of points that are the same place as a position: the first and last along each axis.
 
-    That is at most `RIVAL_DISTANCE_M` away along every axis, or a quarter of the volume's size where that is less.
+    It reaches `RIVAL_DISTANCE_M` along every axis, or a quarter of the volume's longest edge if that is less. Along an
+    axis without such points it is (1, 0).
     """
     reach_m = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
     box = np.empty((3, 2), dtype=np.int64)
@@ -89,15 +93,15 @@ def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
 
 
 def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
-    """From nodes to the highest top near any of them.
+    """Find the highest top near any of some grid points.
 
-    A finer local grid around every start, all looked at in one go; from the best place on each, Newton steps that only
-    ever go up.
+    Around every start a finer local grid is examined; from its best point Newton steps climb, and only upwards.
 
     Parameters
     ----------
     functional : SRPFunctional
     starts_m : (N, 3) or (3,) float64
+        Metres.
     grid : Grid
 
     Returns
@@ -115,7 +119,7 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple
 
 
 def _offsets_m(grid: Grid) -> FloatArray:
-    """A cell's finer local grid, relative to its node: (n, 3)."""
+    """Finer local grid of a cell, relative to its centre: (n, 3), metres."""
     fraction = np.linspace(-0.5, 0.5, _SUBDIVISIONS + 1)
     offsets = [fraction * edge if edge > 0 else np.zeros(1) for edge in grid.cell_m]
     return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
@@ -147,7 +151,7 @@ def _climb(functional: SRPFunctional, position_m: FloatArray, value: float, grid
 
 
 def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Newton step with every curvature taken as a hill's, so that it leads up from a saddle, too."""
+    """Newton step with every curvature taken as negative, so that it leads up from a saddle as well."""
     eigenvalues, eigenvectors = np.linalg.eigh(hessian)
     strength = np.maximum(np.abs(eigenvalues), 1e-3 * np.abs(eigenvalues).max(initial=0.0) + 1e-12)
     return np.asarray(eigenvectors @ ((eigenvectors.T @ gradient) / strength))
@@ -160,12 +164,12 @@ def rival_power(find: FindPeaks, grid: Grid, position_m: FloatArray) -> float:
 
 
 def margin(power: float, rival_power: float) -> float:
-    """How far a place stands out from the best other one: 1 - (power there) / (power here), 0 to 1."""
+    """Margin of a place over the best other one: 1 - (power there) / (power here), 0 to 1."""
     return float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
 
 
 def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
-    """How far the peak stands out: its `margin` over the highest power outside its `neighbourhood`."""
+    """Confidence that is no probability: the peak's `margin` over the highest power outside its `neighbourhood`."""
     return margin(first.power, rival_power(find, grid, position_m))
 
 
@@ -178,28 +182,28 @@ def laplace_covariance_m2(
     peak, s^2 their mean square over the other lags, which holds noise and reflections alike. It follows from
     var(tau) = s^2 kappa / (g kappa)^2, kappa the mean square angular frequency: noise of power s^2 and slope variance
     s^2 kappa moves a peak of curvature g kappa. The prior is the search volume's own variance, L^2/12 along each axis,
-    so that what the arrays cannot tell stays as wide as the volume and no wider.
+    so that a coordinate that the arrays do not determine is as uncertain as the volume is wide.
     """
     axes = list(grid.free_axes)
     information = np.diag(12.0 / np.maximum(grid.upper_m - grid.lower_m, 1e-9) ** 2)
-    for heard, term in zip(evidence, functional.pair_terms(position_m), strict=True):
+    for part, term in zip(evidence, functional.pair_terms(position_m), strict=True):
         hill = np.maximum(-term.curvature, 0.0)
-        weight = pair_weight(len(heard.spec.microphones_m))
+        weight = pair_weight(len(part.spec.microphones_m))
         curvature = weight * (term.gradient_s_m.T * hill) @ term.gradient_s_m
-        information += _scale(heard, term) * curvature
+        information += _scale(part, term) * curvature
     covariance = np.zeros((3, 3))
     if axes:
         covariance[np.ix_(axes, axes)] = np.linalg.inv(information[np.ix_(axes, axes)])
     return covariance
 
 
-def noise(heard: Evidence, term: PairTerms, live: BoolArray) -> float:
+def noise(evidence: Evidence, term: PairTerms, live: BoolArray) -> float:
     """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
-    lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(heard.spec.band_hz))
-    return float(kernels.mean_square(heard.gcc.values[live], heard.gcc.lags_s, term.lags_s[live], lobe_s))
+    lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(evidence.spec.band_hz))
+    return float(kernels.mean_square(evidence.gcc.values[live], evidence.gcc.lags_s, term.lags_s[live], lobe_s))
 
 
-def _scale(heard: Evidence, term: PairTerms) -> float:
-    elsewhere = noise(heard, term, np.ones(len(heard.gcc.values), dtype=np.bool_))
+def _scale(evidence: Evidence, term: PairTerms) -> float:
+    elsewhere = noise(evidence, term, np.ones(len(evidence.gcc.values), dtype=np.bool_))
     height = float(term.values.mean())
     return max(height, 0.0) / elsewhere if elsewhere > 0 else 0.0

@@ -1,74 +1,83 @@
-"""A second source that sounds at the same time: what one place explains of the arrays' evidence is taken out of it.
+"""Finds a second source that sounds at the same time, after removing from the evidence what the first one explains.
 
-All pairs of an array hear a source with one spectrum, so its share of their GCCs is one even function of lag, shifted
-to each pair's delay. The mean over the pairs around their delays tells it, moment by moment; what is left is of the
-others, and of reverberation. A moment in which much was said leaves much of that behind, so its rest counts for less: a
-second source is often heard best while the first is silent. What tells it from what reverberation leaves is that in
-some moment it stands out from all that is heard. It knows no sound.
+All pairs of an array receive a source with one spectrum, so its share of their GCCs is one even function of lag,
+shifted to each pair's delay. The mean over the pairs around their delays gives that share frame by frame. What remains
+comes from other sources and from reverberation. A loud frame leaves much behind, so the remainder of a frame counts
+less the louder it is: a second source often stands out best while the first is silent. A source differs from what
+reverberation leaves in that it is prominent in some frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
+from livessl.core.correlate.gcc_phat import LagSampling
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
+from livessl.core.geometry import Grid, microphone_pairs
+from livessl.core.locate import refine
+from livessl.core.locate.peak_search import PeakSearch
+from livessl.core.locate.place import Place
+from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 APART_M: Final = 1.0
-"""Two places nearer than this are one."""
+"""Distance, in metres, below which two places are one source."""
 
-MOST_MOMENTS: Final = 40
-"""Moments kept apart; those of a longer sound are put together, so that a long one takes no more room and time."""
+MAX_FRAMES: Final = 40
+"""Most frames that are kept apart; those of a longer sound are merged, so that memory and time do not grow with it."""
 
 CANDIDATES: Final = 6
-"""Places looked at for each source; the right one is hardly ever further down."""
+"""Places examined for each source; the right one is hardly ever further down."""
 
 CANDIDATES_APART_M: Final = 0.5
-"""Between these, along each axis."""
+"""Least distance between candidates along one of the axes, in metres."""
 
 LITTLE: Final = 200.0
-"""Weight of a moment's onsets below which it is mostly noise, and counts the less: noise at 10 dB gives some 30, a
-source in a clear moment thousands."""
+"""Onset weight of a frame below which it is mostly noise and counts less: noise at 10 dB gives some 30, a source in a
+clear frame thousands."""
 
 LEAST_CONFIDENCE: Final = 0.5
-"""Below it a second source is not told of."""
+"""Confidence below which a second source is not reported."""
 
 LEAST_PROSPECT: Final = 0.1
-"""What is less likely than this to be a second source, at first sight, is not looked at closer."""
+"""Confidence at first sight below which a second source is not examined further."""
 
-_LOGISTIC: Final = (-11.6, 6.9)
-"""Intercept and weight of the clearness in the log-odds of a second source at a place; fitted to 800 pairs of sounds
-and 800 single ones of the development half, of two arrays and of four, RT60 0.4 to 2 s at 20 and 10 dB."""
+_PROMINENCE_FIT: Final = (-11.6, 6.9)
+"""Log-odds of a second source at a place: intercept, weight of the prominence. Fitted to the pairs of sounds and the
+single sounds of the development half."""
 
 
-def clearness(of_arrays: Sequence[float]) -> float:
-    """Of a place, by each array's `Moments.clearness`: two lines make it, so it is the mean of the two highest."""
+def prominence(of_arrays: Sequence[float]) -> float:
+    """Prominence of a place from each array's `FrameGCCs.prominence`: the mean of the two highest.
+
+    Two lines of sight determine a place.
+    """
     return float(np.mean(sorted(of_arrays)[-2:]))
 
 
-def confidence(clearness: float) -> float:
-    """Probability that there is a second source, and at this place, by the place's `clearness`."""
-    intercept, slope = _LOGISTIC
-    return float(1.0 / (1.0 + np.exp(-(intercept + slope * clearness))))
+def confidence(prominence: float) -> float:
+    """Probability that there is a second source at a place of this `prominence`."""
+    intercept, slope = _PROMINENCE_FIT
+    return float(1.0 / (1.0 + np.exp(-(intercept + slope * prominence))))
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
-    """One array's evidence, moment by moment.
+class FrameGCCs:
+    """One array's correlations frame by frame.
 
     Parameters
     ----------
     spec : ArraySpec
     lags_s : (L,) float64
+        Seconds.
     values : (F, P, L) float32
-        Of each moment, not normalised.
+        GCCs of the frames, not normalised.
     weights : (F,) float64
-        Of each moment's onsets.
+        Onset weight of each frame.
     """
 
     spec: ArraySpec
@@ -77,9 +86,12 @@ class Moments:
     weights: FloatArray
 
     @classmethod
-    def of(cls, spec: ArraySpec, sampling: LagSampling, frames: Sequence[OnsetGCC], live: BoolArray) -> Moments:
-        """From what a listener made of an array's frames, no envelopes; pairs that are not `live` (P,) are silent."""
-        size = -(-len(frames) // MOST_MOMENTS)
+    def of(cls, spec: ArraySpec, sampling: LagSampling, frames: Sequence[OnsetGCC], live: BoolArray) -> FrameGCCs:
+        """Interpolate an array's onset GCCs, which must not be envelopes.
+
+        Pairs that are not `live` (P,) become zeros.
+        """
+        size = -(-len(frames) // MAX_FRAMES)
         together = [summed(frames[first : first + size]) for first in range(0, len(frames), size)]
         whole = summed(together)
         even = live[:, None] * np.float32(whole.weight) / whole.heights(microphone_pairs(len(spec.microphones_m)))
@@ -88,7 +100,7 @@ class Moments:
         return cls(spec, sampling.fine_lags_s, fine, np.array([one.weight for one in together]))
 
     def without(self, delays_s: FloatArray) -> Evidence:
-        """What is left when a source at these delays of the pairs (P,) is taken out."""
+        """Evidence that remains when a source at these delays of the pairs (P,), in seconds, is removed."""
         share, starts = self._share(delays_s)
         count, live = len(self.lags_s), self._live
         scale = 1.0 / np.maximum(self.weights, LITTLE)
@@ -99,19 +111,18 @@ class Moments:
             values[pair] -= weighed[starts[pair] : starts[pair] + count]
         return Evidence(self.spec, GCC(microphone_pairs(len(self.spec.microphones_m)), self.lags_s, values))
 
-    def clearness(self, delays_s: FloatArray, without_s: FloatArray) -> float:
-        """How high a source at some delays (P,) stands without that at others, in the moment where it is clearest.
+    def prominence(self, delays_s: FloatArray, without_s: FloatArray) -> float:
+        """Prominence of a source at delays (P,) after removing the one at delays `without_s`, in its clearest frame.
 
-        It is the mean height over the pairs over the root mean square of all that is heard in that moment, of both
-        sources.
+        It is the mean height over the pairs, over the root mean square of the frame's GCCs with both sources.
         """
         share, starts = self._share(without_s)
         at, live = self._nearest(delays_s), self._live
         if not len(live):
             return 0.0
         heights = (self.values[:, live, at[live]] - share[:, starts[live] + at[live]]).mean(axis=1)
-        heard = self.values[:, live]
-        rms = np.sqrt(np.einsum("fpl,fpl->f", heard, heard) / (heard.shape[1] * heard.shape[2]))
+        both = self.values[:, live]
+        rms = np.sqrt(np.einsum("fpl,fpl->f", both, both) / (both.shape[1] * both.shape[2]))
         return float((heights / np.maximum(rms, 1e-9)).max())
 
     @property
@@ -124,15 +135,90 @@ class Moments:
         return np.asarray(np.clip(places, 0, len(self.lags_s) - 1))
 
     def _share(self, delays_s: FloatArray) -> tuple[Float32Array, IntArray]:
-        """Share of a source at these delays (P,) in each moment, (F, 2 L - 1), and where in it a pair's begins, (P,).
+        """Share of a source at delays (P,) in each frame, (F, 2 L - 1), and where in it each pair's lags begin, (P,).
 
-        It is r(t) = mean over pairs of [R_p(tau_p + t) + R_p(tau_p - t)] / 2, t as far as the lags reach.
+        The share is r(t) = mean over pairs of [R_p(tau_p + t) + R_p(tau_p - t)] / 2, t as far as the lags reach.
         """
-        moments, _, count = self.values.shape
-        share = np.zeros((moments, 2 * count - 1), dtype=np.float32)
+        frames, _, count = self.values.shape
+        share = np.zeros((frames, 2 * count - 1), dtype=np.float32)
         terms = np.zeros(2 * count - 1, dtype=np.float32)
         starts = count - 1 - self._nearest(delays_s)
         for pair in self._live:
             share[:, starts[pair] : starts[pair] + count] += self.values[:, pair]
             terms[starts[pair] : starts[pair] + count] += 1.0
         return (share + share[:, ::-1]) / np.maximum(terms + terms[::-1], 1.0), starts
+
+
+@dataclass(frozen=True, slots=True)
+class TwoSources:
+    """Two places at which sources sounded at the same time, and the confidence that the second one is a source."""
+
+    first: Place
+    second: Place
+    confidence: float
+
+
+class SecondSourceSearch:
+    """Searches for a second source beside a known one.
+
+    Parameters
+    ----------
+    search : PeakSearch
+    grid : Grid
+        Grid of the search.
+    c_m_s : float
+        Speed of sound, m/s.
+    """
+
+    def __init__(self, search: PeakSearch, grid: Grid, c_m_s: float) -> None:
+        self._search = search
+        self._grid = grid
+        self._c_m_s = c_m_s
+
+    def find(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources | None:
+        """Find a second source; None if there is none.
+
+        The first source is removed and the second searched for; with the second removed the first is searched for
+        again, and then the second once more.
+
+        Parameters
+        ----------
+        first : Place
+            The place of all evidence.
+        frames : sequence of FrameGCCs
+            Frames of the same arrays in the same order.
+        """
+        second, prospect = self.beside(first, frames)
+        if prospect < LEAST_PROSPECT:
+            return None
+        again, _ = self.beside(second, frames)
+        second, confidence = self.beside(again, frames)
+        if confidence < LEAST_CONFIDENCE or not second.proven or again.apart_m(second) < APART_M:
+            return None
+        return TwoSources(again, second, confidence)
+
+    def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, float]:
+        """Most likely other place once the source at `place` is removed, and the confidence that it is a source.
+
+        Of the candidates with the highest power, the one with the highest product of power and prominence wins.
+        """
+        delays_s = [term.lags_s for term in place.functional.pair_terms(place.position_m)]
+        evidence = tuple(each.without(taken_s) for each, taken_s in zip(frames, delays_s, strict=True))
+        find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
+        known = [refine.neighbourhood(place.position_m, self._grid)]
+        apart_nodes = round(CANDIDATES_APART_M / self._grid.spacing_m)
+        best, chosen = 0.0, (place, 0.0)
+        for _ in range(CANDIDATES):
+            found = find(1, without=known)
+            if not found:
+                break
+            position_m, power = refine.refine(functional, self._grid.node_m(found[0].node), self._grid)
+            terms = functional.pair_terms(position_m)
+            each = zip(frames, terms, delays_s, strict=True)
+            prominent = prominence([one.prominence(term.lags_s, taken_s) for one, term, taken_s in each])
+            if power * prominent > best:
+                candidate = Place(evidence, functional, position_m, power, power, found[0].proven)
+                best, chosen = power * prominent, (candidate, confidence(prominent))
+            known.append(refine.box_around(self._grid, found[0].node, apart_nodes))
+        other, other_confidence = chosen
+        return replace(other, rival_power=refine.rival_power(find, self._grid, other.position_m)), other_confidence

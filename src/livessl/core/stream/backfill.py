@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.locate.estimators import Estimator
+from livessl.core.locate.estimator import Estimator
 from livessl.core.stream.evidence import BackfilledSound
 from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
@@ -147,7 +147,7 @@ def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: in
     loud = [frame for frame_index, frame in zip(indices, frames, strict=True) if frame_index >= start]
     if not loud or len({frame.sample_rate_hz for frame in frames}) > 1:
         return None
-    front_end = estimator.listener(frames[0].array, frames[0].sample_rate_hz)
+    front_end = estimator.onset_front_end(frames[0].array, frames[0].sample_rate_hz)
     if front_end is None:
         return None
     pushed = zip(indices, frames, strict=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
-from livessl.core.locate.estimators import Estimator
+from livessl.core.locate.estimator import Estimator
 from livessl.core.types import Frame
 
 CACHED_FRAMES: Final = 4096
@@ -104,7 +104,7 @@ class CorrelationCache:
         self, array: str, sample_rate_hz: float, frame_indices: range, frames: Mapping[int, Frame]
     ) -> OnsetFrontEnd | None:
         """Make a front end and push what is left of a run; None where the estimator uses no front end."""
-        front_end = self._estimator.listener(array, sample_rate_hz)
+        front_end = self._estimator.onset_front_end(array, sample_rate_hz)
         if front_end is not None:
             for frame_index in frame_indices:
                 frame = frames.get(frame_index)

@@ -13,7 +13,7 @@ from typing import Final, overload
 import numpy as np
 
 from livessl.core.correlate.onset_gcc import OnsetGCC
-from livessl.core.locate.estimators import Sound
+from livessl.core.locate.estimator import Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_stream import ArrayStream

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Final
 
-from livessl.core.locate.estimators import PowerMaps
+from livessl.core.locate.estimator import PowerMaps
 from livessl.core.stream.alignment import EARLIEST_NS, LATEST_NS
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.stream.fusion import Fusion, Role

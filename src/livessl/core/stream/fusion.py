@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from livessl.core.locate.estimators import PowerMaps
+from livessl.core.locate.estimator import PowerMaps
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.stream.event_reporter import EventReporter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from livessl.core.locate.estimators import Localization
+from livessl.core.locate.estimator import Localization
 
 VOTES: Final = 10
 """Number of last events that an array's votes are kept of."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from livessl.core.locate.estimators import Estimator
+from livessl.core.locate.estimator import Estimator
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
 from livessl.core.stream.outlier_votes import OutlierVotes

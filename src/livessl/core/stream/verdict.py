@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.geometry import direction_deg
-from livessl.core.locate.estimators import Localization
+from livessl.core.locate.estimator import Localization
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
 from livessl.core.stream.site_state import SiteState
@@ -43,7 +43,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
     if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
         return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
-    if found.features is not None and not found.features.tell_direction:
+    if found.features is not None and not found.features.has_direction:
         return Status.REFUSED, "no direction stands out in the sound"
     who = "one array" if len(specs) == 1 else "these arrays"
     return Status.DIRECTION_ONLY, f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"

@@ -18,9 +18,10 @@ from livessl.clock import Clock
 from livessl.core.correlate.gcc_phat import GCCPhat, correlated
 from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.kernels import kernels
-from livessl.core.locate.estimators import Sound, SrpPhat
-from livessl.core.locate.peak_search import PeakSearch, Rule
+from livessl.core.locate.estimator import Sound
+from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPMapper
+from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 from livessl.simulation.room import impulse_responses
 from livessl.simulation.sounds import voice
@@ -258,7 +259,7 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[Case]
                 )
         yield Case(
             f"samples to peak, {arrays[0]} arrays, {spacing_m:g} m, voice",
-            lambda n, search=search: search.among(evidence("voice", n, arrays[0]), Rule.SUM)(1),  # type: ignore[misc]
+            lambda n, search=search: search.among(evidence("voice", n, arrays[0]))(1),  # type: ignore[misc]
         )
     grid = Grid(room, 0.1)
     specs = most[: arrays[0]]

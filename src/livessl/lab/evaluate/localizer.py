@@ -14,11 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from scipy.optimize import minimize
 
 from livessl.core.geometry import angle_deg
-from livessl.core.locate.confidence import ConfidenceFeatures
-from livessl.core.locate.estimators import ESTIMATORS, Estimator, Sound
+from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
@@ -165,7 +163,7 @@ class LocalizerPosition:
         return specs, self._rightly_placed[case.c_m_s]
 
     def _estimators(self, specs: Sequence[ArraySpec], c_m_s: float) -> dict[str, Estimator]:
-        return {method: ESTIMATORS[method](specs, self._grid, c_m_s) for method in METHODS}
+        return {method: create(method, specs, self._grid, c_m_s) for method in METHODS}
 
 
 class _Ear:
@@ -196,7 +194,7 @@ def heard(
     """
     frame = round(FRAME_S * sample_rate_hz)
     segments = tuple(samples[:, start * frame : stop * frame] for start, stop in runs(active))
-    listener = estimator.listener(spec.name, sample_rate_hz)
+    listener = estimator.onset_front_end(spec.name, sample_rate_hz)
     if listener is None:
         return Sound(segments, sample_rate_hz)
     loud = np.flatnonzero(active)
@@ -227,26 +225,6 @@ def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, f
     return intercept, of_margin, of_standing
 
 
-def rivals_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float]:
-    """Intercept and weight of the margin of what tells that no other place is as good, given how well it is heard.
-
-    Parameters are those of `development_fit`, of events of which the arrays may tell nothing but directions.
-    """
-    right = np.asarray(columns["error_m"]) <= near_m
-    features = [
-        ConfidenceFeatures(float(m), float(s)) for m, s in zip(columns["margin"], columns["standing"], strict=True)
-    ]
-    log_heard, margin = np.log([each.heard for each in features]), np.array([each.margin for each in features])
-
-    def surprise(constants: FloatArray) -> float:
-        log_likely = log_heard - np.logaddexp(0.0, -constants[0] - constants[1] * margin)
-        log_unlikely = np.log(-np.expm1(np.minimum(log_likely, -1e-12)))
-        return float(-np.where(right, log_likely, log_unlikely).mean())
-
-    intercept, of_margin = minimize(surprise, [0.0, 20.0], method="Nelder-Mead").x
-    return float(intercept), float(of_margin)
-
-
 def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
     """What an estimator makes of an event, and how far that is from the truth."""
     found = estimator.locate(sounds)
@@ -266,7 +244,7 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
     row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
     row |= {f"found_{axis}_m": value for axis, value in zip("xyz", found.position_m, strict=True)}
     if found.features is not None:
-        row |= {"confidence": found.confidence, "margin": found.features.margin, "standing": found.features.standing}
+        row |= {"confidence": found.confidence, "margin": found.features.margin, "standing": found.features.peak_to_rms}
     return row
 
 

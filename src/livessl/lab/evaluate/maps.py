@@ -11,7 +11,7 @@ import numpy as np
 
 from livessl.core.correlate.gcc_phat import OVERSAMPLING
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimators import third_octaves_below_hz
+from livessl.core.locate.map_estimator import third_octaves_below_hz
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray

@@ -61,17 +61,6 @@ def angle_error_deg(
     return np.asarray(np.degrees(direction) - np.asarray(angle_deg, dtype=np.float64))
 
 
-def small_angle_error_deg(
-    angle_deg: ArrayLike, spacing_m: ArrayLike, sample_rate_hz: float, c_m_s: float = 343.0
-) -> FloatArray:
-    """The same for errors that are small: c/(fs d sqrt 12 cos theta), in degrees; infinite along the pair's line."""
-    lag, cosine = np.broadcast_arrays(
-        _lag_error(spacing_m, sample_rate_hz, c_m_s), np.abs(np.cos(np.radians(angle_deg)))
-    )
-    error = np.divide(lag, cosine, out=np.full(lag.shape, np.inf), where=cosine > 1e-12)
-    return np.asarray(np.degrees(error))
-
-
 def _lag_error(spacing_m: ArrayLike, sample_rate_hz: float, c_m_s: float) -> FloatArray:
     spacing = np.asarray(spacing_m, dtype=np.float64)
     if not (spacing > 0).all():

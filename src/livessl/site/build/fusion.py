@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from livessl.core.locate.estimators import ESTIMATORS, Estimator
+from livessl.core.locate.estimator import Estimator, create
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
@@ -24,7 +24,7 @@ def make_clock_offsets(site: Site) -> ClockOffsets:
 
 def make_estimator(site: Site, method: str | None = None) -> Estimator:
     """Return a new estimator of a site's arrays: the site's method, or another of `METHODS`."""
-    return ESTIMATORS[method or site.fusion.method](site.processed, search_grid(site), site.c_m_s)
+    return create(method or site.fusion.method, site.processed, search_grid(site), site.c_m_s)
 
 
 def make_fusion(

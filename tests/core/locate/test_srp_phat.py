@@ -1,4 +1,4 @@
-"""From sounds to a place: right, and wrong as soon as a sign, a unit or a channel is."""
+"""SRP-PHAT finds the source, and misses it as soon as a sign, a unit or a channel is wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from livessl.core.geometry import Grid, circle, posed
-from livessl.core.locate.estimators import ESTIMATORS, Localization, Sound, SrpPhat
+from livessl.core.locate.estimator import Localization, Sound
+from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.types import ArraySpec, FloatArray
 
 BOUNDS_M = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
@@ -21,8 +22,8 @@ NORTH = tetra("north", [2.7, 4.2, 1.3])
 SOUTH = tetra("south", [2.3, 1.1, 1.5], yaw_deg=71.0)
 SOURCE_M = np.array([1.13, 3.31, 1.47])
 
-# Lags are exact to a hundredth of a fine lag (derived at their own test), 27 um of way: over 0.3 m that is 90 urad,
-# 0.2 mm at 2.5 m; five times that where directions cross flat.
+# Lags are exact to a hundredth of a fine lag (derived in test_gcc_phat), 27 um of sound path: over 0.3 m that is
+# 90 urad, 0.2 mm at 2.5 m; five times that where directions cross at a small angle.
 NEAR_M = 0.001
 
 
@@ -43,14 +44,9 @@ def error_m(found: Localization, source_m: FloatArray = SOURCE_M) -> float:
     return float(np.linalg.norm(found.position_m - source_m))
 
 
-def test_it_has_a_name() -> None:
-    assert ESTIMATORS["srp-phat"] is SrpPhat
-    assert SrpPhat.name == "srp-phat"
-
-
 @settings(deadline=None, max_examples=15)
 @given(seed=st.integers(0, 10**6))
-def test_place_is_found_well_below_the_grid(seed: int, estimator: SrpPhat) -> None:
+def test_the_position_is_much_finer_than_the_grid(seed: int, estimator: SrpPhat) -> None:
     source_m = np.random.default_rng(seed).uniform([0.3, 2.0, 0.4], [1.6, 3.6, 2.3])
     found = estimator.locate(sounds_from(source_m, seed=seed))
     assert error_m(found, source_m) < NEAR_M
@@ -71,7 +67,7 @@ def test_maps_are_drawn_from_the_evidence(estimator: SrpPhat) -> None:
 
 
 @pytest.mark.parametrize("band_limit", [False, True])
-def test_maps_are_limited_as_the_search_was(band_limit: bool) -> None:
+def test_maps_use_the_band_limit_of_the_search(band_limit: bool) -> None:
     coarse, unlimited = (SrpPhat([NORTH, SOUTH], Grid(BOUNDS_M, 0.3), C_M_S, band_limit=b) for b in (band_limit, False))
     found = coarse.locate(sounds_from(SOURCE_M))
     limited = coarse.power_maps(found.evidence).fused
@@ -79,7 +75,7 @@ def test_maps_are_limited_as_the_search_was(band_limit: bool) -> None:
     assert np.array_equal(limited, whole) is not band_limit
 
 
-def test_channels_in_another_order_are_another_place(estimator: SrpPhat) -> None:
+def test_swapped_channels_give_another_position(estimator: SrpPhat) -> None:
     sounds = sounds_from(SOURCE_M)
     assert error_m(estimator.locate(sounds)) < NEAR_M
     for order in ([1, 0, 2, 3], [0, 1, 3, 2], [3, 2, 1, 0]):
@@ -87,14 +83,14 @@ def test_channels_in_another_order_are_another_place(estimator: SrpPhat) -> None
         assert error_m(estimator.locate(swapped)) > 0.3
 
 
-def test_channels_and_microphones_in_another_order_are_the_same_place() -> None:
+def test_channels_and_microphones_swapped_alike_give_the_same_position() -> None:
     order = np.array([2, 0, 3, 1])
     moved = [ArraySpec(spec.name, spec.microphones_m[order], BAND_HZ) for spec in (NORTH, SOUTH)]
     sounds = {name: Sound((s.segments[0][order],), RATE_HZ) for name, s in sounds_from(SOURCE_M).items()}
     assert error_m(SrpPhat(moved, GRID, C_M_S).locate(sounds)) < NEAR_M
 
 
-def test_each_array_has_its_own_place(estimator: SrpPhat) -> None:
+def test_swapped_arrays_give_another_position(estimator: SrpPhat) -> None:
     sounds = sounds_from(SOURCE_M)
     assert error_m(estimator.locate({"north": sounds["south"], "south": sounds["north"]})) > 0.3
 
@@ -106,7 +102,7 @@ def test_speed_of_sound_is_used(estimator: SrpPhat) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [22050.0, 44100.0, 48000.0])
-def test_any_sampling_rate_gives_the_same_place(estimator: SrpPhat, rate_hz: float) -> None:
+def test_any_sampling_rate_gives_the_same_position(estimator: SrpPhat, rate_hz: float) -> None:
     at_this, at_16 = sounds_from(SOURCE_M, rate_hz), sounds_from(SOURCE_M)
     assert error_m(estimator.locate(at_this)) < NEAR_M
     assert error_m(estimator.locate({"north": at_this["north"], "south": at_16["south"]})) < NEAR_M
@@ -114,7 +110,7 @@ def test_any_sampling_rate_gives_the_same_place(estimator: SrpPhat, rate_hz: flo
     assert error_m(estimator.locate(wrong)) > 5 * NEAR_M
 
 
-def test_metres_are_absolute() -> None:
+def test_positions_are_absolute() -> None:
     shift = np.array([10.0, -3.0, 1.0])
     x, y, z = ((low + d, high + d) for (low, high), d in zip(BOUNDS_M, shift, strict=True))
     moved = [ArraySpec(spec.name, spec.microphones_m + shift, BAND_HZ) for spec in (NORTH, SOUTH)]
@@ -128,7 +124,7 @@ def results(found: Localization) -> list[bytes]:
     return [array.tobytes() for array in arrays]
 
 
-def test_order_of_the_arrays_does_not_matter_to_the_last_bit(estimator: SrpPhat) -> None:
+def test_the_order_of_the_arrays_does_not_change_a_bit(estimator: SrpPhat) -> None:
     sounds = sounds_from(SOURCE_M)
     turned: Mapping[str, Sound] = dict(reversed(sounds.items()))
     assert results(estimator.locate(sounds)) == results(estimator.locate(turned))
@@ -137,7 +133,7 @@ def test_order_of_the_arrays_does_not_matter_to_the_last_bit(estimator: SrpPhat)
     assert results(estimator.locate(sounds_from(SOURCE_M, seed=1))) != results(estimator.locate(sounds))
 
 
-def test_preparing_changes_nothing() -> None:
+def test_prepare_does_not_change_the_answer() -> None:
     sounds = sounds_from(SOURCE_M)
     made = SrpPhat([NORTH, SOUTH], GRID, C_M_S)
     made.prepare("north", RATE_HZ)
@@ -145,13 +141,13 @@ def test_preparing_changes_nothing() -> None:
     assert results(made.locate(sounds)) == results(SrpPhat([NORTH, SOUTH], GRID, C_M_S).locate(sounds))
 
 
-def test_several_segments_are_one_sound(estimator: SrpPhat) -> None:
+def test_several_segments_are_located_as_one_sound(estimator: SrpPhat) -> None:
     one, other = sounds_from(SOURCE_M, seed=1), sounds_from(SOURCE_M, seed=2)
     both = {name: Sound((*one[name].segments, *other[name].segments), RATE_HZ) for name in one}
     assert error_m(estimator.locate(both)) < NEAR_M
 
 
-def test_one_array_gives_the_direction(estimator: SrpPhat) -> None:
+def test_one_array_alone_gives_the_direction(estimator: SrpPhat) -> None:
     found = estimator.locate({"north": sounds_from(SOURCE_M)["north"]})
     towards, right = found.position_m - NORTH.centre_m, SOURCE_M - NORTH.centre_m
     cosine = towards @ right / np.linalg.norm(towards) / np.linalg.norm(right)
@@ -159,7 +155,7 @@ def test_one_array_gives_the_direction(estimator: SrpPhat) -> None:
     assert [heard.spec.name for heard in found.evidence] == ["north"]
 
 
-def test_silence_and_dead_channels_are_survived(estimator: SrpPhat) -> None:
+def test_silence_and_dead_channels_give_finite_answers(estimator: SrpPhat) -> None:
     silent = {name: Sound((np.zeros((4, 800), dtype=np.float32),), RATE_HZ) for name in ("north", "south")}
     found = estimator.locate(silent)
     assert found.confidence == 0.0
@@ -181,7 +177,7 @@ def test_arrays_of_two_to_sixteen_microphones_work_together() -> None:
     assert error_m(SrpPhat(specs, GRID, C_M_S).locate(sounds)) < 2 * NEAR_M
 
 
-def test_plane_grid_stays_in_its_plane() -> None:
+def test_a_position_on_a_plane_grid_stays_in_its_plane() -> None:
     plane = Grid((BOUNDS_M[0], BOUNDS_M[1], (1.47, 1.47)), 0.1)
     found = SrpPhat([NORTH, SOUTH], plane, C_M_S).locate(sounds_from(SOURCE_M))
     assert error_m(found) < NEAR_M

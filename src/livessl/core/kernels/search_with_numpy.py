@@ -1,0 +1,302 @@
+"""The kernels of the peak search on NumPy alone: lags of cells, upper bounds, and branch and bound.
+
+Sums run in one order everywhere: over the pairs of an array, then over the arrays. Rounding to float32 keeps the order
+of numbers, so a sum of maxima is never below a sum of any of the numbers that they are maxima of, rounding included:
+the bounds are exact. Names of dimensions are those of `arguments`.
+
+A lag's place on the fine axis is `int((|r - r_k| - |r - r_i|) * scale + offset)` in float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.kernels.arguments import BLOCKS, RUNS, Axes, SearchBounds, SearchCells, SearchRows
+from livessl.core.types import Float32Array, IntArray, UInt16Array
+
+_SLAB_POINTS: Final = 1 << 15
+"""Grid points whose distances are computed at once: as many as fit the second-level cache."""
+
+_CELLS_AT_ONCE: Final = 64
+"""Most cells whose points are examined at once. The search begins with one, because mostly few are needed."""
+
+
+def lag_places(
+    points_m: Float32Array, microphones_m: Float32Array, pairs: IntArray, scale: np.float32, offset: np.float32
+) -> IntArray:
+    """Place of each pair's delay on the fine lag axis, for points (N, 3): (P, N) int32."""
+    x, y, z = (points_m[:, axis] - microphones_m[:, axis, None] for axis in range(3))
+    distance = np.sqrt((x * x + y * y) + z * z)
+    return np.asarray(((distance[pairs[:, 1]] - distance[pairs[:, 0]]) * scale + offset).astype(np.int32))
+
+
+def cell_intervals(
+    axes: Axes,
+    microphones_m: Float32Array,
+    pairs: IntArray,
+    scale: np.float32,
+    offset: np.float32,
+    edge: int,
+    low: UInt16Array,
+    high: UInt16Array,
+) -> None:
+    """Find the lowest and highest lag of every pair of one array over the points of every cell.
+
+    Parameters
+    ----------
+    axes : three of (n,) float32
+        The grid's axes.
+    microphones_m : (K, 3) float32
+    pairs : (P, 2) int32
+    scale, offset : float32
+        From a difference of distances, in metres, to a place on the lag axis.
+    edge : int
+        Points along the edge of a cell.
+    low, high : (P, C) uint16
+        Output; the cells in the grid's order, z fastest.
+    """
+    x_m, y_m, z_m = axes
+    step = max(1, _SLAB_POINTS // (len(y_m) * len(z_m) * edge)) * edge
+    cells_yz = -(-len(y_m) // edge) * -(-len(z_m) // edge)
+    for first in range(0, len(x_m), step):
+        slab = x_m[first : first + step]
+        points_m = np.stack([part.ravel() for part in np.meshgrid(slab, y_m, z_m, indexing="ij")], axis=1)
+        place = lag_places(points_m, microphones_m, pairs, scale, offset)
+        place = place.reshape(len(pairs), len(slab), len(y_m), len(z_m))
+        cells = slice(first // edge * cells_yz, (first // edge + -(-len(slab) // edge)) * cells_yz)
+        for extreme, out in ((np.minimum, low), (np.maximum, high)):
+            reduced = place
+            for axis in (1, 2, 3):
+                reduced = extreme.reduceat(reduced, np.arange(0, reduced.shape[axis], edge), axis=axis)
+            out[:, cells] = reduced.reshape(len(pairs), -1)
+
+
+def running_maxima(values: Float32Array, block: IntArray, maxima: Float32Array) -> None:
+    """Find the maxima of each row over runs of blocks of lags.
+
+    Parameters
+    ----------
+    values : (R, L) float32
+    block : (R,) int64
+        Lags in a block.
+    maxima : (R, levels * `BLOCKS`) float32
+        Output: at `level * BLOCKS + b` of each row, the greatest value in the `RUNS[level]` blocks from b on.
+    """
+    padded = np.full((len(values), int(block.max()) * BLOCKS), -np.inf, dtype=np.float32)
+    for size in np.unique(block):
+        which, width = block == size, min(values.shape[1], size * BLOCKS)
+        padded[which, :width] = values[which, :width]
+        maxima[which, :BLOCKS] = padded[which, : size * BLOCKS].reshape(-1, BLOCKS, size).max(axis=2)
+    levels = maxima.reshape(len(maxima), -1, BLOCKS)
+    for level in range(1, levels.shape[1]):
+        further = RUNS[level] - RUNS[level - 1]
+        levels[:, level] = levels[:, level - 1]
+        np.maximum(levels[:, level - 1, :-further], levels[:, level - 1, further:], out=levels[:, level, :-further])
+
+
+def upper_bounds(maxima: Float32Array, places: UInt16Array, rows: SearchRows, bound: Float32Array) -> None:
+    """Bound the power of the points of each of some cells by the sum of the pairs' maxima over the cell's lags.
+
+    Parameters
+    ----------
+    maxima : (R, levels * `BLOCKS`) float32
+        `running_maxima` of the rows.
+    places : (site's pairs, C) uint16
+        Place among a row's maxima of the run of lags that holds all of the cell's.
+    rows : SearchRows
+    bound : (C,) float32
+        Output.
+    """
+    bound[:] = 0.0
+    for a, weight in enumerate(rows.weight):
+        total = np.zeros(len(bound), dtype=np.float32)
+        for r in range(rows.first_row[a], rows.first_row[a + 1]):
+            total += maxima[r, places[rows.site_pair[r]]]
+        bound += weight * total
+
+
+def highest(
+    values: Float32Array,
+    maxima: Float32Array,
+    rows: SearchRows,
+    cells: SearchCells,
+    bounds: SearchBounds,
+    boxes: IntArray,
+    most_look_ups: int,
+) -> tuple[int, float, bool]:
+    """Find the highest grid point outside some boxes, exactly as in the whole map, by branch and bound.
+
+    Cubes of cells are examined in the order of their bounds, and of their cells those whose bound reaches the best
+    power known. Of equal points the first in the grid's order is returned.
+
+    Parameters
+    ----------
+    values : (R, L) float32
+        GCCs.
+    maxima : (R, levels * `BLOCKS`) float32
+        `running_maxima` of the rows.
+    rows : SearchRows
+    cells : SearchCells
+    bounds : SearchBounds
+        Those of cells are filled in as they become known.
+    boxes : (E, 3, 2) int64
+        First and last point along each axis of boxes that are left out.
+    most_look_ups : int
+        Look-ups after which the search gives up: where nothing stands out and many arrays take part, hardly any cell
+        can be skipped.
+
+    Returns
+    -------
+    point : int
+    power : float
+        -inf if there is no point outside the boxes.
+    proven : bool
+        Whether no point is higher; otherwise it is the best of those examined.
+    """
+    search = _Search(values, maxima, rows, cells, bounds, boxes, most_look_ups)
+    proven = search.run()
+    return search.best_point, float(search.best), proven
+
+
+class _Search:
+    """One search: the best point so far, and the look-ups spent."""
+
+    def __init__(
+        self,
+        values: Float32Array,
+        maxima: Float32Array,
+        rows: SearchRows,
+        cells: SearchCells,
+        bounds: SearchBounds,
+        boxes: IntArray,
+        most_look_ups: int,
+    ) -> None:
+        self._values = values
+        self._maxima = maxima
+        self._rows = rows
+        self._cells = cells
+        self._bounds = bounds
+        self._boxes = boxes
+        self._most_look_ups = most_look_ups
+        self._shape = tuple(len(axis_m) for axis_m in cells.axes)
+        self._halves = cells.leaf_places.shape[2] > 0
+        self._leaf_edge = cells.edge // 2 if self._halves else cells.edge
+        self._spent = 0
+        self.best = np.float32(-np.inf)
+        self.best_point = int(np.prod(self._shape))
+
+    @property
+    def _gives_up(self) -> bool:
+        return self._spent > self._most_look_ups and bool(self.best > -np.inf)
+
+    def run(self) -> bool:
+        """Examine cubes; return whether the search came to its end."""
+        per_cube, edge = self._cells.per_cube, self._cells.edge
+        of_cubes, of_cells, known = self._bounds
+        inner = _corners(per_cube) * edge
+        cube_counts = tuple(-(-n // (per_cube * edge)) for n in self._shape)
+        every = np.arange(len(of_cubes))
+        corners = np.stack(np.unravel_index(every, cube_counts), axis=1) * (per_cube * edge)
+        cubes = self._promising(every, corners, per_cube * edge, of_cubes)
+        while (chosen := cubes.take(self.best, self.best_point)) is not None:
+            which, first = chosen
+            for cube in which[~known[which]]:
+                if self._gives_up:
+                    return False
+                self._spent += per_cube**3 * len(self._rows.site_pair)
+                upper_bounds(self._maxima, self._cells.cell_places[cube], self._rows, of_cells[cube])
+                known[cube] = True
+            children = (which[:, None] * per_cube**3 + np.arange(per_cube**3)).ravel()
+            firsts = (first[:, None] + inner).reshape(-1, 3)
+            if not self._examine(self._promising(children, firsts, edge, of_cells[which].ravel())):
+                return False
+        return True
+
+    def _examine(self, cells: _InOrder) -> bool:
+        """Examine cells; return whether all of them that may hold a better point were examined."""
+        rows = len(self._rows.site_pair)
+        halves = _corners(2) * self._leaf_edge
+        inmost = _corners(self._leaf_edge)
+        bound = np.empty((_CELLS_AT_ONCE, 8), dtype=np.float32)
+        while (chosen := cells.take(self.best, self.best_point)) is not None:
+            if self._gives_up:
+                return False
+            which, first = chosen
+            if self._halves:
+                for number, cell in enumerate(which):
+                    upper_bounds(self._maxima, self._cells.leaf_places[cell], self._rows, bound[number])
+                self._spent += bound[: len(which)].size * rows
+                first = (first[:, None] + halves)[bound[: len(which)] >= self.best]
+            self._spent += len(first) * len(inmost) * rows
+            self._compare((first[:, None] + inmost).reshape(-1, 3))
+        return True
+
+    def _compare(self, at: IntArray) -> None:
+        """Compare points, given by their indices (N, 3), with the best one."""
+        at = at[(at < self._shape).all(axis=1)]
+        for box in self._boxes:
+            at = at[~((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)]
+        points_m = np.stack([axis_m[at[:, axis]] for axis, axis_m in enumerate(self._cells.axes)], axis=1)
+        power = _power(points_m, self._values, self._rows)
+        peak = power.max(initial=-np.inf)
+        if peak >= self.best and len(power):
+            point = int(np.ravel_multi_index(tuple(at[power == peak].T), self._shape).min())
+            self.best_point = point if peak > self.best else min(point, self.best_point)
+            self.best = peak
+
+    def _promising(self, which: IntArray, first: IntArray, points: int, bound: Float32Array) -> _InOrder:
+        """Put cubes with `points` along an edge in the order of their bounds, without those that cannot be best."""
+        last = np.minimum(first + points, self._shape) - 1
+        out = (first >= self._shape).any(axis=1)
+        for box in self._boxes:
+            out |= ((first >= box[:, 0]) & (last <= box[:, 1])).all(axis=1)
+        bound = np.where(out, np.float32(-np.inf), bound)
+        order = np.argsort(-bound, kind="stable")
+        order = order[(bound[order] > -np.inf) & (bound[order] >= self.best)]
+        corner = np.ravel_multi_index(tuple(first[order].T), self._shape)
+        return _InOrder(which[order], first[order], bound[order], corner)
+
+
+@dataclass
+class _InOrder:
+    """Cubes of grid points in the order of their bounds, taken a few at a time: first one, then twice as many."""
+
+    which: IntArray
+    first: IntArray
+    bound: Float32Array
+    corner: IntArray
+    _done: int = 0
+    _some: int = 1
+
+    def take(self, best: np.float32, best_point: int) -> tuple[IntArray, IntArray] | None:
+        """Take the next ones that may hold a point better than the best, or an equal one before it; None at the end."""
+        while self._done < len(self.which) and self.bound[self._done] >= best:
+            now = slice(self._done, self._done + self._some)
+            self._done, self._some = now.stop, min(2 * self._some, _CELLS_AT_ONCE)
+            bound, corner = self.bound[now], self.corner[now]
+            may_hold = (bound > best) | ((bound == best) & (corner < best_point))
+            if may_hold.any():
+                return self.which[now][may_hold], self.first[now][may_hold]
+        return None
+
+
+def _corners(count: int) -> IntArray:
+    """Indices (count^3, 3) of a cube's parts, z fastest."""
+    return np.stack(np.unravel_index(np.arange(count**3), (count,) * 3), axis=1)
+
+
+def _power(points_m: Float32Array, values: Float32Array, rows: SearchRows) -> Float32Array:
+    """Summed power at points (N, 3): (N,)."""
+    power = np.zeros(len(points_m), dtype=np.float32)
+    for a, weight in enumerate(rows.weight):
+        own = slice(rows.first_row[a], rows.first_row[a + 1])
+        microphones_m = rows.microphones_m[rows.first_microphone[a] : rows.first_microphone[a + 1]]
+        places = lag_places(points_m, microphones_m, rows.pairs[own], rows.scale[a], rows.offset[a])
+        total = np.zeros(len(points_m), dtype=np.float32)
+        for row, place in zip(values[own], places, strict=True):
+            total += row[place]
+        power += weight * total
+    return power

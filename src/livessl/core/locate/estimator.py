@@ -1,0 +1,237 @@
+"""Estimators: what one is given, what it returns, and how a method of one's own is added to the built-in ones.
+
+`Estimator` is the protocol. `livessl.core.locate.map_estimator.MapEstimator` is a base class that leaves only
+`locate` to write.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+
+from livessl.core.correlate.band import dead_channels
+from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
+from livessl.core.geometry import Grid
+from livessl.core.locate.confidence import ConfidenceFeatures
+from livessl.core.methods import METHODS, unknown_method
+from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Sound:
+    """The part of an event, or of a window, that one array recorded.
+
+    Parameters
+    ----------
+    segments : sequence of (K, n) float32
+        Pieces of the active sound without gaps, at least one unless `onsets` are given; channels in the order of the
+        array's microphones.
+    sample_rate_hz : float
+    onsets : sequence of OnsetGCC
+        What the estimator's `onset_front_end` made of the frames of the sound and of its pre-roll, one value a frame;
+        empty if the estimator has no such front end.
+    suspect : bool
+        Whether the array was an outlier in many of the last events.
+    sources : int
+        Most sources to look for.
+    ended : bool
+        Whether the sound is complete. While it lasts it will be located again, so a second look is not worth its time.
+    """
+
+    segments: Sequence[Float32Array]
+    sample_rate_hz: float
+    onsets: Sequence[OnsetGCC] = ()
+    suspect: bool = False
+    sources: int = 1
+    ended: bool = True
+
+    @property
+    def onset_strength(self) -> float:
+        """Sum over the frames of the mean onset level of the microphones; 0 without `onsets`."""
+        return float(np.mean([onset.levels for onset in self.onsets])) * len(self.onsets) if self.onsets else 0.0
+
+    def without_dead_channels(self, gcc: GCC) -> GCC:
+        """Return `gcc` with zeros in the pairs of dead microphones (`livessl.core.correlate.band.dead_channels`).
+
+        Without segments dead microphones cannot be recognized, and `gcc` is returned as it is.
+        """
+        if not self.segments:
+            return gcc
+        dead = dead_channels(self.segments)
+        if not dead.any():
+            return gcc
+        values = np.where(np.any(dead[gcc.pairs], axis=1)[:, None], np.float32(0.0), gcc.values)
+        return GCC(gcc.pairs, gcc.lags_s, values)
+
+
+@dataclass(frozen=True, slots=True)
+class Localization:
+    """The answer of an estimator: a position, its certainty, and the evidence for it.
+
+    Parameters
+    ----------
+    position_m : (3,) float64
+        Metres, room corner at the origin.
+    covariance_m2 : (3, 3) float64
+        Square metres. Fusion reports only a direction if it is large compared with the distance to the nearest array.
+    confidence : float
+        0 to 1.
+    evidence : tuple of Evidence
+        One for each array, in the order of their names; power maps are drawn from it. May be empty.
+    proven : bool
+        Whether no grid point has a higher power; False if the search was given up.
+    features : ConfidenceFeatures or None
+        What the confidence was computed from; None if it is no probability.
+    refused : str or None
+        Why the position should not be relied on, in words; None if it may be.
+    outliers : mapping of str to float, or None
+        Arrays that disagree with the others and were left out of the position, and the angle in degrees between each
+        one's own direction and the position. None if the estimator does not look for outliers.
+    unneeded : collection of str
+        Arrays that were not used because enough others have stronger onsets.
+    others : tuple of Localization
+        Further sources that sounded at the same time.
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    confidence: float
+    evidence: tuple[Evidence, ...]
+    proven: bool = True
+    features: ConfidenceFeatures | None = None
+    refused: str | None = None
+    outliers: Mapping[str, float] | None = None
+    unneeded: Collection[str] = ()
+    others: tuple[Localization, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PowerMaps:
+    """Power at every point of a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+        It may be coarser than the grid that is searched.
+    fused : (G,) float32
+        Sum over the arrays, in the grid's order.
+    arrays : mapping of str to (G,) float32
+        Maps of single arrays.
+    """
+
+    grid: Grid
+    fused: Float32Array
+    arrays: Mapping[str, Float32Array]
+
+
+class Estimator(Protocol):
+    """The interface of a localization method, as fusion uses it.
+
+    `locate` does the work, live and offline; everything else may do nothing: `prepare` is only called live, when a node
+    connects; `onset_front_end` may return None; `power_maps` is only called when a client requests a map. An estimator
+    may cache, but must give the same answer to the same sounds, and must not depend on their order.
+
+    Calls come from one thread, with two exceptions: `onset_front_end` may be called for several arrays at once, and
+    `power_maps` from another thread.
+    """
+
+    name: str
+    """Name of the method, reported with every event; `create` sets it to the name in the registry."""
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Compute what depends on an array's sampling rate, so that its first sound is not delayed.
+
+        Raises
+        ------
+        ValueError
+            If the rate is too low for the array's band.
+        """
+        ...
+
+    def onset_front_end(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:
+        """Return a new front end to which every frame of an array is passed in order, or None if segments suffice.
+
+        What it returns for the frames of a sound becomes `Sound.onsets`.
+        """
+        ...
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        """Locate the source of the sounds of one or more arrays, given by array name."""
+        ...
+
+    def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
+        """Compute power maps from the evidence of a `Localization`; may be called from another thread.
+
+        Parameters
+        ----------
+        evidence : sequence of Evidence
+        separately : collection of str, or None
+            Arrays of which single maps are wanted besides the fused map; None for all.
+        """
+        ...
+
+
+Factory = Callable[[Sequence[ArraySpec], Grid, float], Estimator]
+"""Makes an estimator from the arrays, the search grid and the speed of sound in m/s. A class with these constructor
+parameters is one."""
+
+
+def register(name: str, factory: Factory) -> None:
+    """Add a localization method, which can then be chosen wherever a method is named. An existing name is replaced.
+
+    Parameters
+    ----------
+    name : str
+        Name in the site file (`fusion.method`), in `--method` and in `livessl.locate(..., method=...)`.
+    factory : callable
+        Called with the arrays (sequence of `ArraySpec`), the search `Grid` and the speed of sound in m/s; returns an
+        `Estimator`.
+
+    Raises
+    ------
+    ValueError
+        If the name is empty.
+    TypeError
+        If `factory` cannot be called.
+    """
+    if not name:
+        raise ValueError("method: expected a name, got an empty text")
+    if not callable(factory):
+        raise TypeError(
+            f"method {name!r}: expected a factory (arrays, grid, c_m_s) -> Estimator, got {type(factory).__name__}; "
+            "pass the class itself, not an instance"
+        )
+    METHODS[name] = factory
+
+
+def create(method: str, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> Estimator:
+    """Return a new estimator of a registered method.
+
+    Parameters
+    ----------
+    method : str
+    arrays : sequence of ArraySpec
+        All arrays that may take part.
+    grid : Grid
+        Search grid.
+    c_m_s : float
+        Speed of sound, m/s.
+
+    Raises
+    ------
+    ValueError
+        If no method of that name is registered.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method: {unknown_method(method)}")
+    factory: Any = METHODS[method]
+    if isinstance(factory, str):
+        module, _, attribute = factory.partition(":")
+        factory = getattr(import_module(module), attribute)
+    estimator: Estimator = factory(arrays, grid, c_m_s)
+    estimator.name = method
+    return estimator

@@ -1,0 +1,30 @@
+"""Names of the localization methods. Checking a site file loads this module, and nothing that locates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from typing import Final
+
+ONSET: Final = "onset"
+SRP_PHAT: Final = "srp-phat"
+CEPSTRAL: Final = "cepstral"
+AVERAGED: Final = "averaged"
+
+METHODS: Final[dict[str, str | Callable[..., object]]] = {
+    ONSET: "livessl.core.locate.onset:Onset",
+    SRP_PHAT: "livessl.core.locate.srp_phat:SrpPhat",
+    CEPSTRAL: "livessl.core.locate.srp_phat:Cepstral",
+    AVERAGED: "livessl.core.locate.srp_phat:Averaged",
+}
+"""Registry of the methods: from the name in a site file or on the command line to the factory of its estimator.
+
+A factory is a callable, or the text "module:attribute" of one that is imported when it is first needed. Use
+`livessl.core.locate.estimator.register` to add a method and `create` to make an estimator."""
+
+
+def unknown_method(name: str) -> str:
+    """Return the error text for a name that is not in `METHODS`, with the nearest name that is."""
+    close = get_close_matches(name, METHODS, n=1)
+    guess = f"; did you mean {close[0]!r}?" if close else ""
+    return f"expected one of {', '.join(METHODS)}, got {name!r}{guess}"

@@ -1,0 +1,243 @@
+"""Values that fusion returns: estimates, updates, events, tracks, windows and backfill requests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from livessl.core.types.arrays import FloatArray, read_only
+from livessl.core.types.sound import Evidence
+
+
+class Status(StrEnum):
+    """Kind of an event's answer: a position, a direction only, or none."""
+
+    LOCATED = "located"
+    DIRECTION_ONLY = "direction-only"
+    REFUSED = "refused"
+
+
+class TrackState(StrEnum):
+    """Stage in the life of a track."""
+
+    NEW = "new"
+    UPDATE = "update"
+    END = "end"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A position and its certainty.
+
+    Parameters
+    ----------
+    time_ns : int
+        Site time at the middle of the sound used, in nanoseconds.
+    position_m : (3,) float64
+        Metres, room corner at the origin.
+    covariance_m2 : (3, 3) float64
+        Square metres. An axis that the search volume fixes has zeros.
+    confidence : float
+        0 to 1. By `onset` the probability that the position is right to within 0.5 m; by other methods the margin of
+        the map's peak over the next best place, which is no probability.
+    arrays : tuple of str
+        Arrays from which the position was computed.
+
+    Raises
+    ------
+    ValueError
+        If position or covariance has another shape.
+    """
+
+    time_ns: int
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    confidence: float
+    arrays: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.position_m.shape != (3,) or self.covariance_m2.shape != (3, 3):
+            raise ValueError(
+                f"estimate: expected position (3,) and covariance (3, 3), "
+                f"got {self.position_m.shape} and {self.covariance_m2.shape}"
+            )
+        read_only(self.position_m)
+        read_only(self.covariance_m2)
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """One array's part in an event.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array.
+    active_s : float
+        Length of its sound that was used, seconds.
+    power : float
+        In-band mean power of that sound, full scale squared.
+    azimuth_deg, elevation_deg, distance_m : float
+        Direction and distance of the position from the array's centre; azimuth counter-clockwise from +x.
+    agrees : bool or None
+        Whether the array agrees with the others; False for an outlier, which has no part in the position. None if it
+        was alone, or the estimator does not look for outliers.
+    off_deg : float or None
+        Angle between an outlier's own direction and the position; None if it agrees.
+    asked : bool
+        Whether the array did not detect the sound itself, and its frames came by a backfill request.
+    """
+
+    array: str
+    active_s: float
+    power: float
+    azimuth_deg: float
+    elevation_deg: float
+    distance_m: float
+    agrees: bool | None = None
+    off_deg: float | None = None
+    asked: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """Position of a sound that is still going on, from its last window.
+
+    Parameters
+    ----------
+    event_id : str
+        `Event.id` of the event that the sound will become.
+    status, estimate, power, contributions, complete_ns
+        As in `Event`, of the window alone.
+    others : tuple of Estimate
+        Further sources that sound at the same time.
+    """
+
+    event_id: str
+    status: Status
+    estimate: Estimate
+    power: float
+    contributions: tuple[Contribution, ...] = ()
+    complete_ns: int = 0
+    others: tuple[Estimate, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A finished sound and where it happened.
+
+    Parameters
+    ----------
+    id : str
+        Stable name of the event.
+    start_ns, end_ns : int
+        Site time of the outer edges of its first and last active frame, in nanoseconds.
+    status : Status
+        Whether `estimate` is a position, a direction only, or missing.
+    reason : str or None
+        Why it is not simply located, in words.
+    estimate : Estimate or None
+        None if it was refused.
+    power : float
+        Greatest in-band frame power over all arrays, full scale squared.
+    method : str
+        Name of the localization method.
+    contributions : tuple of Contribution
+        One for each array used.
+    heard_by : tuple of str
+        All arrays that detected it, used or not.
+    late_frames : int
+        Frames that arrived after their window had closed.
+    latency_s : float
+        Time from the end of the sound to this answer, in seconds.
+    late : bool
+        Whether the answer uses sound that arrived after its windows had closed.
+    complete_ns : int
+        Site time from which the answer could be computed: the end of the sound and of the quiet that ends it.
+    source : int
+        1, or 2 for the second of two sources that sounded at the same time, each of which has an event.
+    """
+
+    id: str
+    start_ns: int
+    end_ns: int
+    status: Status
+    reason: str | None
+    estimate: Estimate | None
+    power: float
+    method: str
+    contributions: tuple[Contribution, ...] = ()
+    heard_by: tuple[str, ...] = ()
+    late_frames: int = 0
+    latency_s: float = 0.0
+    late: bool = False
+    complete_ns: int = 0
+    source: int = 1
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A source followed over several estimates.
+
+    Parameters
+    ----------
+    id : int
+        Number that stays the same while the track lives.
+    state : TrackState
+        new, update or end.
+    time_ns : int
+        Site time of the state below, in nanoseconds.
+    position_m, velocity_m_s : (3,) float64
+        Metres, metres per second.
+    covariance_m2 : (3, 3) float64
+        Covariance of the position, square metres.
+    """
+
+    id: int
+    state: TrackState
+    time_ns: int
+    position_m: FloatArray
+    velocity_m_s: FloatArray
+    covariance_m2: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The evidence from which a window was located, for power maps that are drawn on demand.
+
+    Parameters
+    ----------
+    time_ns : int
+        Site time at the middle of the window, in nanoseconds.
+    evidence : tuple of Evidence
+        One for each array that detected the sound.
+    """
+
+    time_ns: int
+    evidence: tuple[Evidence, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BackfillRequest:
+    """A request for the frames of an array over a span in which it sent none.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array.
+    first, last : int
+        Frame indices, both included, by the array's own clock.
+    """
+
+    array: str
+    first: int
+    last: int
+
+
+Output = Update | Event | Track | Window | BackfillRequest
+"""Value that fusion returns from a step."""

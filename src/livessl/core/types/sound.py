@@ -1,0 +1,259 @@
+"""Values from a device to the evidence of a sound: blocks, frames, marks, arrays and their correlations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from livessl.core.types.arrays import Float32Array, FloatArray, IntArray, RealArray, read_only
+
+FRAME_NS: Final = 50_000_000
+"""Length of a frame, and step of the grid of frames in site time, in nanoseconds: the paper's 50 ms."""
+
+FRAME_S: Final = FRAME_NS / 1e9
+"""Length of a frame in seconds."""
+
+MIN_MICROPHONES: Final = 2
+"""Fewest microphones of an array: one pair."""
+
+MAX_MICROPHONES: Final = 16
+"""Most microphones of an array: tables grow with its 120 pairs."""
+
+MAX_SAMPLE: Final = 1e6
+"""Largest magnitude of a sample, 120 dB above full scale. No converter gives more; a larger value comes from a broken
+file or sender, and one such sample would mask every other array."""
+
+
+class ClockState(StrEnum):
+    """Reliability of a node's mapping from sample index to site time."""
+
+    SETTLING = "settling"
+    LOCKED = "locked"
+    STEPPED = "stepped"
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Samples that a device delivers at once.
+
+    Parameters
+    ----------
+    first_index : int
+        Index of the first sample, counted by the device from the start of the stream.
+    samples : (channels, n) float32
+        Samples in [-1, 1). An empty block means that no samples are there yet: a device never blocks.
+    stamp_ns : int
+        Site time at which the first sample was seen to arrive, in nanoseconds since the epoch; it jitters.
+    overflow : bool
+        Whether samples, of unknown number, were lost just before this block.
+
+    Raises
+    ------
+    ValueError
+        If the samples are not float32 with two axes.
+    """
+
+    first_index: int
+    samples: Float32Array
+    stamp_ns: int
+    overflow: bool = False
+
+    def __post_init__(self) -> None:
+        if self.samples.ndim != 2 or self.samples.dtype != np.float32:
+            raise ValueError(
+                f"block: samples must be (channels, n) float32, got {self.samples.shape} {self.samples.dtype}"
+            )
+        read_only(self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The sound of one array in one interval of 50 ms.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array.
+    sequence : int
+        Number of the array's frame since its node started, from 1; 0 where `requested`.
+    frame_index : int
+        Index on the grid of frames: site time of the interval's start divided by 50 ms.
+    time_ns : int
+        Site time (UTC since the epoch) of the first sample, in nanoseconds.
+    sample_rate_hz : float
+        Nominal sampling rate.
+    samples : (channels, n) float32
+        Channels in the order of the array's microphones.
+    power : float
+        In-band mean power over the channels, full scale squared.
+    active : bool
+        Whether the causal activity detection found sound in it.
+    requested : bool
+        Whether it answers a `BackfillRequest`. It is then outside the numbering of the frames that the node sends by
+        itself.
+
+    Raises
+    ------
+    ValueError
+        If the samples are not float32 with two axes.
+    """
+
+    array: str
+    sequence: int
+    frame_index: int
+    time_ns: int
+    sample_rate_hz: float
+    samples: Float32Array
+    power: float
+    active: bool
+    requested: bool = False
+
+    def __post_init__(self) -> None:
+        if self.samples.ndim != 2 or self.samples.dtype != np.float32:
+            raise ValueError(
+                f"frame of array {self.array!r}: samples must be (channels, n) float32, "
+                f"got {self.samples.shape} {self.samples.dtype}"
+            )
+        read_only(self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Sign of life for an interval without a frame, with the state of the node.
+
+    Parameters
+    ----------
+    array, frame_index
+        As in `Frame`.
+    sequence : int
+        Sequence number of the array's last frame, 0 before the first. Marks have no number of their own, because a lost
+        mark is no loss.
+    power : float
+        In-band mean power over the channels in the interval, full scale squared.
+    noise_power : float
+        The node's estimate of the background, full scale squared.
+    channel_power : tuple of float
+        In-band mean power of each channel, full scale squared; 0 for a dead channel.
+    overflows, lost_frames : int
+        Counts since the node started: blocks that followed a loss of samples; frames dropped for a gap or a full spool.
+    drift_ppm : float
+        Rate of the device's clock against site time, parts per million; 0 until it is known.
+    clock : ClockState
+        State of the mapping from sample index to site time.
+    """
+
+    array: str
+    sequence: int
+    frame_index: int
+    power: float
+    noise_power: float
+    channel_power: tuple[float, ...]
+    overflows: int = 0
+    lost_frames: int = 0
+    drift_ppm: float = 0.0
+    clock: ClockState = ClockState.SETTLING
+
+
+Message = Frame | Mark
+"""Message of a node about the sound of an array."""
+
+
+@dataclass(frozen=True, slots=True)
+class GCC:
+    """Generalized cross-correlations of one array.
+
+    Parameters
+    ----------
+    pairs : (P, 2) int64
+        Microphone indices (i, k), i < k.
+    lags_s : (L,) float64
+        Lags in seconds, ascending and evenly spaced. Positive lag of pair (i, k): the sound reaches channel k later.
+    values : (P, L) float32 or float64
+        Correlation, 1 for perfect coherence at that lag.
+
+    Raises
+    ------
+    ValueError
+        If `values` has another shape.
+    """
+
+    pairs: IntArray
+    lags_s: FloatArray
+    values: RealArray
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (len(self.pairs), len(self.lags_s)):
+            raise ValueError(
+                f"GCC: values must be (pairs, lags) = {(len(self.pairs), len(self.lags_s))}, got {self.values.shape}"
+            )
+        for array in (self.pairs, self.lags_s, self.values):
+            read_only(array)
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySpec:
+    """A microphone array as the core needs it.
+
+    Parameters
+    ----------
+    name : str
+        Name in the site file.
+    microphones_m : (K, 3) float64
+        Absolute positions in channel order, metres.
+    band_hz : (float, float)
+        Lowest and highest frequency used.
+
+    Raises
+    ------
+    ValueError
+        If the number of microphones or the band is out of range.
+    """
+
+    name: str
+    microphones_m: FloatArray
+    band_hz: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        count, *rest = self.microphones_m.shape
+        if rest != [3] or not MIN_MICROPHONES <= count <= MAX_MICROPHONES:
+            raise ValueError(
+                f"array {self.name!r}: expected 2 to 16 microphone positions (K, 3), "
+                f"got shape {self.microphones_m.shape}"
+            )
+        low, high = self.band_hz
+        if not 0 <= low < high:
+            raise ValueError(f"array {self.name!r}: expected a band 0 <= low < high in Hz, got {self.band_hz}")
+        read_only(self.microphones_m)
+
+    @property
+    def centre_m(self) -> FloatArray:
+        """Mean microphone position (3,), metres."""
+        return np.asarray(self.microphones_m.mean(axis=0))
+
+    @property
+    def aperture_m(self) -> float:
+        """Largest distance between two microphones, metres."""
+        difference = self.microphones_m[:, None] - self.microphones_m[None]
+        return float(np.sqrt((difference**2).sum(axis=2)).max())
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One array's evidence of one sound.
+
+    Parameters
+    ----------
+    spec : ArraySpec
+        The array.
+    gcc : GCC
+        Correlations of the whole band.
+    below : tuple of GCC
+        Correlations of the part of the band below each cut-off, if the array's map is limited against spatial aliasing.
+    """
+
+    spec: ArraySpec
+    gcc: GCC
+    below: tuple[GCC, ...] = ()
