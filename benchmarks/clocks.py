@@ -96,9 +96,7 @@ def heard_with(
             start_ns += round(offset_s * 1e9)
         drifting = Drifting(recording, drift_ppm if array == late else 0.0)
         parts.append(AssignedRecording(array, drifting, start_ns, tuple(range(1, 5))))
-    fusion = make_fusion(site, updates=False)
-    if not corrected:
-        fusion.clock_offsets = None
+    fusion = make_fusion(site, updates=False, corrects_clocks=corrected)
     outputs: list[Output] = []
     now_ns = 0
     for now_ns, batch in paced_messages(*make_pipelines(site, parts), UnpacedClock()):

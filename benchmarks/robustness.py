@@ -19,7 +19,9 @@ from livessl.core.geometry import Grid
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.locate.onset import Onset
 from livessl.core.stream.activity import ActivityParameters, CausalActivity, exact_mask
-from livessl.core.stream.fusion import Fusion, FusionParameters
+from livessl.core.stream.fusion import Fusion
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame, Track
 from livessl.lab.evaluate.campaign import read_clips
 from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
@@ -297,7 +299,7 @@ LEAD_NS: Final = 20 * 1_700_000_000 * FRAME_NS
 
 
 def _tracks(specs: Sequence[ArraySpec], samples: Float32Array, live_sources: int) -> list[Track]:
-    fusion = Fusion("walk", specs, Onset(specs, GRID, C_M_S), FusionParameters(live_sources=live_sources))
+    fusion = Fusion(SiteState("walk", specs, Onset(specs, GRID, C_M_S), FusionParameters(live_sources=live_sources)))
     gates = [CausalActivity(ActivityParameters()) for _ in specs]
     tracks: list[Track] = []
     for k in range(samples.shape[1] // FRAME):

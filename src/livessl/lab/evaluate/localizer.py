@@ -18,7 +18,7 @@ import pyarrow as pa
 from livessl.core.geometry import angle_deg
 from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.stream.activity import exact_mask, runs
-from livessl.core.stream.fusion import judged
+from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M
 from livessl.lab.evaluate.scenarios import ARRAYS, HALVES, LOCALIZER, ROOMS, SCENARIOS, TWO, Case
