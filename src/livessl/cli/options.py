@@ -27,8 +27,8 @@ def add_method(parser: Any) -> None:
     parser.add_argument(
         "--method",
         type=argument.method,
-        metavar="NAME",
-        help=f"localization method: {', '.join(METHODS)}, or one of your own as MODULE:NAME (default: the site's)",
+        metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
+        help="localization method; MODULE:NAME imports one of your own (default: the site's)",
     )
 
 
