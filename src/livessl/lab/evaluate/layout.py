@@ -70,8 +70,8 @@ def layout_of(site: Site) -> Layout:
         if uses_envelope(spec.band_hz):
             low, high = spec.band_hz
             raise ValueError(
-                f"--site: array {spec.name!r}: evaluate expects a band that begins low, got {low:g} to {high:g} Hz, whose "
-                "envelope `locate` uses; lower its band_hz"
+                f"--site: array {spec.name!r}: evaluate expects a band that begins low, got {low:g} to {high:g} Hz, "
+                "whose envelope `locate` uses; lower its band_hz"
             )
     sums = [("all arrays", site.specs)] if len(site.specs) > 1 else []
     if joint and len(site.processed) > 1:

@@ -1,6 +1,6 @@
 """Power maps of many recordings at once: a matrix per pair of microphones, made once, times their correlations.
 
-This is fast on coarse grids. The memory grows with the grid, so fine grids use the look-ups of `livessl.core.locate.srp`.
+This is fast on coarse grids. Its memory grows with the grid, so fine grids use look-ups (`livessl.core.locate.srp`).
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class PairMatrices:
 
 
 class PairTables:
-    """The same for fine grids: look-ups in tables of finely interpolated correlations, one for each cut-off.
+    """Maps fine grids by look-ups in tables of finely interpolated correlations, one table for each cut-off.
 
     The cut-offs are third octaves, rounded down.
 
@@ -116,7 +116,7 @@ class PairTables:
         self._made: dict[bytes, SRPMapper] = {}
 
     def power(self, spec: ArraySpec, pairs: IntArray, lags: Float32Array) -> Float32Array:
-        """Map recordings of one array, as `PairMatrices.power`."""
+        """Map C recordings of one array, as `PairMatrices.power` does."""
         cut_offs_hz = third_octaves_below_hz(spec.band_hz) if self._band_limit else ()
         count = lags.shape[2]
         reach = int(np.ceil(spec.aperture_m / self._c_m_s * self._rate_hz)) * OVERSAMPLING + OVERSAMPLING
@@ -143,5 +143,5 @@ class PairTables:
 
 
 def _taper(offset_s: FloatArray) -> FloatArray:
-    """Flat for the first half of the margin, then a cosine to nothing: no step where the lags end."""
+    """Return weights that are 1 over half of the margin and then fall to 0 as a cosine: the lags end without a step."""
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(2.0 * np.abs(offset_s) / MARGIN_S - 1.0, 0.0, 1.0)))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -28,9 +28,8 @@ def panels(rows: int = 1, columns: int = 1, size_inches: tuple[float, float] = (
 def save(figure: Figure, path: Path, dpi: int = 130) -> None:
     """Write a figure as a PNG with a palette; the same figure gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.set_dpi(dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=dpi)
+    image = Image.open(buffer).convert("RGB")
     with_palette = image.quantize(PALETTE, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     with_palette.save(path, optimize=True)
