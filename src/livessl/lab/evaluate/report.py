@@ -33,7 +33,7 @@ READINGS: Final = (
     "Intervals are 99 % bootstrap intervals. Positions are resampled, in the same way for all conditions, so that "
     "differences are paired.",
 )
-"""How open points of the paper are settled; each is a switch or a line here."""
+"""Decisions on points that the paper leaves open; each is a switch or a line here."""
 
 PAPERS_LAYOUT: Final = (
     "A tetrahedron consists of every other vertex of a cube. The second array of a pair is mirrored along the length, "

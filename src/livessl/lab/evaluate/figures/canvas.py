@@ -1,4 +1,4 @@
-"""What all figures share: colours, panels, and how a figure becomes a PNG."""
+"""The common parts of all figures: colours, panels and the PNG file."""
 
 from __future__ import annotations
 
