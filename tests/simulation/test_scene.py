@@ -235,7 +235,7 @@ def test_useless_files_are_named(tmp_path: Path, samples: np.ndarray[Any, Any], 
 
 def test_unreadable_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "bad.wav").write_bytes(b"RIFF and then nothing of the kind")
-    with pytest.raises(ValueError, match=r"bad.wav: expected a readable WAV or FLAC file, got .*; replace it"):
+    with pytest.raises(ValueError, match=r"bad.wav: expected a readable WAV or FLAC file, got .*; replace or remove it"):
         read_sounds(tmp_path, RATE_HZ)
 
 

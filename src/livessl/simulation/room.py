@@ -83,8 +83,8 @@ def impulse_responses(
     """Compute the responses from a source to microphones, all omnidirectional, by the image method.
 
     An image after n reflections at distance d arrives after d/c with amplitude beta^n / (4 pi d). Neither d nor n
-    depends on the reverberation time, so the images are visited once: h = A B, where A (time, n) sums 1 / (4 pi d) and B (n, R) holds
-    beta^n, with beta = sqrt(1 - alpha) and alpha of `absorption`.
+    depends on the reverberation time, so the images are visited once: h = A B, where A (time, n) sums 1 / (4 pi d) and
+    B (n, R) holds beta^n, with beta = sqrt(1 - alpha) and alpha of `absorption`.
 
     Parameters
     ----------
