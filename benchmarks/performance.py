@@ -468,7 +468,8 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
         f"client; it takes {_number(memory.offset)} MB and another {_number(memory.factor)} MB per array. An array of",
         f"four microphones sends {_number(megabits)} Mbit/s during sound, and almost nothing otherwise. The largest",
         f"number of arrays that one server carried on this machine is {most}; for more, use several servers, for",
-        f"example one per hall. The table assumes that all arrays send sound at once and that nothing is used beyond {USED:.0%}.",
+        "example one per hall. The table assumes that all arrays send sound at once and that nothing is used beyond",
+        f"{USED:.0%}.",
     )
     yield ""
     rows = []
