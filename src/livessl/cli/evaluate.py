@@ -160,7 +160,8 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
         If an argument, a sound or the folder is unusable, or the extra `evaluate` is not installed.
     """
     try:
-        from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
+        from livessl.lab.evaluate.campaign import run_campaign
+        from livessl.lab.evaluate.job import Job, read_clips
         from livessl.lab.evaluate.report import require_campaign, write_report
     except ImportError as error:
         raise ValueError(
@@ -187,7 +188,8 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
 
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
-    from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
+    from livessl.lab.evaluate.campaign import run_campaign
+    from livessl.lab.evaluate.job import Job, read_clips
     from livessl.lab.evaluate.localizer_report import write_localizer_report
     from livessl.lab.evaluate.sessions import SessionSettings
     from livessl.lab.evaluate.sessions_report import write_sessions_report
