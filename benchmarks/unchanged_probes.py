@@ -23,7 +23,7 @@ from unchanged_trees import (
 
 HERE: Final = Path(__file__).parent
 
-REASON: Final = re.compile(rb'"reason": "(?:[^"\\\\]|\\\\.)*"')
+REASON: Final = re.compile(rb'"reason": "(?:[^"\\]|\\.)*"')
 """The reason of an event in JSON, with its text."""
 
 
