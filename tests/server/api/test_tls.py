@@ -1,4 +1,4 @@
-"""TLS from certificate files: requests and WebSockets are encrypted, and files that do not fit stop the start."""
+"""TLS from certificate files: requests and WebSockets are encrypted, and the server does not start on wrong files."""
 
 from __future__ import annotations
 
@@ -58,9 +58,7 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
         for offered in ("DEFAULT", "AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA256"):
             trusted.set_ciphers(offered)
             with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
-                if (
-                    version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT"
-                ):  # no key exchange anew, or none authentic
+                if version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT":  # not forward secret, or without AEAD
                     with pytest.raises(ssl.SSLError):
                         trusted.wrap_socket(plain, server_hostname="127.0.0.1")
                     continue
@@ -71,7 +69,7 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
 
 
 @pytest.mark.parametrize(
-    ("certificate", "key", "said"),
+    ("certificate", "key", "fault"),
     [
         ("site.crt", "other.key", "KEY_VALUES_MISMATCH"),
         ("site.crt", "locked.key", "name a PEM certificate and its key without a passphrase"),
@@ -79,9 +77,9 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
         ("site.key", "site.key", "name a PEM certificate"),
     ],
 )
-def test_files_that_do_not_fit_stop_the_start(folder: Path, certificate: str, key: str, said: str) -> None:
+def test_server_does_not_start_on_files_that_do_not_match(folder: Path, certificate: str, key: str, fault: str) -> None:
     changes = {"server.http.certificate": certificate, "server.http.private_key": key}
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=fault) as caught:
         Server(site_of(changes, folder), SystemClock())
     assert str(caught.value).startswith("server.http.certificate: cannot use ")
 
