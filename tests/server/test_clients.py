@@ -13,7 +13,7 @@ from clients import MAX_CLIENT_KB, measure, open_client
 from livessl.server.app import Server
 from livessl.server.fanout import BACKLOG
 from messages import update_message
-from small_site import running_server, site_of, wait_until
+from small_site import HANG_S, running_server, site_of, wait_until
 
 
 @pytest.mark.processes
@@ -42,7 +42,7 @@ def test_client_that_leaves_with_messages_on_their_way_causes_no_log_line(caplog
 
         assert server.loop is not None
         server.loop.call_soon_threadsafe(leave)
-        assert done.wait(5)
+        assert done.wait(timeout=HANG_S)
         wait_until(lambda: server.parts.fanout.clients == 0, "its place to be free")
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
 

@@ -15,7 +15,7 @@ from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.server.app import Server
-from small_site import running_server, scene_recordings, site_of, wait_until
+from small_site import HANG_S, running_server, scene_recordings, site_of, wait_until
 
 CLOCK: Final = SystemClock()
 _RUNS = count()
@@ -58,10 +58,10 @@ def get(client: httpx.Client, path: str, status: int = 200, **query: Any) -> dic
 def live(server: Server, query: str = "", origin: str | None = None) -> Any:
     """Open the WebSocket of messages."""
     url = f"ws{server.url.removeprefix('http')}/api/v1/live{query}"
-    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=5)
+    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=HANG_S)
 
 
 def watch(server: Server, query: str = "", origin: str | None = None) -> Any:
     """Open the WebSocket of maps."""
     url = f"ws{server.url.removeprefix('http')}/api/v1/map{query}"
-    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=5)
+    return connect(url, origin=None if origin is None else Origin(origin), open_timeout=HANG_S)

@@ -24,7 +24,7 @@ from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
 from livessl.server.app import REFRESH_S, Server
 from livessl.server.http import MAX_HEAD_BYTES
 from livessl.site.tokens import Role, add_token, revoke_token
-from small_site import running_server, site_of, wait_until, write_site
+from small_site import HANG_S, running_server, site_of, wait_until, write_site
 
 TOKENED = {"server.http.tokens": "tokens.yaml"}
 ROLES: list[Role | None] = [None, *Role]
@@ -44,7 +44,7 @@ class Secured:
         return {} if role is None else {"Authorization": f"Bearer {self.tokens[role]}"}
 
     def live(self, path: str = "live", **more: Any) -> Any:
-        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=5, **more)
+        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=HANG_S, **more)
 
     def routes(self) -> set[str]:
         """Every path of the OpenAPI description, with examples in place of its parameters."""
@@ -55,12 +55,12 @@ class Secured:
 def listen(live: ClientConnection) -> None:
     """Receive messages until the server closes the WebSocket."""
     while True:
-        live.recv(timeout=5)
+        live.recv(timeout=HANG_S)
 
 
 def raw(url: str, data: bytes, until: bytes | None = None) -> bytes:
     """Send bytes; return the answer up to a text in it or to the end of the connection."""
-    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=5) as connection:
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=HANG_S) as connection:
         answer = b""
         try:
             connection.sendall(data)
@@ -156,18 +156,18 @@ def test_paths_without_a_route_are_guarded() -> None:
 def test_live_with_a_token(secured: Secured, role: Role) -> None:
     """Programs send the token in a header; browsers offer it among the protocols."""
     with secured.live(additional_headers=secured.headers(role)) as live:
-        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         assert live.subprotocol is None
     offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{secured.tokens[role]}")]
     with secured.live(subprotocols=offered) as live:
-        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         assert live.subprotocol == "livessl"  # and never the one with the token
 
 
 @pytest.mark.parametrize("role", list(Role))
 def test_map_with_a_token(secured: Secured, role: Role) -> None:
     with secured.live("map", additional_headers=secured.headers(role)) as watching:
-        assert watching.ping().wait(timeout=5)  # the connection is open and stays open
+        assert watching.ping().wait(timeout=HANG_S)  # the connection is open and stays open
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,7 @@ def test_token_is_in_no_log(tmp_path: Path) -> None:
                 httpx.get(f"{url}/api/v1/site?token={token}")
                 offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{token}")]
                 with connect(f"ws{url.removeprefix('http')}/api/v1/live", subprotocols=offered) as live:
-                    live.recv(timeout=5)
+                    live.recv(timeout=HANG_S)
                 raw(url, f"GET / HTTP/1.1\r\nAuthorization: Bearer {token}\r\nbroken\r\n\r\n".encode())
         finally:
             process.terminate()

@@ -12,15 +12,15 @@ from websockets.sync.client import connect
 from api_contract import Contract
 from livessl.server.api import live, routes
 from livessl.server.fanout import Fanout
-from small_site import running_server, site_of
+from small_site import HANG_S, running_server, site_of
 
 
 def test_all_messages_and_answers_are_checked(contract: Contract) -> None:
     messages, answers = contract.messages, contract.answers
     with running_server(site_of()) as server:
-        with connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=5) as socket:
+        with connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=HANG_S) as socket:
             for _ in range(3):
-                socket.recv(timeout=5)
+                socket.recv(timeout=HANG_S)
         assert httpx.get(f"{server.url}/api/v1/arrays").status_code == 200
         assert httpx.get(f"{server.url}/api/v1/events/none").status_code == 404
     assert contract.messages - messages >= 5  # three as sent, two of them as published
@@ -40,9 +40,9 @@ def test_a_field_that_the_model_lacks_is_found(contract: Contract, monkeypatch: 
 def test_a_wrong_value_in_a_message_is_found(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "API_VERSION", 2)
     with contract.broken() as faults, running_server(site_of()) as server:
-        socket = connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=5)
+        socket = connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=HANG_S)
         with socket:
-            assert json.loads(socket.recv(timeout=5))["v"] == 2
+            assert json.loads(socket.recv(timeout=HANG_S))["v"] == 2
     assert any("hello.v" in fault for fault in faults)
 
 

@@ -11,7 +11,7 @@ from playwright.sync_api import expect
 from browser import running_browser
 from livessl.server.api import documentation
 from livessl.site.tokens import add_token
-from small_site import Changes, running_server, site_of
+from small_site import HANG_S, Changes, running_server, site_of
 
 
 @pytest.mark.browser
@@ -29,7 +29,7 @@ def test_page_shows_the_api_and_asks_no_other_server(tmp_path: Path, tokens: boo
         if tokens:
             page.add_init_script(f"sessionStorage.setItem('livessl-token', '{token}')")
         page.goto(f"{server.url}/docs")
-        expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=20_000)
+        expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=1000 * HANG_S)
         page.locator("#operations-estimates-get_tracks_api_v1_tracks_get .opblock-summary-control").click()
         page.get_by_role("button", name="Try it out").click()
         page.get_by_role("button", name="Execute").click()

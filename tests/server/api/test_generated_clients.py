@@ -22,7 +22,7 @@ from conftest import require
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.server.app import Server
-from small_site import running_server, scene_recordings, site_of
+from small_site import HANG_S, running_server, scene_recordings, site_of
 
 PACKAGES = {"openapi-typescript": "7.13.0", "typescript": "5.9.3", "@asyncapi/specs": "6.11.1"}
 """Packages from npm, at fixed versions, so that a new release cannot break the tests."""
@@ -61,7 +61,7 @@ def server(server_and_messages: tuple[Server, list[str]]) -> Server:
 def server_and_messages() -> Iterator[tuple[Server, list[str]]]:
     """A server that has located two events, and the messages that it sent meanwhile."""
     with running_server(site_of()) as server:
-        with connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=5) as socket:
+        with connect(f"ws{server.url.removeprefix('http')}/api/v1/live", open_timeout=HANG_S) as socket:
             start_ns = SystemClock().now_ns()
             send_session(
                 site_of(),
@@ -75,7 +75,7 @@ def server_and_messages() -> Iterator[tuple[Server, list[str]]]:
             server.wait_idle()
             messages, events = [], 0
             while events < 2:
-                messages.append(str(socket.recv(timeout=10)))
+                messages.append(str(socket.recv(timeout=HANG_S)))
                 events += json.loads(messages[-1])["kind"] == "event"
         yield server, messages
 

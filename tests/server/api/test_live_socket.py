@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from livessl.clock import utc_ns
 from livessl.server import http
 from livessl.server.app import Server
-from small_site import running_server, site_of, wait_until
+from small_site import HANG_S, running_server, site_of, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +32,25 @@ def client(server: Server) -> Iterator[httpx.Client]:
 
 def test_first_message_is_hello(server: Server) -> None:
     with live(server) as socket:
-        hello = json.loads(socket.recv(timeout=5))
+        hello = json.loads(socket.recv(timeout=HANG_S))
         assert (hello["v"], hello["kind"], hello["site"], hello["mode"]) == (1, "hello", "small", "live")
         assert [array["name"] for array in hello["arrays"]] == ["north", "south"]
         socket.send("messages of clients are ignored")
-        following = [json.loads(socket.recv(timeout=5)) for _ in range(2)]
+        following = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(2)]
         assert {message["kind"] for message in following} <= {"arrays", "track"}
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 
 def test_client_that_returns_gets_what_it_missed(server: Server) -> None:
     with live(server) as socket:
-        hello, first, second = (json.loads(socket.recv(timeout=5)) for _ in range(3))
+        hello, first, second = (json.loads(socket.recv(timeout=HANG_S)) for _ in range(3))
     with live(server, f"?since_seq={first['seq']}") as socket:
-        greeting, following = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+        greeting, following = (json.loads(socket.recv(timeout=HANG_S)) for _ in range(2))
     assert greeting["kind"] == "hello"
     assert following == second
     assert hello["last_seq"] > 1_600_000_000_000  # above every number before the restart
     with live(server, "?since_seq=5") as socket:
-        _, gap = (json.loads(socket.recv(timeout=5)) for _ in range(2))
+        _, gap = (json.loads(socket.recv(timeout=HANG_S)) for _ in range(2))
     assert (gap["kind"], gap["missed"]) == ("gap", None)
 
 
@@ -66,7 +66,7 @@ def test_client_that_returns_gets_what_it_missed(server: Server) -> None:
 )
 def test_wrong_filter_closes_the_socket_with_a_reason(server: Server, query: str, reason: str) -> None:
     with live(server, query) as socket, pytest.raises(ConnectionClosed) as caught:
-        socket.recv(timeout=5)
+        socket.recv(timeout=HANG_S)
     assert caught.value.rcvd is not None
     assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, reason)
 
@@ -74,7 +74,7 @@ def test_wrong_filter_closes_the_socket_with_a_reason(server: Server, query: str
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://evil.example:80", "null", "http://["])
 def test_page_of_another_server_may_not_connect(server: Server, origin: str) -> None:
     with live(server, origin=origin) as socket, pytest.raises(ConnectionClosed) as caught:
-        socket.recv(timeout=5)
+        socket.recv(timeout=HANG_S)
     assert caught.value.rcvd is not None
     assert caught.value.rcvd.code == 1008
     assert caught.value.rcvd.reason.startswith("origin: ")
@@ -82,13 +82,13 @@ def test_page_of_another_server_may_not_connect(server: Server, origin: str) -> 
 
 def test_page_of_the_server_itself_may_connect(server: Server) -> None:
     with live(server, origin=server.url) as socket:
-        assert json.loads(socket.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(socket.recv(timeout=HANG_S))["kind"] == "hello"
 
 
 def test_subscriber_that_sends_too_much_is_disconnected(server: Server) -> None:
     with live(server) as talkative:
         talkative.send("x" * 4096)
-        assert json.loads(talkative.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(talkative.recv(timeout=HANG_S))["kind"] == "hello"
         talkative.send("x" * 4097)
         with pytest.raises(ConnectionClosed) as caught:
             deque(talkative, maxlen=0)
@@ -108,7 +108,7 @@ def test_stages_of_the_latency_add_up() -> None:
     """With one clock every stage is positive, and their sum is at most the delay that the client sees."""
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
         capture_scene(server)
-        messages = [json.loads(socket.recv(timeout=5)) for _ in range(8)]
+        messages = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(8)]
         now_ns = CLOCK.now_ns()
         metrics = httpx.get(f"{server.url}/metrics").text
     answers = [message for message in messages if message["kind"] in ("event", "update")]
@@ -129,9 +129,9 @@ def test_stages_of_the_latency_add_up() -> None:
 
 def test_only_the_chosen_kinds_are_sent(server: Server) -> None:
     with live(server, "?kinds=event") as events, live(server, "?kinds=arrays") as states:
-        assert json.loads(events.recv(timeout=5))["kind"] == "hello"
-        assert json.loads(states.recv(timeout=5))["kind"] == "hello"
-        assert json.loads(states.recv(timeout=5))["kind"] == "arrays"
+        assert json.loads(events.recv(timeout=HANG_S))["kind"] == "hello"
+        assert json.loads(states.recv(timeout=HANG_S))["kind"] == "hello"
+        assert json.loads(states.recv(timeout=HANG_S))["kind"] == "arrays"
         with pytest.raises(TimeoutError):
             events.recv(timeout=0.1)
 

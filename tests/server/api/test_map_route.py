@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 
 from livessl.clock import utc_ns
 from livessl.server.app import Server
-from small_site import running_server, scene, site_of
+from small_site import HANG_S, running_server, scene, site_of
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_map_before_the_first_window_is_204(fresh: httpx.Client) -> None:
 
 def test_watcher_gets_the_newest_window_of_each_view(server: Server, client: httpx.Client) -> None:
     with watch(server, "?array=south&views=floor,side") as socket:
-        packed = [socket.recv(timeout=5) for _ in range(2)]
+        packed = [socket.recv(timeout=HANG_S) for _ in range(2)]
         with pytest.raises(TimeoutError):
             socket.recv(timeout=0.15)  # there is no newer window
     for view, data in zip(("floor", "side"), packed, strict=True):
@@ -100,7 +100,7 @@ def test_watcher_gets_each_new_window() -> None:
     with running_server(site_of()) as server, watch(server) as socket:
         for _ in range(2):
             replay_scene(server)
-            assert len(socket.recv(timeout=5)) == 48 + 16 * 20
+            assert len(socket.recv(timeout=HANG_S)) == 48 + 16 * 20
             with suppress(TimeoutError):
                 while True:
                     socket.recv(timeout=0.3)
@@ -115,14 +115,14 @@ def test_watcher_gets_each_new_window() -> None:
 )
 def test_wrong_query_closes_the_socket_with_a_reason(server: Server, query: str, reason: str) -> None:
     with watch(server, query) as socket, pytest.raises(ConnectionClosed) as caught:
-        socket.recv(timeout=5)
+        socket.recv(timeout=HANG_S)
     assert caught.value.rcvd is not None
     assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, reason)
 
 
 def test_page_of_another_server_may_not_watch(server: Server) -> None:
     with watch(server, origin="http://evil.example") as socket, pytest.raises(ConnectionClosed):
-        socket.recv(timeout=5)
+        socket.recv(timeout=HANG_S)
 
 
 @pytest.mark.parametrize(

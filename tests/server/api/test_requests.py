@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from livessl.server.app import Server
-from small_site import running_server, site_of
+from small_site import HANG_S, running_server, site_of
 
 API = "/api/v1"
 PATHS = ["/site", "/arrays", "/tracks", "/events", "/map", "/health", "/access"]
@@ -101,10 +101,10 @@ def test_every_unknown_parameter_is_named(client: httpx.Client) -> None:
 )
 def test_unknown_parameter_of_a_websocket_closes_it(server: Server, path: str, reason: str) -> None:
     with (
-        connect(f"ws{server.url.removeprefix('http')}{API}{path}", open_timeout=5) as socket,
+        connect(f"ws{server.url.removeprefix('http')}{API}{path}", open_timeout=HANG_S) as socket,
         pytest.raises(ConnectionClosed) as caught,
     ):
-        socket.recv(timeout=5)
+        socket.recv(timeout=HANG_S)
     assert caught.value.rcvd is not None
     assert caught.value.rcvd.code == 1008
     assert caught.value.rcvd.reason.startswith(reason)

@@ -24,7 +24,7 @@ from livessl.clock import utc_ns, utc_text
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
-from small_site import SMALL, running_server, scene, site_of, wait_until
+from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
 
 PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
 ROUTES = {
@@ -224,7 +224,7 @@ def test_events_are_published_while_the_database_is_locked(tmp_path: Path) -> No
         other.execute("BEGIN IMMEDIATE")
         with live(server, "?kinds=event") as socket:
             replay_scene(server)
-            kinds = [json.loads(socket.recv(timeout=10))["kind"] for _ in range(3)]
+            kinds = [json.loads(socket.recv(timeout=HANG_S))["kind"] for _ in range(3)]
         other.rollback()
         assert kinds == ["hello", "event", "event"]
         with httpx.Client(base_url=server.url) as client:

@@ -17,7 +17,7 @@ from conftest import require
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.server.app import Server
-from small_site import running_server, site_of
+from small_site import HANG_S, running_server, site_of
 
 FILES = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}
 
@@ -41,8 +41,8 @@ def test_everything_is_encrypted(folder: Path) -> None:
         assert server.url.startswith("https://127.0.0.1:")
         health = httpx.get(f"{server.url}/api/v1/health", verify=trusted)
         assert health.json()["secured"]["tls"] is True
-        with connect(f"wss{server.url.removeprefix('https')}/api/v1/live", ssl=trusted, open_timeout=5) as live:
-            assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        with connect(f"wss{server.url.removeprefix('https')}/api/v1/live", ssl=trusted, open_timeout=HANG_S) as live:
+            assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         with pytest.raises(httpx.HTTPError):
             httpx.get(server.url.replace("https", "http") + "/api/v1/health")
         with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
@@ -57,7 +57,7 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
         port = int(server.url.rpartition(":")[2])
         for offered in ("DEFAULT", "AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA256"):
             trusted.set_ciphers(offered)
-            with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
+            with socket.create_connection(("127.0.0.1", port), timeout=HANG_S) as plain:
                 if version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT":  # not forward secret, or without AEAD
                     with pytest.raises(ssl.SSLError):
                         trusted.wrap_socket(plain, server_hostname="127.0.0.1")
