@@ -6,6 +6,7 @@ import json
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -108,6 +109,14 @@ def serve_until(link: Link, condition: Callable[[], object], what: str) -> None:
     wait_until(turn, what)
 
 
+def is_connected(link: Link) -> bool:
+    return link.connected
+
+
+def has_refused(server: Server, before: int) -> bool:
+    return server.parts.refusals.count("nodes") > before
+
+
 def test_loopback_serves_nodes_requests_and_websockets() -> None:
     with running_server(site_of(on("::1"))) as server:
         assert server.endpoint.startswith("tcp://[::1]:")
@@ -150,7 +159,7 @@ def test_every_address_means_ipv4_as_well(folder: Path) -> None:
         for host in ("127.0.0.1", "[::1]"):
             endpoint = f"tcp://{host}:{port_of(server.endpoint)}"
             with linked(endpoint, folder, "lab-pc") as link:
-                serve_until(link, lambda link=link: link.connected, "the connection")
+                serve_until(link, partial(is_connected, link), "the connection")
             url = f"http://{host}:{port_of(server.url)}"
             assert httpx.get(f"{url}/api/v1/site").status_code == 401
             assert httpx.get(f"{url}/api/v1/site", headers=admin).status_code == 200
@@ -160,7 +169,7 @@ def test_every_address_means_ipv4_as_well(folder: Path) -> None:
                 connect(f"ws{url.removeprefix('http')}/api/v1/live")
             refused = server.parts.refusals.count("nodes")
             with linked(endpoint, folder, "stranger") as link:
-                serve_until(link, lambda n=refused: server.parts.refusals.count("nodes") > n, "the refusal")
+                serve_until(link, partial(has_refused, server, refused), "the refusal")
         listed = httpx.get(f"http://[::1]:{port_of(server.url)}/api/v1/access", headers=admin).json()["refused"]
         assert {(one["door"], one["who"]) for one in listed} == {
             (door, who) for door in ("nodes", "http") for who in ("127.0.0.1", "::1")
