@@ -1,4 +1,4 @@
-"""`livessl demo`: a simulated scene through real processes, with the error of every answer."""
+"""`livessl demo`: a simulated scene played through real processes, with the error of every event."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from livessl.clock import SystemClock
 from livessl.lab import demo
 
 WITHIN_M: Final = 0.5
-"""Largest error, in metres, of a sound that counts as located; the paper counts so, too."""
+"""Largest error, in metres, of a sound that counts as located; the paper uses the same limit."""
 
 _HEAD: Final = f"{'time':>7}  {'sound':<14} {'true position':<22} {'found':<22} {'error':>7}  status"
 
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--once", action="store_true", help="run the scene once, print each event and its error")
+    parser.add_argument("--once", action="store_true", help="run the scene once without opening a browser, and exit")
     add_json(parser)
     parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default 8000)")
-    parser.add_argument("--events", type=argument.positive, default=8, help="sounds in the scene (default 8)")
-    parser.add_argument("--no-browser", action="store_true", help="do not open the dashboard")
+    parser.add_argument("--events", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
+    parser.add_argument("--no-browser", action="store_true", help="do not open the dashboard in a browser")
 
 
 def run(arguments: argparse.Namespace) -> int:

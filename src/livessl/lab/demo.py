@@ -1,4 +1,4 @@
-"""The demo: a simulated scene through real processes and real sockets, and how far off each answer was."""
+"""The demo: a simulated scene through real processes and real sockets, and the error of each result."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from livessl.site.models import Site
 SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
 
 LEAD_NS: Final = 5_000_000_000
-"""From the command to the scene's first sample: the nodes must be up by then."""
+"""Time, in nanoseconds, from the command to the scene's first sample, in which the nodes start."""
 
 MATCH_S: Final = 1.0
-"""An event that begins this near to a source's start is its event."""
+"""Longest time, in seconds, between the starts of a source and of its event."""
 
 RATE_HZ: Final = 44100.0
 SEED: Final = 1
@@ -44,7 +44,7 @@ class DemoError(RunError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """One source of the scene, and the event that was made of it."""
+    """One source of the scene and its event, if there is one."""
 
     name: str
     start_s: float
@@ -53,12 +53,12 @@ class Outcome:
 
     @property
     def located(self) -> bool:
-        """Whether there is a position."""
+        """True if the event has a position."""
         return self.event is not None and self.event["status"] == "located"
 
     @property
     def error_m(self) -> float | None:
-        """Distance from the truth."""
+        """Distance from the true position, in metres; None without a position."""
         return (
             None
             if self.event is None or self.event["position_m"] is None
@@ -86,14 +86,14 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
 
 @contextmanager
 def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[tuple[str, int]]:
-    """Server and nodes as processes while the context lasts; yields the dashboard's address and the scene's start, ns.
+    """Run server and nodes as processes; yield the dashboard's address and the start of the scene, in nanoseconds.
 
-    The scene starts when the server is there: the first time on a machine that takes some seconds.
+    The scene starts when the server is ready, which takes some seconds at the first start on a machine.
 
     Raises
     ------
     NotStartedError
-        Where one of them does not come up.
+        If one of the processes does not start.
     """
     http = site.server.http
     url = f"http://{http.host}:{http.port}"
@@ -112,7 +112,7 @@ def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterato
 
 
 def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObject]:
-    """Events from the WebSocket, as any subscriber gets them, until a time or for ever."""
+    """Yield events from the WebSocket, as any client receives them, until a time or without end."""
     with connect(f"ws{url.removeprefix('http')}/api/v1/live?kinds=event", open_timeout=10) as live:
         while until_ns is None or clock.now_ns() < until_ns:
             try:
@@ -126,14 +126,14 @@ def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObje
 
 
 def read_truth(directory: Path) -> list[dict[str, Any]]:
-    """The scene's sources."""
+    """Read the sources of the scene."""
     return [json.loads(line) for line in (directory / TRUTH_FILE).read_text(encoding="utf-8").splitlines()]
 
 
 def match(
     truth: Sequence[dict[str, Any]], events: Sequence[JsonObject], start_ns: int, period_s: float
 ) -> list[Outcome]:
-    """For each source the event nearest in time, within `MATCH_S`; scene time repeats after `period_s`."""
+    """Pair each source with the event nearest in time, within `MATCH_S`; scene time repeats after `period_s`."""
     outcomes = []
     for source in truth:
         near = [(abs(_scene_time_s(event, start_ns, period_s) - source["start_s"]), event) for event in events]
@@ -145,7 +145,7 @@ def match(
 
 
 def nearest_source(truth: Sequence[dict[str, Any]], event: JsonObject, start_ns: int, period_s: float) -> Outcome:
-    """The source that an event was made of."""
+    """Pair an event with the source that is nearest in time."""
     time_s = _scene_time_s(event, start_ns, period_s)
     source = min(truth, key=lambda entry: abs(entry["start_s"] - time_s))
     x, y, z = source["position_m"]
@@ -157,7 +157,7 @@ def _scene_time_s(event: JsonObject, start_ns: int, period_s: float) -> float:
 
 
 def _need_free(host: str, port: int) -> None:
-    """Fail before anything is simulated; and never take another server's answers for the demo's."""
+    """Fail early if the port is in use, so that results of another server are never mistaken for the demo's."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -165,5 +165,5 @@ def _need_free(host: str, port: int) -> None:
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise DemoError(
-                f"--port {port}: cannot be used: {reason}; stop what listens there or choose another"
+                f"--port {port}: cannot be used: {reason}; stop the program that uses it or choose another port"
             ) from error

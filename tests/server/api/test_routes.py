@@ -129,7 +129,7 @@ def test_activity_threshold_follows_the_site_file() -> None:
 
 def test_arrays_before_their_first_message(fresh: httpx.Client) -> None:
     for array in get(fresh, "arrays")["arrays"]:
-        assert (array["state"], array["reason"], array["age_s"]) == ("starting", "not heard from yet", None)
+        assert (array["state"], array["reason"], array["age_s"]) == ("starting", "no message yet", None)
 
 
 def test_events_are_where_the_sounds_were(client: httpx.Client) -> None:
