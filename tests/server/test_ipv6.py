@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import socket
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from livessl.cli.main import main
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS
 from livessl.server.app import Server
-from livessl.server.receiver import BindError
+from livessl.server.receiver import BindError, address_cure
 from livessl.site import keys
 from livessl.site.tokens import add_token
 from small_site import RATE_HZ, Changes, running_server, scene, scene_recordings, site_of, wait_until, write_site
@@ -152,7 +153,7 @@ def test_names_and_pages_are_checked_like_those_of_ipv4() -> None:
 
 
 def test_every_address_means_ipv4_as_well(folder: Path) -> None:
-    """With keys, for nodes; with tokens, for clients; whoever is refused is listed under the plain IPv4 address."""
+    """Nodes have keys and clients have tokens. The list of refusals shows plain IPv4 addresses."""
     with open_server(folder, "::") as (server, admin):
         assert server.endpoint.startswith("tcp://[::]:")
         assert server.url.startswith("http://[::]:")
@@ -208,6 +209,10 @@ def test_dashboard_works() -> None:
         page.goto(server.url)
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
         expect(page.get_by_test_id("array-north")).to_be_visible()
+
+
+def test_machine_without_ipv6_is_named() -> None:
+    assert address_cure(errno.EAFNOSUPPORT) == "this machine has no IPv6; write an IPv4 address of it"
 
 
 def test_address_that_is_taken_is_named_as_in_the_site_file(tmp_path: Path) -> None:

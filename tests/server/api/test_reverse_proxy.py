@@ -19,7 +19,7 @@ from browser import faultless_page, running_browser
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from nginx import example, running_nginx
-from small_site import Changes, running_server, site_of
+from small_site import Changes, running_server, site_of, wait_until
 
 HOST = "Host $http_host"
 PUBLIC = "http://site.example"
@@ -65,12 +65,16 @@ def test_documented_nginx_serves_the_dashboard(
     token = add_token(tmp_path / "tokens.yaml", "wall", "viewer")
     changes = changes | {"server.http.tokens": "tokens.yaml"}
     with proxied(tmp_path, changes, location) as (_, url), faultless_page(browser) as page:
+        opened: list[str] = []
+        page.on("websocket", lambda socket: opened.append(socket.url.partition("?")[0]))
         page.goto(f"{url}/")
         page.get_by_role("textbox", name="Access token").fill(token)
         page.keyboard.press("Enter")
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=20_000)
         expect(page.get_by_test_id("array-north")).to_be_visible()
         expect(page.get_by_test_id("banner")).to_be_hidden()
+        wait_until(lambda: len(set(opened)) == 2, "both WebSockets")
+        assert set(opened) == {f"ws{url.removeprefix('http')}/api/v1/{name}" for name in ("live", "map")}
         page.goto(f"{url}/docs")
         expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=20_000)
         page.locator("#operations-estimates-get_tracks_api_v1_tracks_get .opblock-summary-control").click()
@@ -121,7 +125,7 @@ def test_no_path_gets_past_the_tokens(tmp_path: Path, path: str) -> None:
 def test_nginx_that_replaces_the_host_needs_a_trusted_name(
     tmp_path: Path, tokens: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """By default nginx sends the address of its upstream as the host."""
+    """The host that nginx sends by default is the address of its upstream."""
     token = add_token(tmp_path / "tokens.yaml", "wall", "viewer")
     changes: Changes = {"server.http.tokens": "tokens.yaml"} if tokens else {}
     bearer = {"Authorization": f"Bearer {token}"}

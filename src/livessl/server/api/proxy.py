@@ -1,4 +1,4 @@
-"""What a reverse proxy hides, restored from its headers: the client's address, the scheme, and the sub-path."""
+"""Middleware that restores from a proxy's headers what it hides: the client's address, the scheme, and the sub-path."""
 
 from __future__ import annotations
 
