@@ -19,7 +19,7 @@ from browser import faultless_page, running_browser
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from nginx import example, running_nginx
-from small_site import Changes, running_server, site_of, wait_until
+from small_site import Changes, running_server, site_of
 
 HOST = "Host $http_host"
 PUBLIC = "http://site.example"
@@ -69,11 +69,11 @@ def test_documented_nginx_serves_the_dashboard(
         page.on("websocket", lambda socket: opened.append(socket.url.partition("?")[0]))
         page.goto(f"{url}/")
         page.get_by_role("textbox", name="Access token").fill(token)
-        page.keyboard.press("Enter")
+        with page.expect_websocket(lambda socket: "/api/v1/map" in socket.url):  # opened after the greeting
+            page.keyboard.press("Enter")
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=20_000)
         expect(page.get_by_test_id("array-north")).to_be_visible()
         expect(page.get_by_test_id("banner")).to_be_hidden()
-        wait_until(lambda: len(set(opened)) == 2, "both WebSockets")
         assert set(opened) == {f"ws{url.removeprefix('http')}/api/v1/{name}" for name in ("live", "map")}
         page.goto(f"{url}/docs")
         expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=20_000)
