@@ -270,6 +270,13 @@ def test_unprotected_server_does_not_start_and_reports_all_faults(
     assert "server.bind: 'tcp://*:5570' can be reached from other machines" in said
 
 
+def test_trusted_hosts_without_tokens_are_warned_about() -> None:
+    changes: Changes = {"server.http.trusted_hosts": ["site.example"]}
+    [warning] = site_of(changes).warnings
+    assert warning.startswith("server.http.trusted_hosts: everyone who reaches the proxy may do everything; set")
+    assert site_of(changes | {"server.http.tokens": "tokens.yaml"}).warnings == ()
+
+
 def test_unencrypted_tokens_are_warned_about() -> None:
     public = {"server.http.host": "0.0.0.0", "server.http.tokens": "tokens.yaml"}
     [warning] = site_of(public).warnings
