@@ -20,12 +20,13 @@ MAX_RT60_S: Final = 5.0
 """Images grow with the cube of the reverberation time: more would take hours, and few rooms ring longer."""
 
 
-def assignment(text: str) -> tuple[str, Path]:
-    """ARRAY=FILE: both."""
-    name, equals, path = text.partition("=")
-    if not (name and equals and path):
+def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
+    """ARRAY=FILE or ARRAY=FILE,FILE,…: the array's name, and the files. A file may have commas in its name."""
+    name, equals, paths = text.partition("=")
+    files = (paths,) if Path(paths).exists() else tuple(paths.split(","))
+    if not (name and equals and all(files)):
         raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
-    return name, Path(path)
+    return name, tuple(map(Path, files))
 
 
 def joint(text: str) -> tuple[str, list[str]]:
