@@ -221,6 +221,6 @@ def test_every_file_that_does_not_fit_is_reported(tmp_path: Path) -> None:
 
 def test_files_begin_together_except_for_their_offset(tmp_path: Path) -> None:
     site = site_of({"arrays.south.wav_offset_s": -0.25})
-    path = write_wav(tmp_path / "hiss.wav", hiss(0.1))
-    parts = assign_files(site, {"north": path, "south": path}, start_ns=START_NS)
+    files = {name: write_wav(tmp_path / f"{name}.wav", hiss(0.1)) for name in BOTH}
+    parts = assign_files(site, files, start_ns=START_NS)
     assert [part.start_ns - START_NS for part in parts] == [0, -250_000_000]

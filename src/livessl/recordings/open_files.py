@@ -93,8 +93,9 @@ class OpenFiles:
         if shared:
             (path, _), other = shared[0]
             numbers = ", ".join(str(number) for (where, number), user in shared if (where, user) == (path, other))
+            given = next(name for name in paths if name.resolve() == path)
             raise DeviceError(
-                f"{path}: expected each channel to serve one array, got {numbers} for {other!r} and {array!r}; name "
+                f"{given}: expected each channel to serve one array, got {numbers} for {other!r} and {array!r}; name "
                 f"each array's channels with --channels {array}=… or in the site file (nodes.NAME.arrays), or give "
                 "each array a file of its own"
             )

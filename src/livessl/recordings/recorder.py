@@ -30,6 +30,18 @@ class RecordingError(RunError):
     """A recording that had to end because its sound could not be stored."""
 
 
+_FULL: Final = ("the disk is full", "free some space")
+_FAILURES: Final = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EFBIG: (
+        "a file has reached the largest size allowed (4 GiB on FAT disks, or `ulimit -f`)",
+        "raise the limit",
+    ),
+}
+"""Reason and cure by the number of the system's error."""
+
+
 @dataclass(slots=True)
 class _Open:
     file: SoundWriter
@@ -149,10 +161,8 @@ class Recorder:
         self._open.clear()
 
     def _ended(self, error: OSError) -> RecordingError:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        reason = "the disk is full" if full else (error.strerror or str(error)).lower()
+        reason, cure = _FAILURES.get(error.errno or 0, ((error.strerror or str(error)).lower(), "correct that"))
         kept = f"the {self._kept_s:.1f} s before are kept and can be replayed" if self._kept_s else "nothing is kept"
-        cure = "free some space" if full else "correct that"
         return RecordingError(
             f"{self._directory}: {reason}, so recording ended; {kept}; {cure}, or record to another disk"
         )

@@ -29,6 +29,10 @@ _HEADER_S: Final = 1.0
 """Interval, in seconds of sound, at which the length in the header is brought up to date."""
 
 
+_READ_SAMPLES: Final = 4096
+"""Samples of each channel that are read at a time, so that damage is found to a fraction of a second."""
+
+
 class SoundFile:
     """A WAV or FLAC file that is open for reading; use it as a context manager.
 
@@ -90,17 +94,17 @@ class SoundFile:
         DeviceError
             If the file is damaged.
         """
-        at = 0
-        while at < frames:
-            wanted = min(length, frames - at)
-            try:
-                piece = self._file.read(wanted, dtype="float32", always_2d=True)
-            except soundfile.SoundFileError as error:
-                raise self._damaged(at, getattr(error, "error_string", str(error))) from error
-            if len(piece) < wanted:
-                raise self._damaged(at + len(piece), "it ends there")
+        for first in range(0, frames, length):
+            piece = np.empty((min(length, frames - first), self.channels), dtype=np.float32)
+            for at in range(0, len(piece), _READ_SAMPLES):
+                part = piece[at : at + _READ_SAMPLES]
+                try:
+                    got = len(self._file.read(out=part))
+                except soundfile.SoundFileError as error:
+                    raise self._damaged(first + at, getattr(error, "error_string", str(error))) from error
+                if got < len(part):
+                    raise self._damaged(first + at + got, "it ends there")
             yield piece
-            at += wanted
 
     def _note(self, repair: Repair) -> str:
         return f"{self._path}: {repair.fault}; {repair.frames / self.sample_rate_hz:.2f} s of sound were found and read"
