@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,16 @@ def livessl(*arguments: object, limit: Callable[[], None] | None = None) -> subp
     done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit)
     assert "Traceback" not in done.stderr, done.stderr
     return done
+
+
+def here(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run a command in this process, where an error that it does not report fails the test."""
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+        try:
+            code = main([str(word) for word in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess([], code, out.getvalue(), err.getvalue())
 
 
 def events(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -73,9 +85,10 @@ def expected(scene: Path) -> list[Any]:
 def test_session_of_a_killed_recorder_is_replayed(scene: Path, tmp_path: Path, kind: str, expected: list[Any]) -> None:
     out = tmp_path / "session"
     options = ["--site", scene / "with-node.yaml", "--node", "lab-pc", "--out", out, "--format", kind]
+    words = [str(word) for word in (sys.executable, "-m", "livessl", "record", *options, *wavs(scene))]
     quiet: dict[str, Any] = {"stderr": subprocess.DEVNULL}
     lasts_s = heard("north").shape[1] / RATE_HZ
-    with started(sys.executable, "-m", "livessl", "record", *options, *wavs(scene), **quiet) as process:
+    with started(*words, **quiet) as process:
         wait_until((out / f"south-000.{kind}").exists, "a file of the recorder")
         time.sleep(lasts_s - 0.3)
         process.send_signal(signal.SIGKILL)
@@ -154,13 +167,13 @@ def listed(array: str, paths: list[Path]) -> list[str]:
 def test_microphones_with_a_file_each_are_located(scene: Path, tmp_path: Path, expected: list[Any]) -> None:
     north = split(scene, tmp_path, "north")
     common = ["locate", "--site", scene / "site.yaml", "--json", "--wav", f"south={scene / 'south.wav'}"]
-    assert positions(livessl(*common, *listed("north", north))) == expected
-    turned = livessl(*common, *listed("north", north[::-1]), "--channels", "north=4,3,2,1")
+    assert positions(here(*common, *listed("north", north))) == expected
+    turned = here(*common, *listed("north", north[::-1]), "--channels", "north=4,3,2,1")
     assert positions(turned) == expected
     pairs = [write_wav(tmp_path / f"pair-{k}.wav", heard("north")[k : k + 2]) for k in (0, 2)]
-    assert positions(livessl(*common, *listed("north", pairs))) == expected
+    assert positions(here(*common, *listed("north", pairs))) == expected
     comma = write_wav(tmp_path / "hall 1,north.wav", heard("north"))
-    assert positions(livessl(*common, "--wav", f"north={comma}")) == expected
+    assert positions(here(*common, "--wav", f"north={comma}")) == expected
 
 
 def test_microphones_with_a_file_each_are_recorded(scene: Path, tmp_path: Path) -> None:
@@ -177,12 +190,12 @@ def test_microphones_with_a_file_each_in_the_site_file(scene: Path, tmp_path: Pa
     files = {array: [path.name for path in split(scene, tmp_path, array)] for array in ("north", "south")}
     device: Changes = {"nodes.lab-pc.device": {"type": "wav", "files": files}}
     site, out = write_site(tmp_path, device), tmp_path / "session"
-    assert livessl("record", "--site", site, "--node", "lab-pc", "--out", out).returncode == 0
+    assert here("record", "--site", site, "--node", "lab-pc", "--out", out).returncode == 0
     assert soundfile.info(out / "north-000.flac").channels == 4
 
 
 def refusal(*arguments: object, code: int = 2) -> list[str]:
-    done = livessl(*arguments)
+    done = here(*arguments)
     assert (done.returncode, done.stdout) == (code, "")
     return done.stderr.splitlines()
 
@@ -229,9 +242,9 @@ def test_two_arrays_in_one_file_take_the_channels_of_their_node(
     channels = {a: list(range(first + 1 + 4 * k, first + 5 + 4 * k)) for k, a in enumerate(("north", "south"))}
     site = write_site(tmp_path, {"nodes.lab-pc.arrays": channels})
     both = ["--wav", f"north={path}", "--wav", f"south={path}"]
-    assert positions(livessl("locate", "--site", site, *both, "--json")) == expected
+    assert positions(here("locate", "--site", site, *both, "--json")) == expected
     told = [word for name, numbers in channels.items() for word in ("--channels", f"{name}={str(numbers)[1:-1]}")]
-    assert positions(livessl("locate", "--site", scene / "site.yaml", *both, *told, "--json")) == expected
+    assert positions(here("locate", "--site", scene / "site.yaml", *both, *told, "--json")) == expected
 
 
 def test_channel_that_serves_two_arrays_is_refused(tmp_path: Path, scene: Path) -> None:
@@ -291,8 +304,8 @@ def test_simulated_session_has_the_rates_of_the_site(
     assert {array: soundfile.info(out / f"{array}.wav").samplerate for array in channels} == written
     truth = [json.loads(line) for line in (out / "truth.jsonl").read_text().splitlines()]
     for done in (
-        livessl("locate", "--site", site, *wavs(out), "--json"),
-        livessl("replay", out, "--speed", "max", "--once", "--json"),
+        here("locate", "--site", site, *wavs(out), "--json"),
+        here("replay", out, "--speed", "max", "--once", "--json"),
     ):
         found = events(done)
         assert len(found) == 2
@@ -302,7 +315,7 @@ def test_simulated_session_has_the_rates_of_the_site(
 
 def test_rate_on_the_command_line_wins(tmp_path: Path) -> None:
     site, out = write_site(tmp_path), tmp_path / "session"
-    made = livessl("simulate", "--site", site, "--rt60", 0, "--count", 1, "--sample-rate", 24000, "--out", out)
+    made = here("simulate", "--site", site, "--rt60", 0, "--count", 1, "--sample-rate", 24000, "--out", out)
     assert made.returncode == 0
     assert soundfile.info(out / "south.wav").samplerate == 24000
 

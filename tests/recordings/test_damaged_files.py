@@ -22,6 +22,7 @@ from livessl.errors import DeviceError
 from livessl.recordings.recording import FileRecording
 from livessl.recordings.session import read_session
 from livessl.recordings.sound_file import SoundWriter
+from small_site import write_site
 
 FLAC_BLOCK = 4608
 """Largest number of samples in a frame of the FLAC encoders in use."""
@@ -230,12 +231,10 @@ os.kill(os.getpid(), 9)
 )
 def test_killed_recorder_loses_less_than_a_second(tmp_path: Path, kind: str, rate_hz: int, seconds: float) -> None:
     """The session can be read by livessl; other programs that trust the header lose two seconds at most."""
-    from small_site import write_site
-
     write_site(tmp_path, {"nodes.lab-pc.device.sample_rate_hz": rate_hz})
     samples = np.ascontiguousarray(noise(round(seconds * rate_hz) + rate_hz, 8, 3).T)
     np.save(tmp_path / "samples.npy", samples)
-    command = [sys.executable, "-c", KILLED, tmp_path, kind, str(rate_hz), str(seconds)]
+    command = [sys.executable, "-c", KILLED, str(tmp_path), kind, str(rate_hz), str(seconds)]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     session = read_session(tmp_path / "session")
     assert [piece.array for piece in session.pieces] == ["north", "south"]

@@ -6,6 +6,7 @@ They are types of argparse, and raise its `ArgumentTypeError`.
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
@@ -23,7 +24,7 @@ MAX_RT60_S: Final = 5.0
 def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
     """ARRAY=FILE or ARRAY=FILE,FILE,…: the array's name, and the files. A file may have commas in its name."""
     name, equals, paths = text.partition("=")
-    files = (paths,) if Path(paths).exists() else tuple(paths.split(","))
+    files = (paths,) if os.path.lexists(paths) else tuple(paths.split(","))
     if not (name and equals and all(files)):
         raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
     return name, tuple(map(Path, files))

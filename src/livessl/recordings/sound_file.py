@@ -68,8 +68,10 @@ class SoundFile:
         except (soundfile.SoundFileError, OSError, TypeError, ValueError) as error:
             if self._overlay is not None:
                 self._overlay.close()
+            if isinstance(error, FileNotFoundError):
+                raise _unreadable(path, "no such file") from error
             reason = getattr(error, "error_string", None) or getattr(error, "strerror", None) or str(error)
-            raise _unreadable(path, reason if path.exists() else "no such file") from error
+            raise _unreadable(path, reason) from error
         self.sample_rate_hz = int(self._file.samplerate)
         self.channels = int(self._file.channels)
         self.frames = int(self._file.frames) if repair is None else repair.frames
