@@ -115,7 +115,7 @@ class SoundFile:
         at_s, end_s = at / self.sample_rate_hz, self.frames / self.sample_rate_hz
         return DeviceError(
             f"{self._path}: expected {end_s:.2f} s of sound, cannot read it beyond {at_s:.2f} s: "
-            f"{reason.strip().rstrip('.')}; the file is damaged, copy or record it again"
+            f"{reason.removeprefix('Error : ').strip().rstrip('.')}; the file is damaged, copy or record it again"
         )
 
 
