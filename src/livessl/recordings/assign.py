@@ -198,7 +198,8 @@ def assign_sessions(site: Site, sessions: Iterable[Session]) -> list[AssignedRec
         if array in heard:
             files.notes.append(f"{path}: it holds no sound and is left out")
     given += [entry for entry in skipped if entry[0] not in heard]
-    files.match_ends([(path, start_ns) for _, (path,), start_ns in given])
+    joint = {member for name in site.joint for member in site.members(name)}
+    files.match_ends([(path, start_ns) for array, (path,), start_ns in given if array in joint])
     return _assign(site, given, {}, files)
 
 

@@ -1,7 +1,7 @@
-"""Headers of WAV and FLAC files that disagree with the file: how much sound is there, and a header that says so.
+"""Headers of WAV and FLAC files that disagree with the file's size, and their repair.
 
-A program that is killed, or whose disk is full, leaves a header that was never finished; a copy that was interrupted
-leaves a file that is shorter than its header says. The sound is there all the same.
+A program that is killed, or whose disk is full, leaves a header that was never finished. A copy that was interrupted
+leaves a file that is shorter than its header claims. In both cases the sound in the file can be read.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import BinaryIO, Final
 
 _UNKNOWN_32: Final = 0xFFFFFFFF
 _STREAMED: Final = 0x7FFFF000
-"""Least length, in bytes, by which a program says that it could not know the length: 2 or 4 GiB, less a header."""
+"""Least claimed length, in bytes, that means "unknown": programs that write to a pipe enter 2 or 4 GiB, or a little
+less."""
 
 _MAX_HEADER: Final = 1 << 24
-"""Largest header, in bytes, in which sound is looked for; beyond it a file is nonsense."""
+"""Largest header, in bytes, that is searched for the beginning of the sound: more than any program writes."""
 
 _CHUNK_LETTERS: Final = frozenset((string.ascii_letters + string.digits + " _-").encode())
 """Bytes of which the name of a RIFF chunk consists."""
@@ -32,7 +33,7 @@ STREAMINFO_END: Final = 42
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """What is wrong with the header of a sound file, and the header that is right.
+    """The fault of a sound file's header, and the right header.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ class Repair:
     frames : int
         Number of complete samples of each channel.
     fault : str
-        What is wrong, in words that follow the name of the file.
+        Sentence about the fault; it follows the name of the file.
     """
 
     header: bytes
@@ -53,7 +54,7 @@ class Repair:
 
 
 def find_repair(path: Path) -> Repair | None:
-    """Return what is wrong with the header of a WAV or FLAC file; None for a good one and for any other file.
+    """Return the repair of a WAV or FLAC file's header; None for a good header and for any other kind of file.
 
     Raises
     ------
@@ -139,7 +140,7 @@ def _short_sizes(header: bytes) -> tuple[int, int]:
 
 
 def _goes_on(file: BinaryIO, size: int, start: int, riff: int, data: int, align: int) -> bool:
-    """Return True if the sound goes on after its end by the header, which nobody finished."""
+    """Return True if the sound goes on beyond the end that the header claims, because the header is out of date."""
     end = start + data
     if size - end < align or (data == 0 and riff + 8 == size):
         return False

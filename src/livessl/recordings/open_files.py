@@ -13,8 +13,8 @@ from livessl.recordings.recording import FileRecording, Recording, StackedRecord
 _log = logging.getLogger(__name__)
 
 _SAME_END_S: Final = 1.0
-"""Files of one device whose lengths differ by less, in seconds, are cut to the shortest: a recorder that is killed
-has written more of one than of another."""
+"""Largest difference, in seconds, between the lengths of files of one device that are cut to the shortest: a recorder
+that is killed has written more of one than of another."""
 
 
 class OpenFiles:
@@ -63,7 +63,7 @@ class OpenFiles:
             except DeviceError as error:
                 faults.append(str(error))
         if any(recording.note for recording in found):
-            _cut_to_shortest(found)
+            self._cut_to_shortest(found)
         for recording in found[1:]:
             first = found[0]
             for got, expected, unit in (
@@ -108,7 +108,7 @@ class OpenFiles:
             if path in self._opened:
                 together.setdefault((path.parent, start_ns), []).append(self._opened[path])
         for recordings in together.values():
-            _cut_to_shortest(recordings)
+            self._cut_to_shortest(recordings)
 
     def log_notes(self) -> None:
         """Log the notes, each once."""
@@ -116,11 +116,14 @@ class OpenFiles:
             _log.warning("%s", note)
         self.notes.clear()
 
-
-def _cut_to_shortest(recordings: Sequence[FileRecording]) -> None:
-    shortest = min(recording.frames for recording in recordings)
-    longest = max(recording.frames for recording in recordings)
-    rates = {recording.sample_rate_hz for recording in recordings}
-    if len(rates) == 1 and longest - shortest < _SAME_END_S * min(rates):
-        for recording in recordings:
-            recording.cut(shortest)
+    def _cut_to_shortest(self, recordings: Sequence[FileRecording]) -> None:
+        shortest = min(recordings, key=lambda recording: recording.frames)
+        rate_hz = shortest.sample_rate_hz
+        excess = [recording.frames - shortest.frames for recording in recordings]
+        if {recording.sample_rate_hz for recording in recordings} != {rate_hz} or max(excess) >= _SAME_END_S * rate_hz:
+            return
+        for recording, more in zip(recordings, excess, strict=True):
+            if more:
+                recording.cut(shortest.frames)
+                unused = f"its last {more / rate_hz:.3f} s are not used, because {shortest.name} ends before"
+                self.notes.append(f"{recording.name}: {unused}")

@@ -57,7 +57,7 @@ class Recording(Protocol):
 class FileRecording:
     """A WAV or FLAC file, in any sample format that libsndfile reads.
 
-    A file that was cut, or whose header was never finished, is read as far as it is complete: `note` says so.
+    A file that was cut, or whose header was never finished, is read as far as it is complete, and `note` is set.
 
     Parameters
     ----------

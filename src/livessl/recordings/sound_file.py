@@ -1,6 +1,6 @@
-"""Sound files on disk: read as far as they are complete, and written so that a sudden end loses no more than a second.
+"""Sound files on disk: read as far as they are complete, and written so that a sudden end loses less than a second.
 
-No other module of the package meets the errors of libsndfile; here they become sentences.
+Errors of libsndfile end here: they become a `DeviceError` or an `OSError` with a sentence for the user.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class SoundFile:
     may_hold_anything : bool
         True if its sample format has NaN, infinity, and values beyond full scale.
     note : str or None
-        What is wrong with the file, and how much of it is read; None if nothing is wrong.
+        Sentence about the fault of the file and how much of it is read; None for a good file.
 
     Raises
     ------
