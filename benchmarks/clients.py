@@ -1,8 +1,8 @@
-"""What many WebSocket clients cost, some of them stalled: the server's memory, and how late the healthy ones hear.
+"""The cost of many WebSocket clients, some of them stalled: the server's memory and the delay of healthy clients.
 
-The server is the real one, in a process of its own; updates are put in where its engine would publish them. Clients are
-bare sockets in this process, so that reading costs little. Prints a table, or with `--json` one object; exits with 1
-where the healthy ones hear later than they may, or the server takes more memory.
+The server is the real one, in a process of its own; updates enter where its engine would publish them. Clients are bare
+sockets in this process, so that reading costs little. The output is a table, or one object with `--json`. The exit
+status is 1 if the delay of healthy clients or the server's memory exceeds its limit.
 """
 
 from __future__ import annotations
@@ -38,15 +38,16 @@ arrays:
 server: {bind: "tcp://127.0.0.1:*", http: {port: 0}}
 """
 STALLED_WINDOW_BYTES: Final = 4096
-"""A stalled client's receive buffer: small, so that the server soon has to keep what is not read."""
+"""Receive buffer of a stalled client, in bytes: small, so that unread messages soon pile up at the server."""
 
 WARM_UP_S: Final = 2.0
 
 MAX_DELAY_P95_MS: Final = 100.0
+"""Largest 95th percentile of the delay, in milliseconds, of healthy clients."""
 
 MAX_CLIENT_KB: Final = 200.0
-"""Of the server's memory for each client, stalled or not: 64 kB on their way out, a socket, and its queue of messages,
-which are one object for all."""
+"""Largest memory of the server per client, stalled or not, in kilobytes: 64 kB in its output buffer, a socket, and a
+queue of messages that all clients share."""
 
 
 STAMP: Final = b'"published_ns":'
@@ -55,7 +56,7 @@ STAMP: Final = b'"published_ns":'
 
 @dataclass
 class Log:
-    """What the listeners have heard while it was open."""
+    """Delays of the messages that the listeners received while the log was open."""
 
     open: bool = False
     delays_ms: list[float] = field(default_factory=list)
@@ -64,7 +65,7 @@ class Log:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it."""
+    """The measurement."""
 
     clients: int
     stalled: int
@@ -85,7 +86,7 @@ class Outcome:
 
 
 def measure(clients: int, stalled: int, updates_per_s: float, seconds: float) -> Outcome:
-    """Connect, publish, listen."""
+    """Connect the clients, publish updates, and measure their delays and the server's resources."""
     ours, theirs = multiprocessing.Pipe()
     process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs, updates_per_s), daemon=True)
     process.start()
@@ -111,12 +112,12 @@ def _serve(control: Connection, updates_per_s: float) -> None:
         begun_ns, number = time.monotonic_ns(), 0
         while not ended.is_set():
             number += 1
-            # where the engine hands over what it has located
+            # the entry point of the engine's results
             server._publish(_update(number, clock))
             due_ns = begun_ns + round(number / updates_per_s * 1e9)
             ended.wait(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
 
-    def obey() -> None:
+    def control_server() -> None:
         control.send(server.url)
         while control.recv() != "end":
             publishing.set()
@@ -124,13 +125,13 @@ def _serve(control: Connection, updates_per_s: float) -> None:
         publishing.set()
         server.stop()
 
-    for deed in (publish, obey):
-        threading.Thread(target=deed, daemon=True).start()
+    for work in (publish, control_server):
+        threading.Thread(target=work, daemon=True).start()
     server.run()
 
 
 def _update(number: int, clock: SystemClock) -> JsonObject:
-    """An update as a sound that two arrays hear makes it, and when it was published."""
+    """Return an update like that of a sound at two arrays, with the time of its publication."""
     contribution = {"active_s": 0.2, "level_dbfs": -31.2, "azimuth_deg": 12.3, "elevation_deg": -4.5, "distance_m": 3.2}
     return {
         "kind": "update",
@@ -196,7 +197,7 @@ async def _watch(
 
 
 def open_client(host: str, port: int, window_bytes: int | None, kinds: str = "update") -> socket.socket:
-    """A WebSocket for messages of some kinds, opened by hand."""
+    """Open a WebSocket for messages of some kinds by hand."""
     connection = socket.socket()
     if window_bytes is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window_bytes)
@@ -221,7 +222,7 @@ def open_client(host: str, port: int, window_bytes: int | None, kinds: str = "up
 
 
 class Listener(asyncio.Protocol):
-    """Takes frames apart as they come, and notes how long each update was under way."""
+    """Splits WebSocket frames as they arrive, and records the delay of each update."""
 
     def __init__(self, log: Log) -> None:
         self._log = log
@@ -229,12 +230,12 @@ class Listener(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the way back, for pongs."""
+        """Keep the transport for pongs."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
-        """Some bytes of some frames."""
+        """Process the bytes of any number of frames."""
         now_ns = time.monotonic_ns()
         data, at = self._rest + data, 0
         while len(data) >= at + 4:
@@ -243,14 +244,14 @@ class Listener(asyncio.Protocol):
                 length, body = int.from_bytes(data[at + 2 : at + 4], "big"), at + 4
             if len(data) < body + length:
                 break
-            if data[at] & 15 == 9 and self._transport is not None:  # a ping wants its pong, masked with zeros
+            if data[at] & 15 == 9 and self._transport is not None:  # answer a ping by a pong, masked with zeros
                 self._transport.write(bytes([0x8A, 0x80 | length, 0, 0, 0, 0]) + data[body : body + length])
             self.note(data, body, length, now_ns)
             at = body + length
         self._rest = data[at:]
 
     def note(self, data: bytes, body: int, length: int, now_ns: int) -> None:
-        """A frame's body has come."""
+        """Record the delay of a frame's body."""
         stamp = data.rfind(STAMP, body, body + length)
         if stamp >= 0 and self._log.open:
             sent_ns = int(data[stamp + len(STAMP) : body + length].rstrip(b"}"))
@@ -258,13 +259,13 @@ class Listener(asyncio.Protocol):
             self._log.message_bytes = length
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         if self._transport is not None:
             self._transport.abort()
 
 
 def _is_cut(connection: socket.socket) -> bool:
-    """Whether the server has hung up; what it sent before is read and thrown away."""
+    """Return whether the server has closed the connection; messages from before are read and discarded."""
     try:
         while connection.recv(65536):
             pass
@@ -288,19 +289,19 @@ def _cpu_s(pid: int) -> float:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clients", type=int, default=500, help="in all (default 500)")
-    parser.add_argument("--stalled", type=int, default=50, help="of them, that never read (default 50)")
-    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="updates a second (default 20)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="measured, after a warm-up (default 60)")
+    parser.add_argument("--clients", type=int, default=500, help="number of clients (default 500)")
+    parser.add_argument("--stalled", type=int, default=50, help="number of clients that never read (default 50)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="updates per second (default 20)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="measured time, after a warm-up (default 60)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    asked = parser.parse_args(arguments)
-    found: dict[str, Any] = asdict(measure(asked.clients, asked.stalled, asked.rate, asked.seconds))
-    if asked.json:
+    options = parser.parse_args(arguments)
+    found: dict[str, Any] = asdict(measure(options.clients, options.stalled, options.rate, options.seconds))
+    if options.json:
         print(json.dumps(found))
     else:
         for name, value in found.items():
             print(f"{name:<18} {value}")
-    grown_kb = 1000 * (found["rss_peak_mb"] - found["rss_before_mb"]) / asked.clients
+    grown_kb = 1000 * (found["rss_peak_mb"] - found["rss_before_mb"]) / options.clients
     return 1 if found["delay_p95_ms"] > MAX_DELAY_P95_MS or grown_kb > MAX_CLIENT_KB else 0
 
 

@@ -1,8 +1,7 @@
-"""What arrays cost that disagree about time: one scene, played again with one array's clock off, and drifting.
+"""The effect of clocks that disagree: one scene, replayed with one array's clock off and drifting.
 
-`python benchmarks/clocks.py --cache FOLDER` simulates a scene in the demo's room once, and localizes it with the south
-array's clock off by every offset and drift. What came out is in
-docs/accuracy/arrays.md.
+`python benchmarks/clocks.py --cache FOLDER` simulates a scene in the demo's room once, and localizes it with each
+offset and drift of the south array's clock. The results are in docs/accuracy/arrays.md.
 """
 
 from __future__ import annotations
@@ -39,24 +38,24 @@ NEAR_M: Final = 0.5
 
 @dataclass(frozen=True)
 class Drifting:
-    """A recording by a node whose clock gains: its blocks are stamped by it."""
+    """A recording whose blocks are stamped by a clock that runs fast."""
 
     once: FileRecording
     drift_ppm: float
 
     def __getattr__(self, name: str) -> Any:
-        """What else there is to know of a recording."""
+        """Return any other attribute of the recording."""
         return getattr(self.once, name)
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
-        """The recording's, stamped by that clock."""
+        """Yield the blocks of the recording with the stamps of that clock."""
         for block in self.once.blocks(start_ns):
             gained_ns = round((block.stamp_ns - start_ns) * self.drift_ppm * 1e-6)
             yield Block(block.first_index, block.samples, block.stamp_ns + gained_ns)
 
 
 def scene_of(site: Site, sounds: int, rt60_s: float, gap_s: float, seed: int) -> Scene:
-    """Development sounds of every class, anywhere in the room."""
+    """Make a scene of development sounds of every class, anywhere in the room."""
     chosen = [sound for name in CLASSES for sound in read_sounds(DATA / "dcase2016_task2", RATE_HZ) if name in sound[0]]
     return make_scene(
         site.room.size_m,
@@ -72,7 +71,7 @@ def scene_of(site: Site, sounds: int, rt60_s: float, gap_s: float, seed: int) ->
 
 
 def recorded(site: Site, scene: Scene, cache: Path, name: str) -> dict[str, Path]:
-    """Each array's recording of a scene, simulated once."""
+    """Simulate each array's recording of a scene, unless the cache has it; return the files."""
     cache.mkdir(parents=True, exist_ok=True)
     paths = {}
     for number, spec in enumerate(site.specs):
@@ -83,10 +82,10 @@ def recorded(site: Site, scene: Scene, cache: Path, name: str) -> dict[str, Path
     return paths
 
 
-def heard_with(
+def located_with(
     site: Site, paths: dict[str, Path], offset_s: float, drift_ppm: float, *, corrected: bool
 ) -> tuple[list[Event], ClockOffset | None]:
-    """What is found where the last array's clock is off, and what is known of it in the end."""
+    """Localize with the last array's clock off; return the events and the offset that was estimated at the end."""
     late = list(paths)[-1]
     parts = []
     for array, path in paths.items():
@@ -96,9 +95,7 @@ def heard_with(
             start_ns += round(offset_s * 1e9)
         drifting = Drifting(recording, drift_ppm if array == late else 0.0)
         parts.append(AssignedRecording(array, drifting, start_ns, tuple(range(1, 5))))
-    fusion = make_fusion(site, updates=False)
-    if not corrected:
-        fusion.clock_offsets = None
+    fusion = make_fusion(site, updates=False, corrects_clocks=corrected)
     outputs: list[Output] = []
     now_ns = 0
     for now_ns, batch in paced_messages(*make_pipelines(site, parts), UnpacedClock()):
@@ -109,17 +106,17 @@ def heard_with(
 
 
 def by_sound(scene: Scene, events: list[Event]) -> list[list[Event]]:
-    """The events that ended after each sound's beginning, and before the next one's."""
+    """Return for each sound the events that ended after its beginning and before that of the next sound."""
     starts_s = np.array([source.start_s for source in scene.sources])
-    told: list[list[Event]] = [[] for _ in scene.sources]
+    found: list[list[Event]] = [[] for _ in scene.sources]
     for event in events:
         end_s = (event.end_ns - START_NS) / 1e9
-        told[max(0, int(np.searchsorted(starts_s, end_s)) - 1)].append(event)
-    return told
+        found[max(0, int(np.searchsorted(starts_s, end_s)) - 1)].append(event)
+    return found
 
 
 def figures(scene: Scene, events: list[Event]) -> dict[str, Any]:
-    """How many sounds have one event, by both arrays and near; and how far off these are."""
+    """Count the sounds with one event, with both arrays and near the truth, and summarize the errors."""
     errors_m, both, one = [], 0, 0
     for source, found in zip(scene.sources, by_sound(scene, events), strict=True):
         one += len(found) == 1
@@ -141,14 +138,14 @@ def figures(scene: Scene, events: list[Event]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Simulate, listen, print a line for each offset and drift."""
+    """Simulate, localize, and print a line for each offset and drift."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sounds", type=int, default=36)
     parser.add_argument("--rt60", type=float, default=0.7)
     parser.add_argument("--gap", type=float, default=0.8)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--noise-dbfs", type=float, default=-75.0)
-    parser.add_argument("--uncorrected", action="store_true", help="as if nobody knew of clocks")
+    parser.add_argument("--uncorrected", action="store_true", help="do not estimate and correct clock offsets")
     parser.add_argument("--offsets", type=float, nargs="+", default=OFFSETS_S)
     parser.add_argument("--cache", type=Path, required=True)
     arguments = parser.parse_args()
@@ -159,7 +156,7 @@ def main() -> None:
     paths = recorded(site, scene, arguments.cache, name)
     for drift_ppm in DRIFTS_PPM:
         for offset_s in arguments.offsets:
-            events, clock = heard_with(site, paths, offset_s, drift_ppm, corrected=not arguments.uncorrected)
+            events, clock = located_with(site, paths, offset_s, drift_ppm, corrected=not arguments.uncorrected)
             found = figures(scene, events)
             if clock is not None:
                 last_s = (events[-1].end_ns - START_NS) / 1e9

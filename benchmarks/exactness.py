@@ -1,4 +1,4 @@
-"""Whether the search says what the whole map says: the same node and the same value, on every one of many maps.
+"""The search against the whole map: it must find the same grid point and the same value on every map.
 
     python benchmarks/exactness.py --out docs/performance
 
@@ -42,13 +42,13 @@ def compare(
     sounds: int = SOUNDS,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[dict[str, Any]]:
-    """Hold the search against the map, case by case.
+    """Compare the search with the map, case by case.
 
     Returns
     -------
     list of dict
-        Of each case how many `maps` there were, in how many the search found the `same` node and value, how many
-        searches the default limit had `given_up`, and in how many of those it had the right node all the same.
+        For each case the number of `maps`, the number on which the search found the `same` grid point and value, the
+        number of searches `given_up` at the default limit, and the number of these with the right grid point.
     """
     specs = array_specs(max(counts))
     blocks = Blocks(specs)
@@ -93,7 +93,7 @@ def _peaks(maps: Sequence[Float32Array], counts: Sequence[int]) -> Iterator[tupl
 
 
 def main() -> int:
-    """Compare, write exactness.json; fail unless all are the same."""
+    """Compare, write exactness.json, and fail unless all results are the same."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"of each kind (default {SOUNDS}: 180 maps)")

@@ -1,9 +1,9 @@
-"""How many messages a second one server's hub and sockets take to many clients, and what each costs.
+"""The rate of messages that one server's fan-out and sockets deliver to many clients, and the cost of each.
 
     python benchmarks/fanout.py --clients 50 --seconds 5 --arrays 2
 
-The real application (routes, hub, uvicorn's settings) tells updates as fast as its event loop gets through them; the
-clients are a process of their own and only count. One core for the server is what it means, so give it one (taskset).
+The real application (routes, fan-out, uvicorn's settings) publishes updates as fast as its event loop can. The clients
+are a process of their own and only count. The figures are for a server on one core, so pin it to one (taskset).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CLOCK = SystemClock()
 
 
 def update_of(arrays: int) -> JsonObject:
-    """An update as it is told when so many arrays heard the sound."""
+    """Return an update as it is published when a number of arrays contribute."""
     site = parse_site(load.site_text(arrays, 0.5, "tcp://127.0.0.1:5570", 8000))
     names = tuple(site.arrays)
     estimate = Estimate(10**18, np.array([1.234, 5.678, 1.5]), 0.0123 * np.eye(3), 0.61, names)
@@ -41,7 +41,7 @@ def update_of(arrays: int) -> JsonObject:
 
 
 def count(url: str, clients: int, seconds: float, parent: Connection) -> None:
-    """Count what comes to so many clients; tells the sum of messages and bytes."""
+    """Count messages and bytes of many clients, in a process of its own; send the sums to the parent."""
     parent.send(asyncio.run(_count(url, clients, seconds, parent)))
 
 
@@ -66,30 +66,32 @@ async def _one(socket: Any, seconds: float) -> tuple[int, int]:
     return messages, size
 
 
-async def tell(server: Server, message: JsonObject, until_ns: int) -> int:
-    """Tell updates as fast as the clients are sent them, a burst at a time; returns how many."""
-    fanout, told = server.parts.fanout, 0
+async def publish(server: Server, message: JsonObject, until_ns: int) -> int:
+    """Publish bursts of updates as fast as they are sent to the clients; return their number."""
+    fanout, published = server.parts.fanout, 0
     while CLOCK.monotonic_ns() < until_ns:
         for _ in range(LAGGING // 2):
             fanout.publish(message, CLOCK.monotonic_ns())
-            told += 1
+            published += 1
         while fanout.lags:
             await asyncio.sleep(0)
-    return told
+    return published
 
 
 def processor_s() -> float:
-    """Of this process so far."""
+    """Return the processor time of this process so far, in seconds."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 
 
 def main() -> None:
-    """Measure, and print a line."""
+    """Measure and print a line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--arrays", type=int, default=2, help="that contribute to an update: its size")
+    parser.add_argument(
+        "--arrays", type=int, default=2, help="arrays that contribute to an update, which decide its size"
+    )
     arguments = parser.parse_args()
     site = parse_site(load.site_text(arguments.arrays, 0.5, "tcp://127.0.0.1:*", 0))
     message = update_of(arguments.arrays)
@@ -105,14 +107,14 @@ def main() -> None:
         ours.recv()
         assert server.loop is not None
         began_s, until_ns = processor_s(), CLOCK.monotonic_ns() + round(arguments.seconds * 1e9)
-        told = asyncio.run_coroutine_threadsafe(tell(server, message, until_ns), server.loop).result()
+        published = asyncio.run_coroutine_threadsafe(publish(server, message, until_ns), server.loop).result()
         used_s = processor_s() - began_s
         got, size = ours.recv()
         counting.join()
     finally:
         server.stop()
         running.join()
-    sent = told * arguments.clients
+    sent = published * arguments.clients
     print(
         f"{arguments.clients} clients, {size / max(1, got):.0f} bytes: {got / arguments.seconds:,.0f} messages/s; "
         f"{1e6 * used_s / max(1, sent):.1f} us of the server's processor time each"

@@ -1,7 +1,7 @@
 """Breaks things on purpose and counts what is lost.
 
 `python benchmarks/faults.py replayed --seeds 1000` in simulated time, `soak` for a day of it, `processes --out FOLDER`
-with real processes, and `wire` with damaged messages. What came out is in docs/reliability.md.
+with real processes, and `wire` with damaged messages. The results are in docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FUZZED_AT_A_TIME = 100_000
 
 
 def replayed(seed: int) -> list[str]:
-    """What went wrong with a seed, by every fault."""
+    """Run a seed under every fault; return the failures."""
     logging.disable(logging.CRITICAL)
     expected = undisturbed(seed)
     wrong = {name: difference(seed, fault, expected) for name, fault in HARMLESS.items()}
@@ -47,12 +47,12 @@ def replayed(seed: int) -> list[str]:
 
 
 def undisturbed_processes(site: Playing, rng: random.Random, end_s: float) -> None:
-    """Nothing happens."""
+    """Cause no fault."""
     site.sleep_until(end_s)
 
 
 def server_killed(site: Playing, rng: random.Random, end_s: float) -> None:
-    """50 times, at random moments of the scene."""
+    """Kill the server 50 times, at random moments of the scene."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 5.0) for _ in range(50)):
         site.sleep_until(moment_s)
         site.kill("server")
@@ -60,7 +60,7 @@ def server_killed(site: Playing, rng: random.Random, end_s: float) -> None:
 
 
 def nodes_killed_9(site: Playing, rng: random.Random, end_s: float) -> None:
-    """20 times, one or the other; it starts again at once."""
+    """Kill one of the nodes 20 times; it restarts at once."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(20)):
         site.sleep_until(moment_s)
         name = rng.choice(list(NODES))
@@ -69,7 +69,7 @@ def nodes_killed_9(site: Playing, rng: random.Random, end_s: float) -> None:
 
 
 def link_cut(site: Playing, rng: random.Random, end_s: float) -> None:
-    """One node's link for 60 s, then the other's, then both."""
+    """Cut one node's link for 60 s, then the other's, then both."""
     for k, names in enumerate((["a"], ["b"], ["a", "b"])):
         site.sleep_until(10.0 + 80.0 * k)
         for name in names:
@@ -80,14 +80,14 @@ def link_cut(site: Playing, rng: random.Random, end_s: float) -> None:
 
 
 def loss_and_jitter(site: Playing, rng: random.Random, end_s: float) -> None:
-    """5 % of pieces lost, 200 ms of jitter."""
+    """Lose 5 % of the pieces, with 200 ms of jitter."""
     for proxy in site.proxies.values():
         proxy.weather.loss, proxy.weather.jitter_s = 0.05, 0.2
     site.sleep_until(end_s)
 
 
 def cables_pulled(site: Playing, rng: random.Random, end_s: float) -> None:
-    """A loose contact at one node for 60 s, then the other's cable out for 60 s."""
+    """Loosen the contact at one node for 60 s, then unplug the other's cable for 60 s."""
     site.sleep_until(10.0)
     site.cables["a"].loosen(rng, 60.0)
     site.sleep_until(90.0)
@@ -97,7 +97,7 @@ def cables_pulled(site: Playing, rng: random.Random, end_s: float) -> None:
 
 
 def links_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
-    """A tenth of the bandwidth that sound needs, for half of the time."""
+    """Limit links to a tenth of the bandwidth that sound needs, for half of the time."""
     site.sleep_until(10.0)
     for cable in site.cables.values():
         cable.narrow(200)
@@ -107,7 +107,7 @@ def links_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
 
 
 def cable_pulled_then_narrow(site: Playing, rng: random.Random, end_s: float) -> None:
-    """A cable out for up to 30 s, and a third of the bandwidth that sound needs when it is in again; four times."""
+    """Unplug a cable for up to 30 s, then limit it to a third of the bandwidth that sound needs; four times."""
     for k in range(4):
         cable = site.cables[rng.choice(list(NODES))]
         site.sleep_until(10.0 + k * end_s / 4)
@@ -120,7 +120,7 @@ def cable_pulled_then_narrow(site: Playing, rng: random.Random, end_s: float) ->
 
 
 def stopped(site: Playing, rng: random.Random, end_s: float) -> None:
-    """Server and nodes with SIGSTOP for up to 5 s, 30 times, and torn connections."""
+    """Stop server or nodes by SIGSTOP for up to 5 s, or tear a connection, 30 times."""
     for moment_s in sorted(rng.uniform(0.0, end_s - 10.0) for _ in range(30)):
         site.sleep_until(moment_s)
         if rng.random() < 0.3:
@@ -143,11 +143,11 @@ PROCESSES = {
 
 
 CABLED = {"cables loose and pulled", "links narrow", "cable pulled, then narrow"}
-"""Those with nodes in network namespaces instead of behind proxies."""
+"""Faults for which nodes run in network namespaces instead of behind proxies."""
 
 
 def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
-    """Play the same 40 sounds under each fault; what was stored, against the undisturbed run."""
+    """Play the same 40 sounds under each fault, and compare the stored events with the undisturbed run."""
     recordings = folder / "recordings"
     if not recordings.exists():
         recordings.mkdir(parents=True)
@@ -156,7 +156,7 @@ def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
     for name in names:
         path = folder / f"{name.replace(' ', '-').replace('%', 'percent').replace(',', '')}.json"
         if not path.exists():
-            directory = path.with_suffix("")  # it stays, with what the processes said, where anything goes wrong
+            directory = path.with_suffix("")  # it stays, with the output of the processes, if anything fails
             shutil.rmtree(directory, ignore_errors=True)
             events = play(recordings, directory, PROCESSES[name], len(name), cabled=name in CABLED)
             shutil.copy(directory / "said.txt", path.with_suffix(".txt"))
@@ -169,7 +169,7 @@ def processes(folder: Path, names: list[str]) -> list[dict[str, Any]]:
 
 
 def compared(name: str, got: list[dict[str, Any]], expected: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many of the expected events are there once, by start; how far off their positions are."""
+    """Count the expected events that occur exactly once, by their starts, and compare their positions."""
     doubled = sum(1 for one, other in pairwise(got) if other["at_s"] < one["at_s"] + one["duration_s"])
     pairs = [(event, [e for e in got if abs(e["at_s"] - event["at_s"]) < 0.5]) for event in expected]
     there = [(event, found[0]) for event, found in pairs if len(found) == 1]
@@ -187,7 +187,7 @@ def compared(name: str, got: list[dict[str, Any]], expected: list[dict[str, Any]
 
 
 def damaged(count: int) -> int:
-    """Damaged messages in ten parts; the memory after each."""
+    """Decode damaged messages in ten parts, and print the memory after each."""
     logging.disable(logging.CRITICAL)
     outcomes: Counter[str] = Counter()
     began = time.monotonic()
@@ -200,19 +200,19 @@ def damaged(count: int) -> int:
 
 
 def deaths(folder: Path, names: list[str]) -> None:
-    """Let an array die in each way, and print how late the others' events are told."""
+    """Disable an array in each way, and print the delay of the other arrays' events."""
     recordings = folder / "recordings"
     if not recordings.exists():
         make_death_recordings(recordings, DEATH_SOUNDS)
     for name in names:
         death = play_death(recordings, folder / name.replace(" ", "-"), name)
-        told = f"{len(death.delays_s)} events, p50 {1000 * death.p50_s:.0f} ms, p95 {1000 * death.p95_s:.0f} ms"
+        events = f"{len(death.delays_s)} events, p50 {1000 * death.p50_s:.0f} ms, p95 {1000 * death.p95_s:.0f} ms"
         most = f"max {1000 * death.delays_s[-1]:.0f} ms"
-        print(f"{name}: {told}, {most}, shown after {death.shown_s and round(death.shown_s, 2)} s", flush=True)
+        print(f"{name}: {events}, {most}, shown after {death.shown_s and round(death.shown_s, 2)} s", flush=True)
 
 
 def fuzzed(seconds: float) -> int:
-    """Fuzz by coverage for so long; 1 where a line of the decoder was not reached."""
+    """Fuzz by coverage for some seconds; return 1 if a line of the decoder was not reached."""
     began_s, seed = time.monotonic(), 0
     outcomes: Counter[str] = Counter()
     found = fuzz(FUZZED_AT_A_TIME, seed)
@@ -221,12 +221,12 @@ def fuzzed(seconds: float) -> int:
         seed += 1
         found = fuzz(FUZZED_AT_A_TIME, seed)
     print(f"{outcomes.total()} messages, {dict(outcomes)}, {seed} seeds, {time.monotonic() - began_s:.0f} s")
-    print(f"ways from line to line: {len(found.edges)}; lines of the decoder not reached: {lines_missed(found)}")
+    print(f"transitions between lines: {len(found.edges)}; lines of the decoder not reached: {lines_missed(found)}")
     return 1 if lines_missed(found) else 0
 
 
 def soaked(hours: float, seed: int) -> int:
-    """So many hours of four arrays; 1 where the memory has grown too much after the first, or a sound is lost."""
+    """Simulate hours of four arrays; return 1 if the memory grows too much after the first, or a sound is lost."""
     logging.disable(logging.CRITICAL)
 
     def tell(sample: Sample) -> None:
@@ -241,26 +241,28 @@ def soaked(hours: float, seed: int) -> int:
 
 
 def main() -> int:
-    """Run a campaign; 1 where anything went wrong."""
+    """Run a campaign; return 1 if anything failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     campaigns = parser.add_subparsers(dest="campaign", required=True)
     sub = campaigns.add_parser("replayed", help="simulated time: every fault for each seed")
-    sub.add_argument("--seeds", type=int, default=1000, help="how many worlds (1000)")
+    sub.add_argument("--seeds", type=int, default=1000, help="number of simulated worlds (1000)")
     sub.add_argument("--first", type=int, default=0, help="the first seed (0)")
     sub.add_argument("--jobs", type=int, default=2, help="processes (2)")
     sub = campaigns.add_parser("processes", help="real processes and sockets: 40 sounds under each fault")
-    sub.add_argument("--out", type=Path, required=True, help="folder for recordings and results; what is there stays")
-    sub.add_argument("--fault", choices=list(PROCESSES), action="append", help="only these (all)")
+    sub.add_argument(
+        "--out", type=Path, required=True, help="folder for recordings and results; existing ones are kept"
+    )
+    sub.add_argument("--fault", choices=list(PROCESSES), action="append", help="only this fault; may be repeated (all)")
     sub = campaigns.add_parser("wire", help="damaged messages, given to the server's ingest")
-    sub.add_argument("--count", type=int, default=1_000_000, help="how many (1 000 000)")
+    sub.add_argument("--count", type=int, default=1_000_000, help="number of messages (1 000 000)")
     sub = campaigns.add_parser("soak", help="simulated time: a day of four arrays, and the server's memory")
-    sub.add_argument("--hours", type=float, default=24.0, help="how long (24)")
-    sub.add_argument("--seed", type=int, default=0, help="of what goes wrong meanwhile (0)")
-    sub = campaigns.add_parser("deaths", help="real processes: how late events are told when an array dies")
-    sub.add_argument("--out", type=Path, required=True, help="folder for recordings; they stay")
-    sub.add_argument("--fault", choices=list(DEATHS), action="append", help="only these (all)")
-    sub = campaigns.add_parser("fuzz", help="fuzzing of the wire, led by coverage")
-    sub.add_argument("--seconds", type=float, default=300.0, help="how long (300)")
+    sub.add_argument("--hours", type=float, default=24.0, help="simulated time (24)")
+    sub.add_argument("--seed", type=int, default=0, help="seed of the faults (0)")
+    sub = campaigns.add_parser("deaths", help="real processes: the delay of events when an array fails")
+    sub.add_argument("--out", type=Path, required=True, help="folder for recordings; they are kept")
+    sub.add_argument("--fault", choices=list(DEATHS), action="append", help="only this fault; may be repeated (all)")
+    sub = campaigns.add_parser("fuzz", help="coverage-guided fuzzing of the wire")
+    sub.add_argument("--seconds", type=float, default=300.0, help="running time (300)")
     arguments = parser.parse_args()
     if arguments.campaign == "fuzz":
         return fuzzed(arguments.seconds)
@@ -269,7 +271,7 @@ def main() -> int:
         return 0
     if arguments.campaign == "soak":
         if arguments.hours <= REFERENCE_HOURS:
-            parser.error(f"--hours: expected more than {REFERENCE_HOURS:g}, for the end is held against that hour")
+            parser.error(f"--hours: expected more than {REFERENCE_HOURS:g}, because the end is compared with that hour")
         return soaked(arguments.hours, arguments.seed)
     if arguments.campaign == "wire":
         return damaged(arguments.count)

@@ -1,8 +1,8 @@
-"""What limits `onset` in noise: its answers beside those of the same weights made from what nobody can know.
+"""The limit of `onset` in noise: its errors beside those with ideal weights, which need the true direct sound.
 
-`python benchmarks/limits.py --events DIR`: development sounds in the paper's room, two arrays. *Known* weighs each
-moment and band by the power that truly came straight from the source and that of all else, noise and reverberation,
-instead of by what can be told from the past.
+`python benchmarks/limits.py --events DIR`: development sounds in the paper's room, two arrays. *Known* weights each hop
+and band by the true powers of the direct sound and of the rest, noise and reverberation, instead of by estimates from
+the past.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from livessl.core.correlate.onset_gcc import _STRONGEST, OnsetFrontEnd, OnsetGCC
 from livessl.core.correlate.spectra import Spectra
 from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray
-from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.job import read_clips
 from livessl.lab.evaluate.localizer import LEAD_S, PRE_ROLL_FRAMES, _active
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M, pair
 from livessl.lab.evaluate.scenarios import HALVES
@@ -33,21 +33,21 @@ CLASSES: Final = ("doorslam", "keysDrop", "phone", "speech")
 
 
 class Known:
-    """Hears frames beside the front end, and the direct sound in them apart from the rest."""
+    """Computes the onset GCC of frames like the front end, but with weights from their true direct sound."""
 
     def __init__(self, front_end: OnsetFrontEnd, channels: int) -> None:
         self._front_end = front_end
         self._tail = np.zeros((2 * channels, 0), dtype=np.float32)
 
     def push(self, samples: Float32Array, direct: Float32Array) -> OnsetGCC:
-        """What the front end would give for a frame (K, n), had it known its direct part (K, n)."""
+        """Return the onset GCC of a frame (K, n) with ideal weights from its direct part (K, n)."""
         here, length = self._front_end, len(self._front_end._window)
-        heard = np.concatenate([self._tail, np.concatenate([samples, direct])], axis=1)
-        hops = max(0, (heard.shape[1] - length) // here._hop + 1)
-        self._tail = heard[:, hops * here._hop :]
+        joined = np.concatenate([self._tail, np.concatenate([samples, direct])], axis=1)
+        hops = max(0, (joined.shape[1] - length) // here._hop + 1)
+        self._tail = joined[:, hops * here._hop :]
         if hops == 0:
             return here.nothing
-        cut = np.lib.stride_tricks.sliding_window_view(heard, length, axis=1)[:, :: here._hop][:, :hops]
+        cut = np.lib.stride_tricks.sliding_window_view(joined, length, axis=1)[:, :: here._hop][:, :hops]
         spectra = np.asarray(scipy.fft.rfft(cut.swapaxes(0, 1) * here._window, here._n_fft, axis=2), dtype=np.complex64)
         whole, straight = np.split(spectra, 2, axis=1)
         power, rest = (_power(part[:, :, here._band]) for part in (straight, whole - straight))
@@ -58,7 +58,7 @@ class Known:
 
 
 def _power(spectra: ComplexArray) -> Float32Array:
-    """(T, K, B) to (T, B): mean over the microphones and three bins, as the front end takes it."""
+    """Return power (T, B) of spectra (T, K, B): the mean over microphones and three bins, as in the front end."""
     mean = np.square(np.abs(spectra)).mean(axis=1)
     padded = np.pad(mean, ((0, 0), (1, 1)), mode="edge")
     return np.asarray((padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]) / 3.0)
@@ -71,8 +71,8 @@ def errors_m(
     direct: Float32Array,
     source_m: FloatArray,
 ) -> tuple[float, float]:
-    """Of one event (K, n) and its direct part: as shipped, and with known weights; a refused answer counts as it is."""
-    heard: tuple[dict[str, Sound], dict[str, Sound]] = ({}, {})
+    """Return the errors of one event (K, n) with the default and with ideal weights; refused results count, too."""
+    prepared: tuple[dict[str, Sound], dict[str, Sound]] = ({}, {})
     for spec, every, straight in zip(
         arrays, np.split(samples, len(arrays)), np.split(direct, len(arrays)), strict=True
     ):
@@ -80,14 +80,14 @@ def errors_m(
         loud = np.flatnonzero(active)
         listener = estimator.onset_front_end(spec.name, RATE_HZ)
         if listener is None or not len(loud):
-            raise SystemExit(f"{spec.name}: nothing to hear")
+            raise SystemExit(f"{spec.name}: no active frame")
         known = Known(listener, len(every))
         frames = [slice(k * FRAME, (k + 1) * FRAME) for k in range(max(0, loud[0] - PRE_ROLL_FRAMES), loud[-1] + 1)]
         shipped = [listener.push(every[:, at], quiet=not active[at.start // FRAME]) for at in frames]
-        told = [known.push(every[:, at], straight[:, at]) for at in frames]
-        for sounds, onsets in zip(heard, (shipped, told), strict=True):
+        ideal = [known.push(every[:, at], straight[:, at]) for at in frames]
+        for sounds, onsets in zip(prepared, (shipped, ideal), strict=True):
             sounds[spec.name] = Sound((every,), RATE_HZ, onsets)
-    one, other = (float(np.linalg.norm(estimator.locate(sounds).position_m - source_m)) for sounds in heard)
+    one, other = (float(np.linalg.norm(estimator.locate(sounds).position_m - source_m)) for sounds in prepared)
     return one, other
 
 
@@ -95,8 +95,12 @@ def main() -> int:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--events", type=Path, required=True, help="clips named like doorslam001.wav")
-    parser.add_argument("--positions", type=int, default=40, help="of the source, each with four sounds (40)")
-    parser.add_argument("--snr", type=float, default=10.0, help="dB (10)")
+    parser.add_argument(
+        "--positions", type=int, default=40, help="number of source positions, with four sounds each (default 40)"
+    )
+    parser.add_argument(
+        "--snr", type=float, default=10.0, help="level of the sound above the noise, in dB (default 10)"
+    )
     parser.add_argument("--seed", type=int, default=9191)
     arguments = parser.parse_args()
     clips = read_clips(arguments.events, CLASSES, RATE_HZ)
@@ -125,7 +129,7 @@ def main() -> int:
                 scale = np.float32(PEAK / np.abs(samples).max())
                 off = errors_m(estimator, arrays, samples * scale, direct * scale, source_m)
                 found.setdefault((rt60_s, name), []).append(off)
-    print(f"median error of {arguments.positions} positions at {arguments.snr:g} dB, m: as shipped, with known weights")
+    print(f"median error of {arguments.positions} positions at {arguments.snr:g} dB, m: default weights, ideal weights")
     for rt60_s in RT60S_S:
         rows = {name: found[rt60_s, name] for name in CLASSES}
         rows["all"] = [pair for some in rows.values() for pair in some]

@@ -2,8 +2,8 @@
 
     python benchmarks/live.py --arrays 64 --clients 20 --seconds 20 --profile server.pstats
 
-What the localization itself costs, the core's own benchmarks tell; here it says one place, after one pass over the
-sound it was given. The profile is of the thread that runs the fusion, by cProfile, which makes it slower.
+The cost of the localization itself is measured by the core's own benchmarks. Here the estimator returns one position
+after one pass over its sound. The profile is of the thread that runs the fusion, by cProfile, which makes it slower.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from livessl.server.engine import Engine
 
 
 class Nowhere:
-    """Says the middle of the room; looks at the sound, so that it is in the cache as if it had been used."""
+    """Locates everything in the middle of the room, after one pass over the sound to bring it into the cache."""
 
     name = "onset"
 
@@ -39,24 +39,24 @@ class Nowhere:
         self._middle_m = (grid.lower_m + grid.upper_m) / 2
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """There is nothing to prepare."""
+        """Prepare nothing."""
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> None:
         """Nothing listens."""
         return
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        """One place for everything."""
+        """Return the middle of the room."""
         loudest = max(float(segment.max()) for sound in sounds.values() for segment in sound.segments)
         return Localization(self._middle_m + 0.01 * loudest, 0.01 * np.eye(3), 0.5, ())
 
     def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
-        """A map without power."""
+        """Return a map without power."""
         return PowerMaps(self._grid, np.zeros(self._grid.size, dtype=np.float32), {})
 
 
 def serve(site_file: Path, profile: Path | None) -> None:
-    """Be the server, with the estimator above, and perhaps profiled."""
+    """Run the server with this estimator, and profile it if a file is given."""
     register("onset", Nowhere)
     if profile is not None:
         turn = Engine.turn
@@ -72,7 +72,7 @@ def serve(site_file: Path, profile: Path | None) -> None:
 
 
 def main() -> None:
-    """Measure, and print."""
+    """Measure and print the outcome."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--arrays", type=int, default=16)
     parser.add_argument("--clients", type=int, default=20)
@@ -88,7 +88,7 @@ def main() -> None:
     extra = [] if arguments.profile is None else ["--profile", str(arguments.profile)]
 
     def start(site_file: Path) -> Any:
-        return subprocess.Popen([sys.executable, __file__, "--serve", str(site_file), *extra])  # noqa: S603 - ourselves
+        return subprocess.Popen([sys.executable, __file__, "--serve", str(site_file), *extra])  # noqa: S603 - this file
 
     demand = live.Demand(
         arguments.arrays, arguments.clients, arguments.seconds, watchers=arguments.watchers, spacing_m=0.5, rt60_s=0.0

@@ -1,4 +1,4 @@
-"""What a benchmark ran on: written beside its figures, so that nobody compares them with those of another machine."""
+"""Description of the machine of a benchmark, stored with its figures, which are comparable on one machine only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PACKAGES: Final = ("livessl", "numpy", "scipy", "numba", "pyroomacoustics", "aco
 
 
 def describe() -> dict[str, Any]:
-    """Processor, cores, memory, versions, and how many processes wanted to run before the measurement began."""
+    """Return processor, cores, memory, versions, and the load average before the measurement."""
     return {
         "cpu": _cpu(),
         "cores": os.cpu_count(),

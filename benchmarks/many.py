@@ -1,9 +1,9 @@
-"""How many of many arrays are worth listening to: 64 of them around one voice, located by those that hear it best.
+"""The number of arrays that are worth using: 64 arrays around one voice, located by those with the clearest onsets.
 
     python benchmarks/many.py --sounds 12 --rt60 1 --snr 10
 
-prints the error and the time of an answer for each number of arrays that may have a part in it
-(`livessl.core.locate.onset.MOST_ARRAYS`), on the same sounds. What came out is in
+prints the error and the computing time of a result for each number of arrays that may take part
+(`livessl.core.locate.onset.MOST_ARRAYS`), on the same sounds. The results are in
 docs/performance/experiments.md.
 """
 
@@ -20,7 +20,7 @@ from livessl.core.locate import onset
 from livessl.core.locate.estimator import create
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
 from livessl.lab.bench import load
-from livessl.lab.evaluate.localizer import heard
+from livessl.lab.evaluate.localizer import sound_of
 from livessl.simulation.scene import Scene, Source, render, synthesised_sounds
 from livessl.site.build.grid import search_grid
 from livessl.site.load import parse_site
@@ -34,8 +34,8 @@ LEVEL_DBFS: Final = -15.0
 MOST: Final = (4, 8, 16, 32, 64)
 
 
-def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed: int) -> dict[str, Float32Array]:
-    """What every array hears of a voice, with white noise so far below the mean power of it over all arrays."""
+def recorded_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed: int) -> dict[str, Float32Array]:
+    """Simulate a voice at every array, with white noise `snr_db` below its mean power over all arrays."""
     voice = dict(synthesised_sounds(RATE_HZ, seed=seed))["voice"][: round(SOUND_S * RATE_HZ)]
     source = Source("voice", QUIET_S, place_m, voice)
     scene = Scene(site.room.size_m, rt60_s, site.c_m_s, RATE_HZ, (source,), DURATION_S, level_dbfs=LEVEL_DBFS)
@@ -51,7 +51,7 @@ def heard_at(site: Site, place_m: FloatArray, rt60_s: float, snr_db: float, seed
 
 
 def compare(arrays: int, sounds: int, rt60_s: float, snr_db: float, most: Sequence[int]) -> dict[int, FloatArray]:
-    """By how many arrays may have a part: error in metres and time in seconds of every sound's answer, (sounds, 2)."""
+    """Return error (m) and computing time (s) of each sound, (sounds, 2), by the largest number of arrays."""
     site = parse_site(load.site_text(arrays, 0.1, "tcp://127.0.0.1:5570", 8000))
     estimator = create("onset", site.specs, search_grid(site), site.c_m_s)
     rng = np.random.default_rng(3)
@@ -62,13 +62,15 @@ def compare(arrays: int, sounds: int, rt60_s: float, snr_db: float, most: Sequen
     try:
         for number in range(sounds):
             place_m = rng.uniform((0.8, 0.8, 0.8), (x - 0.8, y - 0.8, 1.8))
-            samples = heard_at(site, place_m, rt60_s, snr_db, seed=number)
-            told = {spec.name: heard(estimator, spec, samples[spec.name], active, RATE_HZ) for spec in site.specs}
+            samples = recorded_at(site, place_m, rt60_s, snr_db, seed=number)
+            prepared = {
+                spec.name: sound_of(estimator, spec, samples[spec.name], active, RATE_HZ) for spec in site.specs
+            }
             for count in most:
                 onset.MOST_ARRAYS = count  # type: ignore[misc]
-                estimator.locate(told)
+                estimator.locate(prepared)
                 before_s = time.perf_counter()
-                found = estimator.locate(told)
+                found = estimator.locate(prepared)
                 rows[count].append((float(np.linalg.norm(found.position_m - place_m)), time.perf_counter() - before_s))
     finally:
         onset.MOST_ARRAYS = shipped  # type: ignore[misc]
@@ -85,9 +87,8 @@ def main() -> None:
     arguments = parser.parse_args()
     most = [count for count in MOST if count <= arguments.arrays]
     rows = compare(arguments.arrays, arguments.sounds, arguments.rt60, arguments.snr, most)
-    print(
-        "| arrays with a part | error, median (mm) | worst (mm) | time of an answer, median (ms) |\n|---|---|---|---|"
-    )
+    print("| arrays that may take part | median error (mm) | largest error (mm) | median time of a result (ms) |")
+    print("|---|---|---|---|")
     for count, each in rows.items():
         error_mm, time_ms = 1e3 * each.T
         print(f"| {count} | {np.median(error_mm):.1f} | {error_mm.max():.1f} | {np.median(time_ms):.1f} |")

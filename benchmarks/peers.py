@@ -1,14 +1,14 @@
-"""Our localizer and others at the same work, in one process, in turn, on one thread: how long, and how right.
+"""livessl and other codes at the same work, in one process, in turn, on one thread: their times and their accuracy.
 
     python benchmarks/peers.py --out docs/performance
 
 Two tetrahedra, blocks of 4096 samples, 100 to 6000 Hz, the room of `livessl.lab.bench.kernels`. The work is the whole
-way from samples over the summed map to its highest node. All transform a block with as many zeros after it as livessl
-does, so that no lag wraps round and all maps are of the same thing. Beside each time stands the correlation of the map
-with that of the plain formula in double precision. Imports, tables and whatever else is made once are not counted.
+path from samples through the summed map to its highest grid point. All codes pad a block with as many zeros as livessl
+does, so that no lag wraps round and all maps are comparable. Beside each time stands the correlation of the map with
+that of the plain formula in double precision. Imports, tables and other one-time work are not counted.
 
-On the fine grid the others are timed on a random part of the nodes, the time being scaled up with the nodes: all of
-them work node by node, and what they do once a block is below a hundredth of what they do on the part.
+On the fine grid the others are timed on a random part of the grid points, and the time is scaled with their number: all
+of them work point by point, and their work per block is below a hundredth of that on the part.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from livessl.lab.bench import kernels as bench
 COARSE_M: Final = 0.5
 FINE_M: Final = 0.1
 PART: Final = 1000
-"""Nodes of the fine grid that the others are timed on."""
+"""Grid points of the fine grid on which the others are timed."""
 
 CHECKED: Final = 3
-"""bench.Blocks whose maps are held against the reference."""
+"""Number of blocks whose maps are compared with the reference."""
 
 SPACINGS_M: Final = (0.5, 0.1, 0.05)
 COUNTS: Final = (2, 4, 8)
@@ -62,16 +62,16 @@ MAP_SPACINGS_M: Final = (0.5, 0.2, 0.1, 0.05)
 Heard = TypeVar("Heard")
 Sounds = Sequence[Float32Array]
 Power = Callable[[Sounds], RealArray]
-"""From each array's samples (K, n) to the summed power (N,) at the nodes that it was made for."""
+"""Maps each array's samples (K, n) to the summed power (N,) at the grid points that it was made for."""
 
 
 def room_grid(spacing_m: float) -> Grid:
-    """The whole room."""
+    """Return a grid of the whole room."""
     return Grid(((0.0, bench.ROOM_M[0]), (0.0, bench.ROOM_M[1]), (0.0, bench.ROOM_M[2])), spacing_m)
 
 
 def transform_length() -> int:
-    """Samples that livessl makes of a block before it transforms it."""
+    """Return the number of samples to which livessl pads a block before the transform."""
     lengths = []
 
     def front_end(samples: Float32Array, sample_rate_hz: float, lags: int) -> Spectra:
@@ -89,7 +89,7 @@ LOW, HIGH = band_bins(N_FFT, bench.RATE_HZ, bench.BAND_HZ)
 FREQUENCY_HZ: Final = np.arange(LOW, HIGH) * (bench.RATE_HZ / N_FFT)
 
 STEERING_BYTES: Final = 2 * 6 * 2 * 4 * (HIGH - LOW)
-"""A node's share of the steering product's matrices: two arrays, six pairs, real and imaginary parts in float32."""
+"""Memory of the steering product's matrices per grid point, in bytes: two arrays, six pairs, complex float32."""
 
 
 def reference(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
@@ -111,7 +111,7 @@ def reference(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
 
 
 def steering_product(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
-    """What one writes first: whitened cross-spectra times a kept steering matrix, (N, bins) of every pair, float32."""
+    """The obvious code: whitened cross-spectra times a stored steering matrix, (N, bins) for each pair, float32."""
     matrices: list[Float32Array] = []
     for spec in specs:
         pairs = microphone_pairs(len(spec.microphones_m))
@@ -136,7 +136,7 @@ def steering_product(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
 
 
 class _Nodes:
-    """Places (N, 3) anywhere, as pyroomacoustics wants a grid."""
+    """Arbitrary positions (N, 3), as the grid that pyroomacoustics expects."""
 
     def __init__(self, nodes_m: FloatArray) -> None:
         self.x, self.y, self.z = np.ascontiguousarray(nodes_m.T)
@@ -148,7 +148,7 @@ class _Nodes:
 
 
 def pyroomacoustics_srp(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
-    """`doa.SRP` of pyroomacoustics, its own loop, made to look at places instead of directions.
+    """`doa.SRP` of pyroomacoustics with its own loop, adapted to positions instead of directions.
 
     As it comes its near field cannot be used: several distances raise an error, the grid is the unit sphere whatever
     the distance, and the steering has the sign of the far field turned round. So the grid is replaced by the nodes, and
@@ -207,7 +207,7 @@ def acoular_beamformer(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power
 
 
 def _whitened(samples: RealArray) -> Any:
-    """Phases (K, B) in the band."""
+    """Return the phases (K, B) in the band."""
     spectra = scipy.fft.rfft(samples, N_FFT)[:, LOW:HIGH]
     return spectra / np.abs(spectra)
 
@@ -233,7 +233,7 @@ def using(form: ModuleType) -> Iterator[None]:
 
 
 class Ours:
-    """livessl with one form of the kernels, on one grid.
+    """The code of livessl with one form of the kernels, on one grid.
 
     Parameters
     ----------
@@ -255,35 +255,35 @@ class Ours:
             for spec in specs:
                 self._search.prepare(spec.name, self._gcc[spec.name].lags_s)
 
-    def heard(self, sounds: Sounds) -> list[Evidence]:
-        """Every array's GCC."""
+    def evidence(self, sounds: Sounds) -> list[Evidence]:
+        """Return every array's GCC."""
         gccs = correlated([(self._gcc[spec.name], [x]) for spec, x in zip(self._specs, sounds, strict=True)])
         return [Evidence(spec, gcc) for spec, gcc in zip(self._specs, gccs, strict=True)]
 
     def power(self, sounds: Sounds) -> Float32Array:
-        """The summed map (G,), overwritten by the next call."""
-        return self.mapped(self.heard(sounds))
+        """Return the summed map (G,), which the next call overwrites."""
+        return self.mapped(self.evidence(sounds))
 
-    def mapped(self, heard: Sequence[Evidence]) -> Float32Array:
-        """The same from the GCCs."""
+    def mapped(self, evidence: Sequence[Evidence]) -> Float32Array:
+        """Return the summed map of GCCs."""
         self._power[:] = 0.0
         with using(self._form):
-            for mapper, one in zip(self._mappers, heard, strict=True):
+            for mapper, one in zip(self._mappers, evidence, strict=True):
                 mapper.add(self._power, one.gcc)
         return self._power
 
     def peak(self, sounds: Sounds) -> int:
-        """The highest node, without the map."""
+        """Return the highest grid point, without the map."""
         with using(self._form):
-            (found,) = self._search.among(self.heard(sounds))(1)
+            (found,) = self._search.among(self.evidence(sounds))(1)
         return found.node
 
 
 @dataclass(frozen=True, slots=True)
 class _Contender:
-    """One code on one grid: what to time, how many of the grid's nodes that covers, and what to check, if it can be.
+    """One code on one grid: the function to time, the number of grid points that it covers, and the map to check.
 
-    `power` gives the map at the nodes that the reference is worked out at, `node` the highest of all.
+    `power` gives the map at the grid points of the reference; None if the code makes no map.
     """
 
     name: str
@@ -295,7 +295,7 @@ class _Contender:
 
 
 def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) -> Iterator[_Contender]:
-    """All of them; with `part`, the others on so many random nodes."""
+    """Yield all codes; with `part`, the others work on that number of random grid points."""
     grid = room_grid(spacing_m)
     rng = np.random.default_rng(0)
     which = np.arange(grid.size) if part is None else np.sort(rng.choice(grid.size, part, replace=False))
@@ -321,7 +321,7 @@ REFERENCE: Final = "plain formula, double precision"
 
 
 def side_by_side(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
-    """Times and correlations of all codes on both grids; the reference itself is timed like the rest."""
+    """Measure times and correlations of all codes on both grids; the reference itself is timed like the rest."""
     specs = bench.array_specs(2)
     blocks = bench.Blocks(specs)
     heard = [blocks.sound("voice", number) for number in range(12)]
@@ -362,7 +362,7 @@ def side_by_side(rounds: int, progress: Callable[[int, int], None]) -> list[dict
 
 
 def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
-    """The search alone, over grids, numbers of arrays, lengths and kinds of sound; GCCs are worked out before."""
+    """Measure the search alone, over grids, numbers of arrays, lengths and kinds of sound; GCCs are computed before."""
     specs = bench.array_specs(max(COUNTS))
     blocks = bench.Blocks(specs)
     gcc = [GCCPhat(spec, bench.RATE_HZ, bench.C_M_S) for spec in specs]
@@ -401,9 +401,9 @@ def searches(rounds: int, progress: Callable[[int, int], None]) -> list[dict[str
 
 
 def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[dict[str, Any]]]:
-    """What grows with the microphones of an array, and the map with the grid; two arrays throughout.
+    """Measure times against the number of microphones of two arrays, and of the map against the size of the grid.
 
-    And the map of the fine grid alone by either form of the kernels, beside as many bare look-ups, compiled.
+    The map of the fine grid alone is measured with both forms of the kernels, relative to as many bare look-ups.
     """
     shape = tetrahedron(0.5)
     parts = [
@@ -424,7 +424,7 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
         fine, display = Ours(specs, room_grid(0.05), with_numba), Ours(specs, room_grid(FINE_M), with_numba)
         microphones += [{"microphones": count, "what": what} for what in ("GCC", "peak", "map")]
         cases += [
-            bench.Case("GCC", _each(fine.heard, [heard])),
+            bench.Case("GCC", _each(fine.evidence, [heard])),
             bench.Case("peak", _each(fine.peak, [heard])),
             bench.Case("map", _each(display.power, [heard])),
         ]
@@ -439,7 +439,7 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
     for form in (with_numba, with_numpy):
         ours = Ours(specs, room_grid(FINE_M), form)
         forms.append({"kernels": form.NAME, "look_ups": 12 * room_grid(FINE_M).size})
-        cases.append(bench.Case("map alone", _each(ours.mapped, [ours.heard(block)])))
+        cases.append(bench.Case("map alone", _each(ours.mapped, [ours.evidence(block)])))
     cases.append(bench.bare_look_ups())
     (taken_ms,) = bench.timed_ms(SystemClock(), cases, rounds, progress)
     of_microphones, of_maps, of_forms, floor_ms = np.split(
@@ -456,13 +456,13 @@ def growth(rounds: int, progress: Callable[[int, int], None]) -> dict[str, list[
 
 
 def frame_bytes() -> int:
-    """Of an array's 50 ms on the wire."""
+    """Return the size of an array's 50 ms on the wire."""
     samples = np.zeros((4, round(bench.RATE_HZ / 20)), np.float32)
     return len(wire.encode(Frame("array1", 0, 0, 0, bench.RATE_HZ, samples, 0.0, True)))
 
 
 def _each(run: Callable[[Heard], object], heard: Sequence[Heard]) -> Callable[[int], object]:
-    """What runs on one after the other, round after round."""
+    """Return a function of the round's number that runs on one block after the other."""
     return lambda number: run(heard[number % len(heard)])
 
 
@@ -474,11 +474,13 @@ def _with_times(rows: list[dict[str, Any]], taken_ms: FloatArray) -> list[dict[s
 
 
 def main() -> int:
-    """Measure all of it and write peers.json."""
+    """Measure everything and write peers.json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--rounds", type=int, default=15, help="of all codes, side by side (default 15)")
-    parser.add_argument("--search-rounds", type=int, default=60, help="of our search and maps alone (default 60)")
+    parser.add_argument("--rounds", type=int, default=15, help="rounds of all codes, side by side (default 15)")
+    parser.add_argument(
+        "--search-rounds", type=int, default=60, help="rounds of our search and maps alone (default 60)"
+    )
     arguments = parser.parse_args()
     about = machine.describe()
     numba.set_num_threads(1)

@@ -1,6 +1,6 @@
-"""Writes docs/performance.md from what the benchmarks measured; with `--measure` measures all of it first.
+"""Writes docs/performance.md from the benchmarks' files; with `--measure` it runs the benchmarks first.
 
-    python benchmarks/performance.py --measure      # some six minutes, on a machine that does nothing else
+    python benchmarks/performance.py --measure      # about six minutes, on a machine that does nothing else
     python benchmarks/performance.py                # the text alone, from the files in docs/performance/
 
 Every figure in the text comes from those files.
@@ -35,24 +35,26 @@ LIVE: Final = (
     (4, 1, False), (4, 20, False), (4, 100, False), (8, 20, False), (16, 20, False), (32, 20, False), (64, 20, False),
     (16, 20, True), (64, 20, True),
 )  # fmt: skip
-"""Arrays and clients of each run of the service, and whether a foreign process spins on each core meanwhile."""
+"""Arrays and clients of each run of the service, and whether a foreign process keeps each core busy meanwhile."""
 
 TO_BUY: Final = (10, 100, 1000)
+"""Numbers of arrays for which hardware is recommended."""
+
 USED: Final = 0.6
-"""Of a core, of memory and of a link: what should be in use where all arrays sound at once."""
+"""Share of cores, memory and links that is in use if all arrays send sound at once."""
 
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How a cost grows: `factor * x ** exponent`, or `factor * x + offset`; and by how much it misses at worst.
+    """The growth of a cost: `factor * x ** exponent`, or `factor * x + offset`, and the largest deviation.
 
     Parameters
     ----------
     factor, exponent, offset : float
     worst : float
-        Greatest deviation of what was measured from the fit, relative to the fit.
+        Largest deviation of a measurement from the fit, relative to the fit.
     """
 
     factor: float
@@ -61,18 +63,18 @@ class Fit:
     worst: float
 
     def __call__(self, x: float) -> float:
-        """The cost at x."""
+        """Return the cost at x."""
         return self.offset + self.factor * float(x**self.exponent)
 
     @classmethod
     def power(cls, x: Sequence[float], y: Sequence[float]) -> Fit:
-        """Least squares of the logarithms."""
+        """Fit a power by least squares of the logarithms."""
         exponent, logarithm = np.polyfit(np.log(x), np.log(y), 1)
         return cls._judged(math.exp(logarithm), float(exponent), 0.0, x, y)
 
     @classmethod
     def line(cls, x: Sequence[float], y: Sequence[float]) -> Fit:
-        """Least squares of the deviations relative to what was measured: small costs count as much as great ones."""
+        """Fit a line by least squares of the relative deviations, so that small costs count as much as large ones."""
         factor, offset = np.polyfit(x, y, 1, w=1.0 / np.asarray(y))
         return cls._judged(float(factor), 1.0, float(offset), x, y)
 
@@ -88,7 +90,7 @@ def measure(folder: Path, parts: Iterable[str], *, brief: bool) -> None:
     Raises
     ------
     subprocess.CalledProcessError
-        Where one fails; exactness fails where the search and the map differ.
+        If one fails; exactness fails if the search and the map differ.
     """
     folder.mkdir(parents=True, exist_ok=True)
     runs: dict[str, Callable[[], None]] = {
@@ -137,14 +139,14 @@ def _write(file: Path, report: Json) -> None:
 
 
 def document(folder: Path) -> str:
-    """The text, from the files in a folder.
+    """Return the text, made from the files in a folder.
 
     Raises
     ------
     FileNotFoundError
-        Where one is missing; all of those of the service may be.
+        If a file is missing; those of the service may all be missing.
     ValueError
-        Where they are of different machines, or some of the service's are missing.
+        If the files are of different machines, or only some of the service's are missing.
     """
     names = ("kernels", "peers", "exactness", "startup")
     measured, peers, exact, startup = (_read(folder / f"{name}.json") for name in names)
@@ -179,7 +181,7 @@ def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[st
 
 
 def _number(value: float) -> str:
-    """Three figures, without an exponent."""
+    """Return a number with three significant figures, without an exponent."""
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g}"
     digits = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -206,22 +208,23 @@ def _head(reports: Sequence[Json]) -> Iterator[str]:
     yield "# Performance"
     yield ""
     yield _paragraph(
-        "Made by `python benchmarks/performance.py --measure`, in some six minutes on a machine that does nothing",
-        "else, from the files in [performance/](performance); every figure is from there. Compare ratios, and inside",
-        "one table: milliseconds are those of this machine on that day. All times are medians, on one thread, except",
-        "the service's.",
+        "This page is generated by `python benchmarks/performance.py --measure`, in about six minutes on a machine",
+        "that does nothing else; every figure comes from the files in [performance/](performance). Milliseconds are",
+        "those of this machine on that day, so compare ratios, and only within one table. All times are medians, and",
+        "on one thread except for the service.",
     )
     yield ""
     yield _paragraph(
         f"{one['cpu']}, {one['cores']} cores, {one['memory_gb']:g} GB; {one['system']}, Python {one['python']},",
         ", ".join(f"{name} {version}" for name, version in one["packages"].items()) + ".",
-        "Processes that wanted to run before a measurement began:",
+        "Load average before the measurements:",
         f"{min(m['load_before'] for m in machines):g} to {max(m['load_before'] for m in machines):g}.",
     )
     yield ""
     yield _paragraph(
-        "The work, unless something else is said: two tetrahedra of 0.5 m, 5 m apart, in a room of 8 x 10 x 4 m with a",
-        "reverberation time of 0.7 s, blocks of 4096 samples at 44.1 kHz, 100 to 6000 Hz, a voice at 20 dB.",
+        "Unless stated otherwise, two tetrahedra of 0.5 m stand 5 m apart in a room of 8 x 10 x 4 m with a",
+        "reverberation time of 0.7 s and record a voice at an SNR of 20 dB; blocks have 4096 samples at 44.1 kHz, and",
+        "the band is 100 to 6000 Hz.",
     )
 
 
@@ -240,13 +243,13 @@ def _ratios(peers: Json, exact: Json) -> Iterator[str]:
     for name in ("pyroomacoustics", "acoular", "steering product, NumPy"):
         coarse, fine = (_number(_row(peers, name, spacing)["ratio"]) for spacing in (0.5, 0.1))
         yield _item(
-            f"From samples to the highest node of the summed map, {name} takes {coarse} times as long as livessl on a",
-            f"0.5 m grid and {fine} times on a 0.1 m grid.",
+            f"From samples to the highest grid point of the summed map, {name} takes {coarse} times as long as livessl",
+            f"on a 0.5 m grid and {fine} times on a 0.1 m grid.",
         )
     ours, search = _row(peers, OURS, 0.1), _row(peers, "livessl, search, compiled", 0.1)
     yield _item(
         f"The search, without the map, takes {_number(search['median_ms'] / ours['median_ms'])} of the map's time on a",
-        f"0.1 m grid; on {exact['same']} of {exact['maps']} maps it finds the very node and value.",
+        f"0.1 m grid; on {exact['same']} of {exact['maps']} maps it finds the same grid point and value as the map.",
     )
 
 
@@ -254,14 +257,15 @@ def _side_by_side(peers: Json) -> Iterator[str]:
     yield "## Side by side"
     yield ""
     yield _paragraph(
-        f"One process, one thread, {peers['rounds']} rounds in turn: samples, summed map, highest node. The ratio is",
-        f"to *{OURS}*. Correlation is with the plain formula, the least of {peers['checked']} blocks; *same peak*",
-        "tells on how many of them the highest node is the formula's. Imports and tables are not counted.",
+        f"All codes run in turn, in one process, on one thread, for {peers['rounds']} rounds: from samples through the",
+        f"summed map to its highest grid point. The ratio is relative to *{OURS}*. *Correlation* is that with the map",
+        f"of the plain formula, the least of {peers['checked']} blocks; *same peak* is the number of these blocks on",
+        "which the highest grid point is that of the formula. Imports and tables are not counted.",
     )
     yield ""
     rows = []
     for row in peers["side_by_side"]:
-        part = "" if row["timed_nodes"] == row["nodes"] else f" ({row['timed_nodes']} of {row['nodes']} nodes, scaled)"
+        part = "" if row["timed_nodes"] == row["nodes"] else f" ({row['timed_nodes']} of {row['nodes']} points, scaled)"
         rows.append(
             (
                 f"{row['spacing_m']:g} m{part}", row["name"], _number(row["ratio"]), _number(row["median_ms"]),
@@ -269,32 +273,34 @@ def _side_by_side(peers: Json) -> Iterator[str]:
                 "" if row["same_peaks"] is None else f"{row['same_peaks']} of {peers['checked']}",
             )
         )  # fmt: skip
-    yield from _table(("grid", "code", "ratio", "ms a block", "correlation", "same peak"), rows)
+    yield from _table(("grid", "code", "ratio", "ms per block", "correlation", "same peak"), rows)
     yield ""
     yield _paragraph(
-        "All get the same transform, with zeros after the block so that no lag wraps round. On the fine grid the",
-        "others are timed on random nodes, and the time is scaled with their number: they work node by node. The",
-        "steering product keeps its matrix, which of the whole fine grid would hold",
-        f"{_number(peers['steering_bytes_a_node'] * _row(peers, OURS, 0.1)['nodes'] / 1e9)} GB. acoular's time",
-        "includes the cross-spectral matrix. pyroomacoustics is made for directions; its near field does not work as",
-        "it comes: several distances raise an error, the grid ignores the distance, and the steering has the opposite",
-        "sign of the far field's. We gave it the nodes as its grid and turned the sign; its own loop does the rest.",
+        "All codes pad the block with the same number of zeros, so that no lag wraps round. On the fine grid the",
+        "others are timed on random grid points, and the time is scaled with their number, because they work point by",
+        "point. The steering product stores its matrix, which would take",
+        f"{_number(peers['steering_bytes_a_node'] * _row(peers, OURS, 0.1)['nodes'] / 1e9)} GB for the whole fine",
+        "grid. acoular's time includes the cross-spectral matrix. pyroomacoustics is made for directions, and its near",
+        "field does not work as delivered: several distances raise an error, the grid ignores the distance, and the",
+        "steering has the opposite sign of that of the far field. Here it gets the grid points as its grid, with the",
+        "sign reversed; the rest is its own loop.",
     )
 
 
 def _exactness(exact: Json) -> Iterator[str]:
-    yield "## The same node as the whole map"
+    yield "## The same grid point as the whole map"
     yield ""
     yield _paragraph(
-        f"{exact['same']} of {exact['maps']} maps: 2 to {exact['most_arrays']} arrays, a voice,",
-        "two voices and noise, grids of 0.1 and 0.05 m; the search unbounded. As shipped it gives up after",
-        f"{exact['most_look_ups'] / 1e6:g} million look-ups and says so: in {exact['given_up']} of them.",
+        f"{exact['same']} of {exact['maps']} maps: 2 to {exact['most_arrays']} arrays, a voice, two voices and noise,",
+        "grids of 0.1 and 0.05 m; here the search has no limit. With its default limit it gives up after",
+        f"{exact['most_look_ups'] / 1e6:g} million look-ups and reports it, which happened on {exact['given_up']} of",
+        "these maps.",
     )
     given_up = [case for case in exact["cases"] if case["given_up"]]
     if given_up:
         yield ""
         yield from _table(
-            ("grid", "arrays", "sound", "given up", "right all the same"),
+            ("grid", "arrays", "sound", "given up", "right nevertheless"),
             (
                 (f"{case['spacing_m']:g} m", str(case["arrays"]), case["kind"],
                  f"{case['given_up']} of {case['maps']}", str(case["right_all_the_same"]))
@@ -308,12 +314,12 @@ def _kernels(measured: Json) -> Iterator[str]:
     yield ""
     yield _paragraph(
         f"{measured['kernels']}, {measured['rounds']} rounds; a bare look-up takes {measured['lookup_ns']:.2f} ns. The",
-        "ratio is to as many of those. In turn: after all other rows, when the caches hold what is theirs. Again:",
-        "right after that, with the next block, as when one recording is gone through.",
+        "ratio is relative to the time of as many bare look-ups. *In turn* is after all other rows, when the caches",
+        "hold their data; *again* is right after that, with the next block, as when one recording is processed.",
     )
     yield ""
     yield from _table(
-        ("what", "ratio", "in turn: median / 99 %, ms", "again: median / 99 %, ms"),
+        ("what", "ratio", "in turn, median / 99 % (ms)", "again, median / 99 % (ms)"),
         (
             (one["name"], "" if one["ratio"] is None else f"{one['ratio']:.2f}",
              f"{_number(one['median_ms'])} / {_number(one['p99_ms'])}",
@@ -327,8 +333,8 @@ def _searches(peers: Json) -> Iterator[str]:
     yield "## The search"
     yield ""
     yield _paragraph(
-        f"From GCCs to the highest node, median / 95 % in ms of {peers['search_rounds']} rounds. A star: some are",
-        "given up at the limit.",
+        f"From GCCs to the highest grid point: median / 95 % of {peers['search_rounds']} rounds, in ms. A star marks",
+        "rows in which some searches gave up at the limit.",
     )
     yield ""
     kinds = list(dict.fromkeys(row["kind"] for row in peers["searches"]))
@@ -347,8 +353,8 @@ def _service(live: Sequence[Json]) -> Iterator[str]:
         yield "Not measured here."
         return
     yield _paragraph(
-        "A server, the load and the clients on the same cores; every array sounds nearly all the time. Latency is from",
-        "the end of a window to a client; what was dropped are frames that no answer used.",
+        "The server, the load and the clients share the cores, and every array sends sound nearly all the time.",
+        "Latency is the time from the end of a window to a client; dropped frames are those that no result used.",
     )
     yield ""
     rows = []
@@ -357,16 +363,16 @@ def _service(live: Sequence[Json]) -> Iterator[str]:
         dropped = run["frames_dropped"] + sum(run["lost"].values())
         rows.append(
             (
-                str(demand["arrays"]), str(demand["clients"]), "spinning" if demand["spin"] else "idle",
+                str(demand["arrays"]), str(demand["clients"]), "all cores busy" if demand["spin"] else "none",
                 "nothing" if run["nothing_dropped"] else f"{dropped} frames, {run['updates']:.1f} of "
-                f"{run['updates_due']} updates told",
+                f"{run['updates_due']} updates received",
                 f"{late['p50']:.0f} / {late['p95']:.0f} / {late['p99']:.0f}", f"{run['cpu_percent']:.0f}",
                 " / ".join(f"{mb:.0f}" for mb in run["rss_mb"]),
             )
         )  # fmt: skip
     yield from _table(
-        ("arrays", "clients", "cores otherwise", "dropped", "latency 50 / 95 / 99 %, ms", "server, % of a core",
-         "memory at first / at last / most, MB"), rows,
+        ("arrays", "clients", "other load", "dropped", "latency 50 / 95 / 99 % (ms)", "server (% of a core)",
+         "memory at the beginning / end / most (MB)"), rows,
     )  # fmt: skip
 
 
@@ -378,12 +384,12 @@ def _startup(startup: Json) -> Iterator[str]:
     yield _paragraph(
         f"`livessl serve` listens {_number(median_s)} s after it was called (median of {len(took_s)},",
         f"{_number(took_s.min())} to {_number(took_s.max())} s; {_number(of_processor_s)} s of processor),",
-        "with two arrays in that room and a grid of 0.05 m. The very first start compiles, and says so.",
+        "with two arrays in that room and a grid of 0.05 m. The first start on a machine compiles kernels and logs it.",
     )
 
 
 def _service_fits(live: Sequence[Json]) -> dict[str, Fit]:
-    """Processor and memory against arrays and against clients, of the runs on idle cores."""
+    """Fit processor and memory against arrays and clients, for the runs without other load."""
     idle = [run for run in live if not run["demand"]["spin"]]
     arrays = [run for run in idle if run["demand"]["clients"] == 20]
     clients = [run for run in idle if run["demand"]["arrays"] == 4]
@@ -402,8 +408,8 @@ def _growth(peers: Json, live: Sequence[Json]) -> Iterator[str]:
     yield "## How costs grow"
     yield ""
     yield _paragraph(
-        "Fits to what was measured: least squares of the logarithms for powers, of relative deviations for lines. The",
-        "last column tells by how much the fit misses at worst.",
+        "Fits to the measurements above: by least squares of the logarithms for powers, and of relative deviations for",
+        "lines. The last column is the largest deviation.",
     )
     yield ""
 
@@ -441,27 +447,28 @@ def _growth(peers: Json, live: Sequence[Json]) -> Iterator[str]:
             what, variable = name.split(", ")
             x = sorted({run["demand"][variable] for run in live})
             rows.append(row(f"the service's {what}", variable, x, fit, "MB" if what == "memory" else "% of a core"))
-    yield from _table(("cost", "measured at", "fit", "worst"), rows)
+    yield from _table(("cost", "measured at", "fit", "largest deviation"), rows)
 
 
 def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
-    yield "## What to buy for 10, 100 and 1000 arrays"
+    yield "## Hardware for 10, 100 and 1000 arrays"
     yield ""
     carried = [run["demand"]["arrays"] for run in live if run["nothing_dropped"] and not run["demand"]["spin"]]
     if not carried:
-        yield "To be told from runs of the service that drop nothing; there are none here."
+        yield "This needs runs of the service that drop nothing; there are none here."
         return
     fits, most = _service_fits(live), max(carried)
     cpu, clients, memory = fits["processor, arrays"], fits["processor, clients"], fits["memory, arrays"]
     base = max(0.0, cpu.offset)
     megabits = 8e-6 * peers["frame_bytes"] / FRAME_S
     yield _paragraph(
-        f"From the fits above: a server takes {_number(base)} % of a core for itself and 20 clients,",
-        f"{_number(cpu.factor)} % for each array that sounds, {_number(clients.factor)} % for each further client, and",
-        f"{_number(memory.offset)} MB and {_number(memory.factor)} MB an array. An array of four microphones sends",
-        f"{_number(megabits)} Mbit/s while it sounds, and hardly anything while it is quiet. The most arrays that one",
-        f"server was seen to carry on this machine are {most}; beyond that take several, one for each hall. All arrays",
-        f"are taken to sound at once, and nothing to be used beyond {USED:.0%}.",
+        f"By the fits above, a server takes {_number(base)} % of a core for itself and 20 clients,",
+        f"{_number(cpu.factor)} % for each array that sends sound, and {_number(clients.factor)} % for each further",
+        f"client; it takes {_number(memory.offset)} MB and another {_number(memory.factor)} MB per array. An array of",
+        f"four microphones sends {_number(megabits)} Mbit/s during sound, and almost nothing otherwise. The largest",
+        f"number of arrays that one server carried on this machine is {most}; for more, use several servers, for",
+        "example one per hall. The table assumes that all arrays send sound at once and that nothing is used beyond",
+        f"{USED:.0%}.",
     )
     yield ""
     rows = []
@@ -475,20 +482,24 @@ def _purchase(peers: Json, live: Sequence[Json]) -> Iterator[str]:
                 f"{_number(arrays * megabits / USED)} Mbit/s",
             )
         )  # fmt: skip
-    yield from _table(
-        ("arrays", "interfaces of eight channels", "servers", "cores like these", "memory", "network"), rows
-    )
+    yield from _table(("arrays", "eight-channel interfaces", "servers", "cores like these", "memory", "network"), rows)
 
 
 def main() -> int:
-    """Perhaps measure; write the text."""
+    """Measure if requested, and write the text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = ("kernels", "peers", "exactness", "startup", "live")
     parser.add_argument(
-        "--measure", nargs="*", choices=parts, metavar="PART", help=f"all, or some of {', '.join(parts)}"
+        "--measure", nargs="*", choices=parts, metavar="PART", help=f"measure all, or some of {', '.join(parts)}"
     )
-    parser.add_argument("--brief", action="store_true", help="few rounds: to see that it works, not for the record")
-    parser.add_argument("--out", type=Path, default=DOCS, metavar="DIR", help="default: docs")
+    parser.add_argument("--brief", action="store_true", help="few rounds, to check that it works")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=DOCS,
+        metavar="DIR",
+        help="folder of performance.md and performance/ (default: docs)",
+    )
     arguments = parser.parse_args()
     folder = arguments.out / "performance"
     if arguments.measure is not None:

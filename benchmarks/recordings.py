@@ -1,4 +1,4 @@
-"""Sound whose truth is known, through the whole pipeline: real recordings, measured rooms, simulated rooms.
+"""Sounds with known positions, through the whole pipeline: real recordings, measured rooms, simulated rooms.
 
 The recordings are not part of the project. They are looked for in LIVESSL_DATA, or beside the project in shared/data.
 """
@@ -42,14 +42,14 @@ FIELD: Final[dict[str, Any]] = {
 FIELD_CHANNELS: Final = (1, 2, 3, 4, 5)
 
 TALKERS: Final = {"respeaker_mic4": 270.0, "respeaker_mic1-4": 315.0, "respeaker_mic1-4_2": 315.0}
-"""Takes of a circle of four microphones 64 mm wide, and the talker's direction, good to some 10 degrees."""
+"""Takes with a circle of four microphones 64 mm wide, and the talker's direction in degrees, known to about 10."""
 
 CLASSES: Final = ("doorslam", "keysDrop", "phone", "speech")
 
 
 @dataclass(frozen=True)
 class Found:
-    """One sound of known place: its class, the error, its square in units of the covariance; None if unheard."""
+    """One sound with a known position: class, error, squared error in units of the covariance; None if not located."""
 
     sound: str
     error_m: float | None
@@ -57,23 +57,23 @@ class Found:
 
 
 def events_in(site: Site, parts: Sequence[AssignedRecording], method: str | None = None) -> list[Event]:
-    """Everything that the pipeline finds, by the site's method or another."""
+    """Return all events of the pipeline, by the site's method or another."""
     outputs = offline.run(site, parts, UnpacedClock(), method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
 
 def wrapped_deg(angle_deg: float) -> float:
-    """The same angle, from -180 to 180 degrees."""
+    """Return an angle in the range of -180 to 180 degrees."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def field_truth_m(file: Path) -> FloatArray:
-    """Where the source was: the last two numbers of the file's name, in centimetres."""
+    """Return the source's true position: the last two numbers of the file's name are centimetres."""
     return np.array([int(number) for number in re.findall(r"\d+", file.stem)[-2:]]) / 100.0
 
 
 def field_errors_m(method: str | None = None) -> dict[str, list[float]]:
-    """Horizontal error of every event, for each file of the field."""
+    """Return the horizontal error of every event, for each file of the field."""
     site = parse_site(yaml.safe_dump(FIELD))
     errors: dict[str, list[float]] = {}
     for file in sorted((DATA / "epo4_room_5mic").glob("*.wav")):
@@ -85,9 +85,9 @@ def field_errors_m(method: str | None = None) -> dict[str, list[float]]:
 
 
 def measured_room_errors_deg(method: str | None = None) -> tuple[list[float], int]:
-    """Azimuth error of every event in the measured rooms, and how many sounds were played.
+    """Return the azimuth error of every event in the measured rooms, and the number of sounds that were played.
 
-    Each of seven measured rooms, each of its two interleaved squares of four microphones, every fourth sound.
+    Every fourth sound is played in each of seven measured rooms, to each of two interleaved squares of microphones.
     """
     sounds = [sound for _, sound in read_sounds(DATA / "dcase2016_task2", 48000.0)[::4]]
     errors: list[float] = []
@@ -98,15 +98,15 @@ def measured_room_errors_deg(method: str | None = None) -> tuple[list[float], in
             microphones = measured["loc_microphone"][square]
             towards = measured["loc_loudspeaker"][0] - microphones.mean(axis=0)
             true_deg = float(np.degrees(np.arctan2(towards[1], towards[0])))
-            heard = _played_in(measured["RIR"][:, square].T.astype(np.float32), sounds, 48000)
-            azimuths = _azimuths_deg(_one_array_site(microphones, [8.1, 6.8, 3.07]), heard, 48000.0, method)
+            recorded = _played_in(measured["RIR"][:, square].T.astype(np.float32), sounds, 48000)
+            azimuths = _azimuths_deg(_one_array_site(microphones, [8.1, 6.8, 3.07]), recorded, 48000.0, method)
             errors += [abs(wrapped_deg(azimuth - true_deg)) for azimuth in azimuths]
             played += len(sounds)
     return errors, played
 
 
 def talker_errors_deg(take: str, method: str | None = None) -> list[float]:
-    """Azimuth error of every event of one take of a talker."""
+    """Return the azimuth error of every event of one take of a talker."""
     folder = DATA / "respeaker_4mic" / take
     tracks = [soundfile.read(folder / f"track{k}.wav", dtype="float32") for k in range(2, 6)]
     around = np.radians([0.0, 90.0, 180.0, 270.0])
@@ -117,7 +117,7 @@ def talker_errors_deg(take: str, method: str | None = None) -> list[float]:
 
 
 def simulated(sounds: Sequence[NamedSound], rt60_s: float, seeds: Sequence[int], count: int) -> tuple[list[Found], int]:
-    """Sounds at random places in the demo's room: what was found of each, and how many events had no sound."""
+    """Localize sounds at random positions in the demo's room; return each result, and the number of false events."""
     site = load_site(SITE_FILE)
     found: list[Found] = []
     surplus = 0
@@ -162,12 +162,12 @@ def _one_array_site(microphones_m: FloatArray, room_m: list[float]) -> Site:
 
 
 def _played_in(responses: Float32Array, sounds: Sequence[Float32Array], rate_hz: int) -> Float32Array:
-    """Sounds one after the other in a measured room, with pauses and a little noise, (K, n)."""
+    """Return sounds one after the other in a measured room, with pauses and a little noise: (K, n)."""
     rng = np.random.default_rng(1)
     pieces = [np.zeros((len(responses), rate_hz), dtype=np.float32)]
     for sound in sounds:
-        heard = oaconvolve(responses, sound[None] / np.abs(sound).max(), axes=1)
-        pieces += [heard, np.zeros((len(responses), rate_hz // 2), dtype=np.float32)]
+        wet = oaconvolve(responses, sound[None] / np.abs(sound).max(), axes=1)
+        pieces += [wet, np.zeros((len(responses), rate_hz // 2), dtype=np.float32)]
     whole = np.concatenate(pieces, axis=1)
     whole *= 0.5 / np.abs(whole).max()
     noise = rng.standard_normal(whole.shape, dtype=np.float32)
@@ -175,7 +175,7 @@ def _played_in(responses: Float32Array, sounds: Sequence[Float32Array], rate_hz:
 
 
 def _azimuths_deg(site: Site, samples: Float32Array, rate_hz: float, method: str | None) -> list[float]:
-    """Azimuth of every event, as the array sees it."""
+    """Return the azimuth of every event from the array."""
     recording = MemoryRecording("recorded", rate_hz, samples)
     part = AssignedRecording("array", recording, 0, tuple(range(1, len(samples) + 1)))
     return [event.contributions[0].azimuth_deg for event in events_in(site, [part], method)]

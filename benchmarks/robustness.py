@@ -1,7 +1,7 @@
-"""One array of three wrong or beside a noise, two sources at once, a walking talker: by the localizer as it is served.
+"""The default localizer with one faulty array of three, a noise beside an array, two sources, or a walking talker.
 
-`python benchmarks/robustness.py array --events DIR`, `beside`, `sources`, `walk`; the sounds are those of DCASE 2016
-task 2, the development half unless told. What they came to is in docs/accuracy/robustness.md.
+`python benchmarks/robustness.py array --events DIR`, `beside`, `sources` or `walk`. The sounds are those of DCASE 2016
+task 2, by default the development half. The results are in docs/accuracy/robustness.md.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from livessl.core.geometry import Grid
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.locate.onset import Onset
 from livessl.core.stream.activity import ActivityParameters, CausalActivity, exact_mask
-from livessl.core.stream.fusion import Fusion, FusionParameters
+from livessl.core.stream.fusion import Fusion
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray, Frame, Track
-from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.job import read_clips
 from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, CLASSES, ROOM_M, pair, tetrahedron_in_cube
 from livessl.lab.evaluate.unit import convolved
 from livessl.simulation.moving import place_on_way, render_moving
@@ -35,7 +37,7 @@ NEAR_M: Final = 0.5
 CONFIDENT: Final = 0.8
 THIRD_M: Final = np.array([1.5, 5.0, 2.0])
 BESIDE_M: Final = 0.6
-"""From the third array's centre to what goes on beside it: some 0.3 m from the nearest of its microphones."""
+"""Distance, in metres, of the noise from the third array's centre: about 0.3 m from its nearest microphone."""
 
 GRID: Final = Grid(((0.0, ROOM_M[0]), (0.0, ROOM_M[1]), (0.0, ROOM_M[2])), 0.1)
 
@@ -43,20 +45,20 @@ Clips = Mapping[str, Sequence[tuple[str, Float32Array]]]
 
 
 def arrays() -> tuple[ArraySpec, ArraySpec, ArraySpec]:
-    """The paper's pair 5 m apart, and a third to its side."""
+    """Return the paper's pair 5 m apart, and a third array to its side."""
     third = THIRD_M + tetrahedron_in_cube(0.5) @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T
     return (*pair(np.array(ROOM_M) / 2.0, 1, 5), ArraySpec("c", third, BAND_HZ))
 
 
 def turned(spec: ArraySpec, yaw_deg: float) -> ArraySpec:
-    """As a site file has it that is wrong by so much."""
+    """Return an array as a site file with a wrong yaw describes it."""
     cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return ArraySpec(spec.name, (spec.microphones_m - spec.centre_m) @ turn.T + spec.centre_m, spec.band_hz)
+    rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return ArraySpec(spec.name, (spec.microphones_m - spec.centre_m) @ rotation.T + spec.centre_m, spec.band_hz)
 
 
-def heard_from(place_m: FloatArray, specs: Sequence[ArraySpec], rt60s_s: Sequence[float]) -> Float32Array:
-    """Responses (R, K, n) to all microphones."""
+def responses_from(place_m: FloatArray, specs: Sequence[ArraySpec], rt60s_s: Sequence[float]) -> Float32Array:
+    """Return the responses (R, K, n) from a position to all microphones."""
     microphones_m = np.vstack([spec.microphones_m for spec in specs])
     return impulse_responses(
         ROOM_M, place_m, microphones_m, rt60s_s, sample_rate_hz=RATE_HZ, c_m_s=C_M_S, own_lengths=True, compiled=True
@@ -64,7 +66,7 @@ def heard_from(place_m: FloatArray, specs: Sequence[ArraySpec], rt60s_s: Sequenc
 
 
 def recorded(wet: Float32Array, lead: int, snr_db: float, rng: np.random.Generator) -> Float32Array:
-    """With noise before and under it, at 6 dB of headroom, in 16 bits."""
+    """Add noise before and during the sound, and round to 16 bits with 6 dB of headroom."""
     samples = np.pad(wet, ((0, 0), (lead, 0)))
     if np.isfinite(snr_db):
         rms = np.sqrt(np.square(wet).mean(dtype=np.float64) * 10.0 ** (-snr_db / 10.0))
@@ -73,7 +75,7 @@ def recorded(wet: Float32Array, lead: int, snr_db: float, rng: np.random.Generat
 
 
 def active_frames(samples: Float32Array) -> BoolArray:
-    """Which frames are active, by the paper's rule, one mask for all channels."""
+    """Return which frames are active by the paper's rule, one mask for all channels: (F,)."""
     count = samples.shape[1] // FRAME
     squares = np.square(samples[:, : count * FRAME]).mean(axis=0, dtype=np.float64)
     return exact_mask(squares.reshape(count, FRAME).mean(axis=1))
@@ -82,7 +84,7 @@ def active_frames(samples: Float32Array) -> BoolArray:
 def sounds_of(
     estimator: Onset, specs: Sequence[ArraySpec], samples: Float32Array, active: BoolArray
 ) -> dict[str, Sound]:
-    """What the arrays heard of an event, as the fusion tells an estimator."""
+    """Prepare the arrays' sound of an event for an estimator, as the fusion does."""
     loud = np.flatnonzero(active)
     frames = range(max(0, int(loud[0]) - PRE_ROLL), int(loud[-1]) + 1)
     sounds = {}
@@ -94,8 +96,8 @@ def sounds_of(
     return sounds
 
 
-def told(label: str, errors_m: Sequence[float], located: Sequence[bool], named: Sequence[bool] | None = None) -> str:
-    """One row of a table."""
+def row_of(label: str, errors_m: Sequence[float], located: Sequence[bool], named: Sequence[bool] | None = None) -> str:
+    """Return one row of a table."""
     error, answered = np.array(errors_m), np.array(located)
     median = f"{np.median(error[answered]):.3f}" if answered.any() else "-"
     wrong, lost = np.mean(answered & (error > NEAR_M)), np.mean(~answered | (error > NEAR_M))
@@ -104,12 +106,12 @@ def told(label: str, errors_m: Sequence[float], located: Sequence[bool], named: 
 
 
 def is_located(found: Localization) -> bool:
-    """Whether an event of it would be told as located."""
+    """Return whether an event with this result would be published as located."""
     return found.refused is None and found.confidence >= CONFIDENT
 
 
 def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
-    """Three arrays, the third as it should be, turned, moved, with a dead microphone; and two only."""
+    """Compare three arrays, the third of them good, turned, moved or with a dead microphone, and two arrays only."""
     a, b, c = arrays()
     moved = ArraySpec("c", c.microphones_m + np.array([0.4, 0.3, 0.0]), BAND_HZ)
     believed = {"all good": [a, b, c], "turned by 30°": [a, b, turned(c, 30.0)], "moved by 0.5 m": [a, b, moved]}
@@ -119,7 +121,7 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
         for number in range(positions):
             rng = np.random.default_rng([seed, number])
             source_m = rng.uniform(0.0, 1.0, 3) * ROOM_M
-            response = heard_from(source_m, (a, b, c), [rt60_s])[0]
+            response = responses_from(source_m, (a, b, c), [rt60_s])[0]
             for ours in clips.values():
                 wet = convolved(ours[int(rng.integers(len(ours)))][1], response)
                 lead = round((LEAD_S + rng.uniform(0.0, FRAME_S)) * RATE_HZ)
@@ -129,19 +131,19 @@ def one_wrong_array(clips: Clips, positions: int, seed: int) -> None:
                 dead[9] = np.rint(rng.standard_normal(samples.shape[1])) / 32768.0
                 signals = {"": samples, "one microphone dead": dead}
                 first = estimators["all good"]
-                heard = {name: sounds_of(first, [a, b, c], signal, active) for name, signal in signals.items()}
+                sounds = {name: sounds_of(first, [a, b, c], signal, active) for name, signal in signals.items()}
                 for name, estimator in estimators.items():
-                    _judge(rows.setdefault(name, []), estimator, heard[""], source_m)
-                    suspect = heard[""] | {"c": replace(heard[""]["c"], suspect=True)}
-                    _judge(rows.setdefault(f"{name}, doubted", []), estimator, suspect, source_m)
+                    _judge(rows.setdefault(name, []), estimator, sounds[""], source_m)
+                    suspect = sounds[""] | {"c": replace(sounds[""]["c"], suspect=True)}
+                    _judge(rows.setdefault(f"{name}, suspect", []), estimator, suspect, source_m)
                 for name in list(signals)[1:]:
-                    _judge(rows.setdefault(name, []), first, heard[name], source_m)
-                two = {name: heard[""][name] for name in "ab"}
+                    _judge(rows.setdefault(name, []), first, sounds[name], source_m)
+                two = {name: sounds[""][name] for name in "ab"}
                 _judge(rows.setdefault("none: two good ones only", []), first, two, source_m)
         print(f"\nRT60 {rt60_s:g} s, {'clean' if np.isinf(snr_db) else f'{snr_db:g} dB'}\n")
-        print("| the third array | events | median (m) | wrong | lost | outvoted |\n|---|---|---|---|---|---|")
+        print("| the third array | events | median (m) | wrong | lost | outlier |\n|---|---|---|---|---|---|")
         for name, each in rows.items():
-            print(told(name, *map(list, zip(*each, strict=True))), flush=True)
+            print(row_of(name, *map(list, zip(*each, strict=True))), flush=True)
 
 
 def _judge(
@@ -154,10 +156,10 @@ def _judge(
 
 
 def noise_beside(clips: Clips, positions: int, seed: int) -> None:
-    """A fan, or a radio that talks, beside the third array and as loud there as the sound that is elsewhere."""
+    """Place a fan or a talking radio beside the third array, as loud there as a sound elsewhere in the room."""
     specs = arrays()
     estimator = Onset(specs, GRID, C_M_S)
-    print("| | events | the sound is told | what is beside is told | it alone | a place of neither |")
+    print("| | events | sound located | noise located | only noise located | other positions |")
     print("|---|---|---|---|---|---|")
     for rt60_s in (0.4, 1.0):
         rows: dict[str, list[tuple[bool, bool, bool, bool]]] = {"nothing": [], "a fan": [], "a radio": []}
@@ -167,7 +169,7 @@ def noise_beside(clips: Clips, positions: int, seed: int) -> None:
             while np.linalg.norm(source_m - THIRD_M) < 1.5:
                 source_m = rng.uniform(0.0, 1.0, 3) * ROOM_M
             beside_m = THIRD_M + BESIDE_M * towards / np.linalg.norm(towards)
-            response, near = (heard_from(place_m, specs, [rt60_s])[0] for place_m in (source_m, beside_m))
+            response, near = (responses_from(place_m, specs, [rt60_s])[0] for place_m in (source_m, beside_m))
             for ours in clips.values():
                 wet = convolved(ours[int(rng.integers(len(ours)))][1], response)
                 lead = round((LEAD_S + rng.uniform(0.0, FRAME_S)) * RATE_HZ)
@@ -179,28 +181,28 @@ def noise_beside(clips: Clips, positions: int, seed: int) -> None:
                 }
                 clear = recorded(wet, lead, 20.0, rng)
                 active = active_frames(clear)
-                for name, told_of in rows.items():
+                for name, outcomes in rows.items():
                     samples = clear
                     if name in goes_on:
                         noise = convolved(goes_on[name], near)[:, :length]
                         level = np.sqrt(np.square(clear[8:, lead:]).mean() / np.square(noise[8:, lead:]).mean())
                         samples = np.asarray(0.5 * (clear + np.float32(level) * noise), dtype=np.float32)
-                    told_m = _located(estimator, specs, samples, active)
-                    errors = [[float(np.linalg.norm(p - at_m)) for at_m in (source_m, beside_m)] for p in told_m]
+                    found_m = _located(estimator, specs, samples, active)
+                    errors = [[float(np.linalg.norm(p - at_m)) for at_m in (source_m, beside_m)] for p in found_m]
                     right, there = (any(error[k] < NEAR_M for error in errors) for k in (0, 1))
                     stray = any(min(error) >= NEAR_M for error in errors)
-                    told_of.append((right, there, there and not right, stray))
-        for name, told_of in rows.items():
-            shares = " | ".join(f"{100 * share:.0f} %" for share in np.mean(told_of, axis=0))
-            print(f"| RT60 {rt60_s:g} s, {name} | {len(told_of)} | {shares} |", flush=True)
+                    outcomes.append((right, there, there and not right, stray))
+        for name, outcomes in rows.items():
+            shares = " | ".join(f"{100 * share:.0f} %" for share in np.mean(outcomes, axis=0))
+            print(f"| RT60 {rt60_s:g} s, {name} | {len(outcomes)} | {shares} |", flush=True)
 
 
 def two_sources(clips: Clips, positions: int, seed: int) -> None:
-    """Two clips of different classes, of one loudest frame, begun within 0.1 s of each other; and one alone."""
+    """Play two clips of different classes with equally loud frames within 0.1 s of each other, and one alone."""
     specs = arrays()[:2]
     estimator = Onset(specs, GRID, C_M_S)
     names = list(clips)
-    print("| | events | both within 0.5 m | first | second told wrongly |\n|---|---|---|---|---|")
+    print("| | events | both within 0.5 m | first | wrong second |\n|---|---|---|---|---|")
     for rt60_s, snr_db in ((0.4, np.inf), (0.4, 10.0), (1.0, np.inf), (2.0, np.inf), (2.0, 10.0)):
         both: list[bool] = []
         first: list[bool] = []
@@ -211,7 +213,7 @@ def two_sources(clips: Clips, positions: int, seed: int) -> None:
             places_m = rng.uniform(0.0, 1.0, (2, 3)) * ROOM_M
             while np.linalg.norm(places_m[0] - places_m[1]) < 1.5:
                 places_m[1] = rng.uniform(0.0, 1.0, 3) * ROOM_M
-            responses = [heard_from(place_m, specs, [rt60_s])[0] for place_m in places_m]
+            responses = [responses_from(place_m, specs, [rt60_s])[0] for place_m in places_m]
             for k, name in enumerate(names):
                 pool = clips[name], clips[names[(k + 1 + int(rng.integers(3))) % 4]]
                 wets = [
@@ -239,7 +241,7 @@ def two_sources(clips: Clips, positions: int, seed: int) -> None:
 
 
 def loudest_rms(wet: Float32Array) -> float:
-    """RMS of the loudest 50 ms over all microphones."""
+    """Return the RMS of the loudest 50 ms over all microphones."""
     count = wet.shape[1] // FRAME
     return float(np.sqrt(np.square(wet[:, : count * FRAME]).mean(axis=0).reshape(count, FRAME).mean(axis=1).max()))
 
@@ -253,9 +255,9 @@ def _located(
 
 
 def walks(clips: Clips, count: int, seed: int, rt60_s: float, live_sources: int, talkers: int) -> None:
-    """Talkers that walk straight across the room at 1 m/s, followed by the fusion's tracks."""
+    """Track talkers that walk straight across the room at 1 m/s by the fusion."""
     specs = arrays()[:2]
-    print("| walk | updates of the track | RMSE (m) | ids | share of the longest |\n|---|---|---|---|---|")
+    print("| walk | states of tracks | RMSE (m) | tracks | share of the longest |\n|---|---|---|---|---|")
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         recordings, ways = [], []
@@ -281,7 +283,9 @@ def walks(clips: Clips, count: int, seed: int, rt60_s: float, live_sources: int,
         for talker in range(talkers):
             mine: dict[int, list[float]] = {}
             for track in tracks:
-                at_s = track.time_ns / 1e9 - LEAD_NS / 1e9 - lead / RATE_HZ - 0.012  # the way to the arrays, about
+                at_s = (
+                    track.time_ns / 1e9 - LEAD_NS / 1e9 - lead / RATE_HZ - 0.012
+                )  # about the travel time to the arrays
                 errors = [float(np.linalg.norm(place_on_way(*each, [at_s])[0] - track.position_m)) for each in ways]
                 if int(np.argmin(errors)) == talker:
                     mine.setdefault(track.id, []).append(errors[talker])
@@ -297,7 +301,7 @@ LEAD_NS: Final = 20 * 1_700_000_000 * FRAME_NS
 
 
 def _tracks(specs: Sequence[ArraySpec], samples: Float32Array, live_sources: int) -> list[Track]:
-    fusion = Fusion("walk", specs, Onset(specs, GRID, C_M_S), FusionParameters(live_sources=live_sources))
+    fusion = Fusion(SiteState("walk", specs, Onset(specs, GRID, C_M_S), FusionParameters(live_sources=live_sources)))
     gates = [CausalActivity(ActivityParameters()) for _ in specs]
     tracks: list[Track] = []
     for k in range(samples.shape[1] // FRAME):
@@ -315,16 +319,16 @@ def _tracks(specs: Sequence[ArraySpec], samples: Float32Array, live_sources: int
 
 
 def main() -> None:
-    """Run one of the four."""
+    """Run one of the four experiments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("array", "beside", "sources", "walk"))
     parser.add_argument("--events", type=Path, required=True, help="folder of DCASE 2016 task 2 clips")
-    parser.add_argument("--positions", type=int, default=30, help="places, or walks")
+    parser.add_argument("--positions", type=int, default=30, help="number of positions or walks")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--half", choices=("development", "test"), default="development")
-    parser.add_argument("--rt60", type=float, default=0.6, help="of the walks, seconds")
-    parser.add_argument("--live-sources", type=int, choices=(1, 2), default=1, help="of the walks")
-    parser.add_argument("--talkers", type=int, choices=(1, 2), default=1, help="of the walks")
+    parser.add_argument("--rt60", type=float, default=0.6, help="reverberation time of the walks, in seconds")
+    parser.add_argument("--live-sources", type=int, choices=(1, 2), default=1, help="sources per window in the walks")
+    parser.add_argument("--talkers", type=int, choices=(1, 2), default=1, help="talkers in the walks")
     given = parser.parse_args()
     first = ("development", "test").index(given.half)
     clips = {name: each[first::2] for name, each in read_clips(given.events, CLASSES, RATE_HZ).items()}

@@ -1,8 +1,8 @@
-"""How soon `livessl serve` listens: two arrays in the room of the other benchmarks, searched on a grid of 0.05 m.
+"""The start-up time of `livessl serve`, with two arrays in the room of the other benchmarks and a grid of 0.05 m.
 
     python benchmarks/startup.py --out docs/performance
 
-Once so that what is compiled is in the cache, which is not counted, and then again and again.
+The first start fills the cache of compiled code and is not counted; the others are.
 """
 
 from __future__ import annotations
@@ -42,31 +42,36 @@ server:
 
 
 def start(site: Path, clock: Clock) -> tuple[float, float]:
-    """Start a server, wait for the line that tells that it listens, end it: seconds by the clock, and of processor.
+    """Start a server, wait until it logs that it is listening, and stop it.
+
+    Returns
+    -------
+    (float, float)
+        Elapsed time and processor time, in seconds.
 
     Raises
     ------
     RuntimeError
-        Where it ends without that line.
+        If the server ends without that log line.
     """
     began_ns = clock.monotonic_ns()
     command = [sys.executable, "-m", "livessl", "serve", "--site", str(site)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:  # noqa: S603 - ours
         assert server.stderr is not None
-        said = []
+        lines = []
         for line in server.stderr:
-            said.append(line)
+            lines.append(line)
             if "listening" in line:
                 took_s = (clock.monotonic_ns() - began_ns) / 1e9
                 ticks = Path(f"/proc/{server.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
                 server.send_signal(signal.SIGTERM)
                 server.communicate()
                 return took_s, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
-    raise RuntimeError(f"livessl serve: expected a line that it listens, got {''.join(said)!r}")
+    raise RuntimeError(f"livessl serve: expected a line with 'listening', got {''.join(lines)!r}")
 
 
 def main() -> int:
-    """Measure, and write `startup.json`."""
+    """Measure the start-up time and write `startup.json`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--starts", type=int, default=STARTS)

@@ -1,7 +1,7 @@
-"""What it is worth to ask arrays that did not find a sound: one scene, ever weaker at one of two arrays.
+"""The benefit of backfill requests: one scene, ever weaker at one of two arrays.
 
-`python benchmarks/weak.py --cache FOLDER` simulates development sounds in the demo's room, the south array hearing them
-so many dB lower in the same noise, and localizes them with and without asking. What came out is in
+`python benchmarks/weak.py --cache FOLDER` simulates development sounds in the demo's room, weaker at the south array by
+a number of dB in the same noise, and localizes them with and without backfill requests. The results are in
 docs/accuracy/arrays.md.
 """
 
@@ -32,7 +32,7 @@ LOWER_DB: Final = (0.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
 def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) -> list[AssignedRecording]:
-    """The arrays' recordings, the last one's sounds so much lower."""
+    """Simulate the arrays' recordings, with the sounds of the last array `lower_db` lower."""
     cache.mkdir(parents=True, exist_ok=True)
     paths = {}
     for number, spec in enumerate(site.specs):
@@ -48,21 +48,27 @@ def parts_of(site: Site, scene: Scene, cache: Path, name: str, lower_db: float) 
 
 
 def figures(scene: Scene, events: list[Event]) -> dict[str, int]:
-    """What became of the sounds."""
+    """Count the sounds by the outcome of their events."""
     near = wrong = alone = helped = 0
-    told = by_sound(scene, events)
-    for source, found in zip(scene.sources, told, strict=True):
+    found_by_sound = by_sound(scene, events)
+    for source, found in zip(scene.sources, found_by_sound, strict=True):
         placed = [event for event in found if event.status is Status.LOCATED and event.estimate is not None]
         errors_m = [float(np.linalg.norm(e.estimate.position_m - source.position_m)) for e in placed if e.estimate]
         near += bool(errors_m) and min(errors_m) <= NEAR_M
         wrong += sum(error_m > NEAR_M for error_m in errors_m)
         alone += any(len(event.heard_by) == 1 for event in found)
         helped += any(contribution.asked for event in placed for contribution in event.contributions)
-    return {"sounds": len(told), "near": near, "wrong": wrong, "heard_by_one": alone, "asked_and_used": helped}
+    return {
+        "sounds": len(found_by_sound),
+        "near": near,
+        "wrong": wrong,
+        "heard_by_one": alone,
+        "asked_and_used": helped,
+    }
 
 
 def main() -> None:
-    """Simulate, listen, print two lines for each level."""
+    """Simulate, localize, and print two lines for each level."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sounds", type=int, default=36)
     parser.add_argument("--rt60", type=float, default=0.7)

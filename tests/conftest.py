@@ -9,6 +9,8 @@ from hypothesis import settings
 
 from livessl.core.locate.peak_search import warm_up
 
+pytest_plugins = ["api_contract"]
+
 settings.register_profile("livessl", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("livessl")
 

@@ -12,13 +12,12 @@ import pytest
 
 from livessl.clock import UnpacedClock
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
-from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset
+from livessl.core.stream.clock_offsets import LEAST_SOUNDS, ClockOffset, ClockOffsets
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
-from livessl.core.stream.fusion import Fusion
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Output
 from livessl.recordings.assign import make_pipelines
 from livessl.recordings.play import paced_messages
-from livessl.site.build.fusion import make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, scene, scene_recordings, site_of
 
@@ -41,7 +40,7 @@ def site() -> Site:
 
 @cache
 def batches(ahead_s: float) -> Batches:
-    """What the two nodes send of the scene, the second one with its clock ahead, and when."""
+    """The messages of two nodes, the second with its clock ahead, and when they come."""
     ahead_ns = round(ahead_s * 1e9)
     parts = [
         replace(part, recording=part.recording, start_ns=START_NS + ahead_ns * (part.array == "south"))
@@ -77,7 +76,7 @@ def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15, 0.15, -0.09])
-def test_answers_are_those_of_clocks_that_agree(ahead_s: float) -> None:
+def test_events_are_those_of_clocks_that_agree(ahead_s: float) -> None:
     expected, agreeing = located(0.0)
     events, south = located(ahead_s)
     assert len(events) == len(expected) == SOUNDS
@@ -107,19 +106,16 @@ def test_answers_are_those_of_clocks_that_agree(ahead_s: float) -> None:
 def test_sounds_close_to_one_another_stay_apart() -> None:
     """Pauses of 0.4 s are longer than the hang-over of 0.3 s, but not by as much as the clocks differ.
 
-    Joined by their own times the arrays would hear on without a pause, and two sounds be one.
+    By the times of the arrays' own clocks there would be no pause, and both sounds would be one event.
     """
 
     def told_of(*, corrected: bool) -> list[Event]:
-        fusion = make_fusion(site(), updates=False)
-        if not corrected:
-            fusion.clock_offsets = None
-        else:
-            assert fusion.clock_offsets is not None
-            for k in range(LEAST_SOUNDS):
-                fusion.clock_offsets.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-            fusion.step([], START_NS)
-            fusion._align()
+        clocks = make_clock_offsets(site())
+        for k in range(LEAST_SOUNDS):
+            clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
+        fusion = make_fusion(
+            site(), updates=False, corrects_clocks=corrected, clock_offsets=clocks if corrected else None
+        )
         messages: list[Message] = []
         for first in (20, 33):
             for array, ahead in (("north", 0), ("south", 3)):
@@ -146,15 +142,15 @@ def settled_events(outputs: Iterable[Output | FinalResults]) -> list[Event]:
     return [event for output in outputs if isinstance(output, FinalResults) for event in output.events]
 
 
-def settling(fusion: Fusion | None = None, settled: int | None = None) -> TwoPassFusion:
-    return TwoPassFusion(fusion or make_fusion(site(), live=True), ("north", "south"), settled)
+def two_passes(clocks: ClockOffsets | None = None, settled: int | None = None) -> TwoPassFusion:
+    return make_two_pass_fusion(site(), ("north", "south"), settled, live=True, clock_offsets=clocks)
 
 
 @pytest.mark.parametrize("step", [1, 7, 100])
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
-def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
-    """However many messages come at a time; and none of them only from the fusion that does not wait."""
-    into = settling()
+def test_live_events_are_the_same_and_final_at_once(ahead_s: float, step: int) -> None:
+    """This does not depend on how many messages come at a time, and the early pass reports none by itself."""
+    into = two_passes()
     outputs: list[Output | FinalResults] = []
     all_batches = batches(ahead_s)
     for at in range(0, len(all_batches), step):
@@ -166,25 +162,25 @@ def test_live_tells_the_same_events_at_once(ahead_s: float, step: int) -> None:
 
 
 @pytest.mark.parametrize("ahead_s", [0.137, -0.15])
-def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -> None:
+def test_each_sound_is_reported_once_however_often_the_server_restarts(ahead_s: float) -> None:
     """Nodes keep what is not settled by their own clocks, and send it again; the server knows the clocks it had."""
     expected = told(located(ahead_s)[0])
     arrays = ("north", "south")
     kept: dict[str, list[Frame]] = {name: [] for name in arrays}
     stored: tuple[int | None, dict[str, Any] | None] = (None, None)
     events: list[Event] = []
-    into = settling()
+    clocks = make_clock_offsets(site())
+    into = two_passes(clocks)
     for k, (now_ns, batch) in enumerate(batches(ahead_s)):
         for message in batch:
             if isinstance(message, Frame):
                 kept[message.array].append(message)
         outputs = into.step(batch, now_ns)
         if k % 29 == 28:  # it is killed, and starts again with what is stored
-            fusion = make_fusion(site(), live=True)
+            clocks = make_clock_offsets(site())
             if stored[1] is not None:
-                assert fusion.clock_offsets is not None
-                fusion.clock_offsets.restore(stored[1])
-            again = settling(fusion, stored[0])
+                clocks.restore(stored[1])
+            again = two_passes(clocks, stored[0])
             for name in arrays:
                 if kept[name]:
                     again.greet(name, (kept[name][0].frame_index, kept[name][-1].frame_index + 1), now_ns)
@@ -195,15 +191,14 @@ def test_each_sound_once_however_often_the_server_starts_again(ahead_s: float) -
         for output in outputs:
             if isinstance(output, FinalResults):
                 events += output.events
-                assert into.live.clock_offsets is not None
-                stored = output.until, into.live.clock_offsets.state()
+                stored = output.until, clocks.state()
         for name, settled in into.settled_of.items():
             kept[name] = [frame for frame in kept[name] if frame.frame_index >= settled]
     events += settled_events(into.flush(now_ns))
     assert told(events) == expected
 
 
-def test_offset_is_shown_to_the_reference() -> None:
+def test_status_shows_the_offset_from_the_reference_clock() -> None:
     north, south = _status_after(0.137)
     assert north.clock_offset is not None
     assert north.clock_offset.reference == "a"

@@ -1,10 +1,12 @@
-"""What `import livessl` offers: values in, values out, and one clear error for what does not fit."""
+"""The functions of `import livessl`: values in, values out, and one clear error for unusable input."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,17 +49,38 @@ def test_microphones_may_have_a_file_each(tmp_path: Path) -> None:
     assert positions(livessl.locate(site_of(), given)) == positions(livessl.locate(site_of(), {**samples()}))
 
 
-def test_integers_are_taken_at_their_full_scale() -> None:
+def test_integers_are_scaled_by_their_full_scale() -> None:
     integers = {name: np.round(heard(name) * 32767).astype(np.int16) for name in ARRAYS}
     of_integers, of_floats = livessl.locate(site_of(), integers), livessl.locate(site_of(), samples())
     assert np.array(positions(of_integers)) == pytest.approx(np.array(positions(of_floats)), abs=0.01)
     assert of_integers[0].power == pytest.approx(of_floats[0].power, rel=0.01)
 
 
-def test_another_method_gives_other_answers() -> None:
+def test_another_method_gives_other_positions() -> None:
     events = livessl.locate(site_of(), samples(), method="srp-phat")
     assert {event.method for event in events} == {"srp-phat"}
     assert positions(events) != positions(livessl.locate(site_of(), samples()))
+
+
+def test_unknown_method_is_an_error_with_a_guess() -> None:
+    with pytest.raises(
+        livessl.ConfigError, match=r"expected one of onset, .*, got 'srp-fat'; did you mean 'srp-phat'\?"
+    ):
+        livessl.locate(site_of(), samples(), method="srp-fat")
+
+
+def test_estimator_of_the_reference_is_registered_and_locates(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "estimators.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
+    assert code is not None
+    names: dict[str, Any] = {}
+    exec(code[1], names)
+    monkeypatch.setitem(livessl.METHODS, "product", "removed:again")  # restored after the test
+    livessl.register("product", names["Product"])
+    events = livessl.locate(site_of(), samples(), method="product")
+    assert [event.method for event in events] == ["product", "product"]
+    for source, position_m in zip(scene().sources, positions(events), strict=True):
+        assert position_m == pytest.approx(source.position_m, abs=0.25)  # one step of the grid
 
 
 @pytest.mark.parametrize(
@@ -72,12 +95,12 @@ def test_another_method_gives_other_answers() -> None:
         ({"north": "none.wav"}, "no such file"),
     ],
 )
-def test_what_does_not_fit_gives_one_clear_error(given: dict[str, livessl.offline.Given], words: str) -> None:
+def test_unusable_recordings_give_one_clear_error(given: dict[str, livessl.offline.Given], words: str) -> None:
     with pytest.raises(DeviceError, match=words):
         livessl.locate(site_of(), given)
 
 
-def test_samples_without_a_rate_are_refused_where_the_site_says_none() -> None:
+def test_samples_without_a_rate_are_refused_if_the_site_has_no_rate() -> None:
     with pytest.raises(DeviceError, match="pass sample_rate_hz"):
         livessl.locate(site_of({"nodes": {}}), samples())
     assert livessl.locate(site_of({"nodes": {}}), samples(), sample_rate_hz=RATE_HZ)
@@ -114,7 +137,7 @@ def test_every_name_of_the_front_door_exists() -> None:
         livessl.lokate  # noqa: B018
 
 
-def test_importing_loads_nothing_heavy() -> None:
+def test_import_loads_no_heavy_module() -> None:
     code = "import sys, livessl; print(*sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert set(done.stdout.split()) & {"numpy", "scipy", "pydantic", "numba", "fastapi", "zmq", "yaml"} == set()

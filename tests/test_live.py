@@ -1,4 +1,4 @@
-"""The whole path as a user runs it: real commands as processes, real sockets, a real browser."""
+"""End-to-end tests: real commands as processes, real sockets, a real browser."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Session:
 
 @dataclass
 class LiveRun:
-    """What subscribers and the browser saw of one live run."""
+    """Everything that subscribers and the browser received in one live run."""
 
     messages: list[dict[str, Any]] = field(default_factory=list)
     page: list[dict[str, Any]] = field(default_factory=list)
@@ -117,7 +117,7 @@ def located(session: Session) -> str:
 
 @pytest.fixture(scope="module")
 def live(session: Session) -> LiveRun:
-    """Server, two nodes, a subscriber, the documented clients and a browser, while the session plays once."""
+    """Run a server, two nodes, a subscriber, the documented clients and a browser while the session plays once."""
     require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
     seen = LiveRun()
     server = subprocess.Popen([*LIVESSL, "serve", "--site", str(session.site)])
@@ -130,7 +130,7 @@ def live(session: Session) -> LiveRun:
         code = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
         reader = [sys.executable, "-u", "-c", code]
         clients.append(subprocess.Popen(reader, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
-        wait_for(lambda: time.time() % TOGETHER_S < 1.0, "a new five seconds: nodes started within them begin together")
+        wait_for(lambda: time.time() % TOGETHER_S < 1.0, "the next multiple of 5 s, at which both nodes begin")
         for node, array in (("north-pc", "north"), ("south-pc", "south")):
             wav = f"{array}={session.directory / array}.wav"
             command = [*LIVESSL, "capture", "--site", str(session.site), "--node", node, "--wav", wav]
@@ -177,7 +177,7 @@ def watch_in_browser(session: Session, seen: LiveRun, nodes: list[subprocess.Pop
 
 
 def look(page: Page) -> dict[str, Any]:
-    """What a person would read off the page at one moment."""
+    """Read the values that the page shows at this moment."""
     seen: dict[str, Any] = page.evaluate(
         """() => {
           const the = name => document.querySelector(`[data-testid="${name}"]`);
@@ -202,7 +202,7 @@ def save_screenshot(page: Page) -> None:
 
 
 def start_javascript_client(page: Page, session: Session) -> None:
-    """The documented JavaScript, with its console.log collected."""
+    """Run the JavaScript of the documentation in the page, and collect what it prints."""
     code = doc_block(ROOT / "docs" / "clients.md", "javascript").replace(
         "127.0.0.1:8000", session.url.removeprefix("http://")
     )
@@ -214,7 +214,7 @@ def start_javascript_client(page: Page, session: Session) -> None:
 
 
 def curl_examples(session: Session) -> dict[str, str]:
-    """Every curl line of the documentation, run."""
+    """Run every curl line of the documentation; return its output by line."""
     require(shutil.which("curl") is not None, "curl is not installed")
     answers_of = {}
     for line in doc_block(ROOT / "docs" / "clients.md", "sh").splitlines():
@@ -257,11 +257,11 @@ def answers(url: str) -> bool:
 def wait_for(condition: Any, what: str, within_s: float = 20.0) -> None:
     deadline = time.monotonic() + within_s
     while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        assert time.monotonic() < deadline, f"not within {within_s:g} s: {what}"
         time.sleep(0.05)
 
 
-def test_locate_finds_every_sound_near_its_true_place(session: Session, located: str) -> None:
+def test_locate_finds_every_sound_near_its_true_position(session: Session, located: str) -> None:
     events = events_of(located)
     assert len(events) == len(session.truth)
     for event, source in zip(events, session.truth, strict=True):
@@ -295,7 +295,7 @@ def test_live_gives_the_events_of_locate(located: str, live: LiveRun) -> None:
         assert math.dist(event["position_m"], expected["position_m"]) <= LIVE_TOLERANCE_M
 
 
-def test_a_subscriber_gets_numbered_messages_of_every_kind(live: LiveRun) -> None:
+def test_subscriber_receives_numbered_messages_of_every_kind(live: LiveRun) -> None:
     kinds = {message["kind"] for message in live.messages}
     assert kinds >= {"hello", "arrays", "update", "event", "track"}
     numbers = [message["seq"] for message in live.messages[1:]]
@@ -303,13 +303,13 @@ def test_a_subscriber_gets_numbered_messages_of_every_kind(live: LiveRun) -> Non
     assert {message["v"] for message in live.messages} == {1}
 
 
-def test_events_are_told_soon_after_the_sound_has_ended(live: LiveRun) -> None:
-    """The hang-over of 0.3 s must pass first; what is beyond it is ours."""
+def test_events_are_published_within_a_second_after_the_sound(live: LiveRun) -> None:
+    """The latency includes the hang-over of 0.3 s, which ends an event."""
     latencies = sorted(event["latency_s"] for event in live.events)
     assert latencies[len(latencies) // 2] <= 1.0
 
 
-def test_the_page_shows_the_estimate_near_the_true_place(session: Session, live: LiveRun) -> None:
+def test_page_shows_the_estimate_near_the_true_position(session: Session, live: LiveRun) -> None:
     places = [source["position_m"] for source in session.truth]
     for kind in ("update", "event"):
         shown = [look["position_m"] for look in live.page if look["kind"] == kind and look["position_m"]]
@@ -322,15 +322,15 @@ def test_the_page_shows_the_estimate_near_the_true_place(session: Session, live:
     assert any(look["map_time"] for look in live.page)
 
 
-def test_the_page_runs_without_errors(live: LiveRun) -> None:
+def test_page_runs_without_errors(live: LiveRun) -> None:
     assert live.problems == []
 
 
-def test_the_page_shows_that_nodes_have_gone(live: LiveRun) -> None:
+def test_page_shows_arrays_of_ended_nodes_as_lost(live: LiveRun) -> None:
     assert live.after_the_end == "lost"
 
 
-def test_the_client_in_the_readme_receives_the_events(live: LiveRun) -> None:
+def test_client_in_the_readme_receives_the_events(live: LiveRun) -> None:
     assert len(readme_block("python").strip().splitlines()) <= 10
     lines = live.readme_client.splitlines()
     assert len(lines) == len(live.events)
@@ -338,22 +338,22 @@ def test_the_client_in_the_readme_receives_the_events(live: LiveRun) -> None:
         assert str(event["position_m"]) in line
 
 
-def test_the_documented_javascript_receives_the_events(live: LiveRun) -> None:
+def test_documented_javascript_receives_the_events(live: LiveRun) -> None:
     assert [entry[-1] for entry in live.javascript_client] == [event["position_m"] for event in live.events]
 
 
-def test_the_documented_curl_lines_answer(live: LiveRun) -> None:
+def test_documented_curl_lines_succeed(live: LiveRun) -> None:
     assert len(live.curl_clients) >= 3
     listed = next(json.loads(text) for line, text in live.curl_clients.items() if "/events?" in line)
     assert {event["id"] for event in listed["events"]} <= {event["id"] for event in live.events}
 
 
-def test_demo_once_locates_every_event_within_a_minute() -> None:
-    began = time.monotonic()
+def test_demo_once_locates_every_sound() -> None:
     shown = run("demo", "--once", "--port", str(free_port()), "--json")
     assert shown.returncode == 0, shown.stderr
-    assert time.monotonic() - began < 60.0
-    events = events_of(shown.stdout)
+    events = {event["id"]: event for event in events_of(shown.stdout)}
+    for replaced in [old for event in events.values() for old in event["replaces"]]:
+        events.pop(replaced, None)
     assert len(events) == 8
-    assert max(event["error_m"] for event in events) <= NEAR_M
+    assert max(event["error_m"] for event in events.values()) <= NEAR_M
     assert "8 of 8 sounds located" in shown.stderr

@@ -16,6 +16,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.errors import ConfigError
 from livessl.server import app
 from livessl.server.store import Query, Store
+from messages import event_message
 from small_site import running_server, scene_recordings, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
@@ -24,7 +25,7 @@ PRIVATE = {"privacy": "positions-only"}
 
 
 def event(number: int) -> dict[str, Any]:
-    return {"id": f"small-{number}", "confidence": 0.5, "zones": [], "note": f"uttered {number}"}
+    return event_message(id=f"small-{number}", reason=f"uttered {number}")
 
 
 def test_record_is_refused_with_positions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,6 +49,15 @@ def test_changed_byte_of_a_binary_is_reported_in_hexadecimal_digits() -> None:
     ]
 
 
+def test_only_the_words_of_a_reason_may_change() -> None:
+    one = b'{"position_m": [1.0], "reason": "a \\"b\\" c", "zones": []}'
+    reworded, none = one.replace(b" c", b" d"), one.replace(b'"a \\"b\\" c"', b"null")
+    moved = reworded.replace(b"1.0", b"1.1")
+    assert len({one, reworded, none, moved}) == 4
+    same, *others = (unchanged_probes.without_reasons({"stdout": text}) for text in (one, reworded, none, moved))
+    assert [other == same for other in others] == [True, False, False]
+
+
 def test_shorter_output_is_reported() -> None:
     [line] = differences({"stdout": EVENT + EVENT}, {"stdout": EVENT})
     assert line.startswith(f"stdout: byte {len(EVENT)} of {2 * len(EVENT)} and {len(EVENT)}")

@@ -34,13 +34,24 @@ SAMPLES = hnp.arrays(
 FRAMES = st.builds(
     Frame,
     array=NAMES,
-    sequence=st.integers(0, 2**63 - 1),
+    sequence=st.integers(1, 2**63 - 1),
     frame_index=RASTERS,
     time_ns=st.integers(-(2**63), 2**63 - 1),
     sample_rate_hz=RATES,
     samples=SAMPLES,
     power=POWERS,
     active=st.booleans(),
+) | st.builds(
+    Frame,
+    array=NAMES,
+    sequence=st.just(0),
+    frame_index=RASTERS,
+    time_ns=st.integers(-(2**63), 2**63 - 1),
+    sample_rate_hz=RATES,
+    samples=SAMPLES,
+    power=POWERS,
+    active=st.booleans(),
+    requested=st.just(True),
 )
 MARKS = st.builds(
     Mark,

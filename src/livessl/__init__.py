@@ -1,7 +1,7 @@
-"""Locates sounds in a room, live, with a few small microphone arrays set far apart.
+"""Locate sounds in a room, live, with a few small microphone arrays set far apart.
 
 `livessl.locate("site.yaml", {"north": "north.wav", "south": "south.wav"})` returns the events in recordings. Each name
-below is loaded when it is first used, so that `import livessl` costs nothing.
+below is loaded when it is first used, so that `import livessl` takes no time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The whole pipeline in one process, without sockets: what the command line, notebooks, tests and calibration call."""
+"""The whole pipeline in one process, without sockets, for the command line, notebooks, tests and calibration."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ Samples = NDArray[Any]
 """Samples (channels, n): floats with full scale at 1, or integers of a converter."""
 
 Given = Samples | Path | str | Sequence[Path | str]
-"""One array's recording: samples, the path of a WAV or FLAC file, or the paths of several, such as one for each
-microphone."""
+"""The recording of one array: samples, the path of a WAV or FLAC file, or the paths of several files that hold its
+channels, such as one for each microphone."""
 
 _WIDEST: Final = 64
-"""Most rows of an array of samples that are taken for channels; an axis longer than that is time."""
+"""Most rows of samples that can be channels; with more rows, the array is likely transposed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,31 +74,32 @@ def locate(
     sample_rate_hz: float | None = None,
     method: str | None = None,
 ) -> list[Event]:
-    """Locate the sounds in recordings: the live pipeline from activity detection to events, as fast as it can.
+    """Locate the sounds in recordings by the live pipeline, from activity detection to events, without waiting.
 
     Parameters
     ----------
     site : Site, Path or str
         A site, or the path of a site file.
     recordings : mapping of array name to (channels, n) array, Path, str or sequence of paths
-        One recording for each array, in the order of its microphones; all begin together. A file may hold more
-        channels: the site's node says which are the array's.
+        One recording for each array, its channels in the order of the microphones. All begin at the same time. A file
+        may have more channels; then the node in the site file says which of them belong to the array. Several files
+        are one recording: the channels of the first, then of the second, ….
     sample_rate_hz : float or None
-        Sampling rate of the recordings that are arrays of samples; None takes the rate that the site says.
+        Sampling rate of recordings that are given as samples; None takes the rate of the site's device.
     method : str or None
-        Name of the estimator; None takes the site's.
+        Name of a registered method, or the import path `MODULE:NAME` of one; None takes the site's.
 
     Returns
     -------
     list of Event
-        In order of time. Event times count from the beginning of the recordings.
+        In order of time. The times of an event count from the beginning of the recordings.
 
     Raises
     ------
     ConfigError
-        Where the site file is wrong.
+        If the site file is invalid, or there is no such method.
     DeviceError
-        Where a recording does not fit the site.
+        If a recording does not fit the site.
     """
     loaded = _site(site)
     parts = _parts(loaded, recordings, sample_rate_hz)
@@ -114,19 +115,19 @@ def power_map(
     sample_rate_hz: float | None = None,
     method: str | None = None,
 ) -> PowerMap:
-    """Map the power of a stretch of recordings over the search volume: one sound, as one segment.
+    """Map the power of one sound, a segment of the recordings, over the search volume.
 
     Parameters
     ----------
     site, recordings, sample_rate_hz, method
         As in `locate`.
     start_s, stop_s : float, float or None
-        The stretch, seconds after the beginning of the recordings; None is their end.
+        Begin and end of the segment, seconds after the beginning of the recordings; None is their end.
 
     Raises
     ------
     ConfigError, DeviceError
-        As in `locate`; also where the stretch holds no sound.
+        As in `locate`; `DeviceError` also if the segment is silent.
     """
     loaded = _site(site)
     sounds = {}
@@ -159,14 +160,14 @@ def run(
     backfill: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[Output]:
-    """Yield everything that the fusion makes of recordings, events in order of time.
+    """Yield all outputs of the fusion for recordings; events are in order of time.
 
-    With `backfill`, arrays that did not detect a sound are asked for their frames of it, as in a live server.
+    With `backfill`, frames of a sound are requested from arrays that did not detect it, as a live server does.
 
     Raises
     ------
     DeviceError
-        Where recordings of arrays that the site joins do not belong together.
+        If recordings of arrays that the site joins do not belong together.
     """
     fusion = make_fusion(site, method, updates=False)
     pipelines, inputs = make_pipelines(site, recordings)

@@ -206,7 +206,7 @@ def _encode_frame(frame: Frame) -> bytes:
     channels, n = frame.samples.shape
     fixed = _FRAME.pack(
         len(name),
-        frame.sequence,
+        0 if frame.requested else frame.sequence,
         frame.frame_index,
         frame.time_ns,
         frame.sample_rate_hz,
@@ -239,7 +239,7 @@ def _decode_frame(body: bytes) -> Frame:
         raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
     if largest > MAX_SAMPLE:
         raise WireError(f"frame of array {name!r}: expected samples up to {MAX_SAMPLE:g}, got {largest:g}")
-    return Frame(name, sequence, frame_index, time_ns, rate, samples, power, active)
+    return Frame(name, sequence, frame_index, time_ns, rate, samples, power, active, requested=sequence == 0)
 
 
 def _encode_mark(mark: Mark) -> bytes:

@@ -30,7 +30,7 @@ from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.receiver import Item, Joined, Left, Receiver
 from livessl.site.models import Site
-from small_site import RATE_HZ, hiss, mark, site_of, wait_until
+from small_site import HANG_S, RATE_HZ, hiss, mark, site_of, wait_until
 
 START_NS = 1_767_225_600_000_000_000
 FIRST = START_NS // FRAME_NS
@@ -139,7 +139,7 @@ def test_session_waits_for_a_server_that_starts_later() -> None:
         wait_until(lambda: late.of(Left), "the good-bye")
     finally:
         receiver.stop()
-    played.join(timeout=5)
+    played.join(timeout=HANG_S)
     assert_whole(late)
 
 
@@ -157,7 +157,7 @@ def test_session_is_not_played_faster_than_the_server_takes_messages() -> None:
         wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.monotonic_ns()), "the node")
         wait_until(there.receiver._queue.full, "a full queue")  # no message is taken
         assert played.is_alive()
-        wait_until(lambda: there.of(Left), "the end", 30)
+        wait_until(lambda: there.of(Left), "the end")
         played.join()
         assert len(there.of(Frame)) > 2 * MAX_PENDING
         for array in ARRAYS:

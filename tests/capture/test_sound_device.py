@@ -28,6 +28,7 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
 from livessl.site.node_models import SoundDeviceConfig
+from small_site import HANG_S
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -506,7 +507,7 @@ class VirtualCard:
             process.terminate()
         for process in self.running:
             with suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=5)
+                process.wait(timeout=HANG_S)
             process.kill()
             process.communicate()
 
@@ -541,7 +542,7 @@ def test_each_channel_of_a_card_is_recorded_in_its_place(card: VirtualCard, tmp_
     card.play((AMPLITUDE * np.sin(2 * np.pi * np.array(TONES_HZ) * seconds)).astype(np.float32))
     path, count = tmp_path / "recorded.npz", 200
     recorder = card.start(sys.executable, "-c", RECORDER, str(path), str(count))
-    assert recorder.wait(timeout=60) == 0
+    assert recorder.wait(timeout=HANG_S) == 0
     recorded = np.load(path)
 
     assert recorded["samples"].shape == (4, count * BLOCK)

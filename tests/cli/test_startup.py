@@ -1,4 +1,4 @@
-"""What a command loads: a node starts on small machines, and a server within a second and a half."""
+"""Modules that a command imports: a node runs on small machines, and a server starts within a second and a half."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from small_site import write_site
 
 PAPER = Path(__file__).parents[2] / "config" / "paper.yaml"
 RUN = """
@@ -22,36 +26,57 @@ OTHER_COMMANDS = {
     "livessl.lab.plan",
     "livessl.offline",
 }
+LOCALIZES = {
+    "livessl.core.kernels",
+    "livessl.core.locate.estimator",
+    "livessl.core.locate.peak_search",
+    "livessl.core.locate.srp",
+    "livessl.core.stream.fusion",
+}
 NEVER_LIVE = {"matplotlib", "pyarrow", "scipy.signal", "scipy.sparse", "scipy.spatial", "scipy.stats", "tqdm"}
 
 
 def loaded(*arguments: str, code: int) -> set[str]:
-    """Modules, and the packages that they are in, that a command has loaded when it ends with that code."""
+    """Run a command that ends with `code`; return the names of all modules that it has imported."""
     done = subprocess.run([sys.executable, "-c", RUN, *arguments], capture_output=True, text=True, check=True)
-    got, names = json.loads(done.stdout)
+    got, names = json.loads(done.stdout.splitlines()[-1])
     assert got == code, done.stderr
     return set(names)
 
 
-def test_a_node_loads_nothing_that_localizes() -> None:
+def test_capture_imports_nothing_that_localizes() -> None:
     names = loaded("capture", "--site", str(PAPER), "--node", "nobody", code=2)
     assert {"livessl.capture.node", "livessl.capture.link", "livessl.site.models"} <= names
-    heavy = {
-        "livessl.core.locate.estimator",
-        "livessl.core.stream.fusion",
-        "livessl.core.kernels",
-        "livessl.core.locate.peak_search",
-    }
-    heavy |= {"livessl.core.locate.srp", "livessl.server", "livessl.simulation", "fastapi", "numba", "uvicorn"}
-    assert names & (heavy | OTHER_COMMANDS | NEVER_LIVE) == set()
+    heavy = {"livessl.server", "livessl.simulation", "fastapi", "numba", "uvicorn"}
+    assert names & (LOCALIZES | heavy | OTHER_COMMANDS | NEVER_LIVE) == set()
 
 
-def test_a_server_loads_nothing_of_other_commands(tmp_path: Path) -> None:
+def test_serve_imports_nothing_of_other_commands(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         text = PAPER.read_text(encoding="utf-8")
         text = text.replace(":5570", f":{taken.getsockname()[1]}").replace("port: 8000", "port: 0")
         site = tmp_path / "site.yaml"
         site.write_text(text, encoding="utf-8")
-        names = loaded("serve", "--site", str(site), code=1)  # once all else is ready
+        names = loaded("serve", "--site", str(site), code=1)  # the port is opened last
     assert {"livessl.server.api.app", "livessl.core.locate.peak_search", "fastapi", "numba"} <= names
     assert names & (OTHER_COMMANDS | NEVER_LIVE | {"livessl.recordings.recording", "livessl.simulation"}) == set()
+
+
+EVALUATION = {"livessl.cli.evaluate", "livessl.lab.evaluate", "livessl.lab.evaluate.paper"}
+
+
+@pytest.mark.parametrize(
+    "arguments", [("check", "evaluate"), ("replay", "evaluate"), ("--verbose", "check", "evaluate")], ids=" ".join
+)
+def test_file_called_evaluate_imports_nothing_of_the_evaluation(arguments: tuple[str, ...]) -> None:
+    assert loaded(*arguments, code=2) & EVALUATION == set()
+
+
+def test_evaluate_imports_the_evaluation() -> None:
+    assert loaded("evaluate", "report", "--out", "unused", code=2) >= EVALUATION
+
+
+def test_check_of_a_method_of_ones_own_imports_nothing_that_localizes(tmp_path: Path) -> None:
+    """The module of the method does not exist, and the check does not look for it."""
+    site = write_site(tmp_path, {"fusion.method": "nowhere:Method"})
+    assert loaded("check", str(site), code=0) & LOCALIZES == set()

@@ -160,7 +160,7 @@ class Player(Microphones):
     sounds: Sequence[Mapping[str, Heard]] = ()
     sent: Counter[str] = field(default_factory=Counter)
 
-    def hear(self, frame_index: int) -> list[Message]:
+    def messages_at(self, frame_index: int) -> list[Message]:
         messages = self._heard(frame_index)
         self.sent.update(type(message).__name__ for message in messages)
         return messages
@@ -169,11 +169,11 @@ class Player(Microphones):
         slot, since = divmod(frame_index - START, SLOT)
         played = sound_of(slot, len(self.sounds))
         if played is None:
-            return super().hear(frame_index)
+            return super().messages_at(frame_index)
         began = frame_index - since + played[0]
         frames = self.sounds[played[1]][self.array].get(frame_index - began, ())
         if not frames:
-            return super().hear(frame_index)
+            return super().messages_at(frame_index)
         messages: list[Message] = []
         for frame in frames:
             self.sequence += 1
@@ -277,7 +277,11 @@ class Soak(World):
             if not node.stopped:  # else its device's buffer holds what is heard
                 first = self.frame_index - step if node.next_raster is None else node.next_raster
                 node.link.send(
-                    [m for frame_index in range(first, self.frame_index) for m in node.microphones.hear(frame_index)]
+                    [
+                        m
+                        for frame_index in range(first, self.frame_index)
+                        for m in node.microphones.messages_at(frame_index)
+                    ]
                 )
                 node.next_raster = self.frame_index
         self._serve()

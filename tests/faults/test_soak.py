@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Final
@@ -12,8 +12,8 @@ from unittest.mock import patch
 import pytest
 from soak import GROWTH, READERS, Outcome, soak
 
-from livessl.core.stream.final_pass import TwoPassFusion
-from livessl.core.types import Message
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.types import Message, Output
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(120)]
 
@@ -32,14 +32,14 @@ def steady(directory: Path) -> Outcome:
 
 def leaking(directory: Path) -> Outcome:
     kept: list[Message | bytes] = []
-    take = TwoPassFusion._take
+    step = TwoPassFusion.step
 
-    def hoard(self: TwoPassFusion, message: Message, now_ns: int) -> bool:
-        kept.append(message)
-        kept.append(bytes(MARK_BYTES))
-        return take(self, message, now_ns)
+    def hoard(self: TwoPassFusion, messages: Sequence[Message], now_ns: int) -> list[Output | FinalResults]:
+        kept.extend(messages)
+        kept.extend(bytes(MARK_BYTES) for _ in messages)
+        return step(self, messages, now_ns)
 
-    with patch.object(TwoPassFusion, "_take", hoard):
+    with patch.object(TwoPassFusion, "step", hoard):
         return steady(directory)
 
 

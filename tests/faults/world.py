@@ -109,7 +109,7 @@ class Wire:
 
 
 class Cable(Dealer):
-    """What a node's link has for a socket."""
+    """The stand-in for the socket of a node's link."""
 
     def __init__(self, world: World, node: str) -> None:
         self._world = world
@@ -136,7 +136,7 @@ class Cable(Dealer):
         return self._world.receive_down(self._node)
 
     def wait(self, milliseconds: int) -> None:
-        raise AssertionError("nobody waits here")
+        raise AssertionError("a link must not wait in simulated time")
 
     def close(self, linger_ms: int) -> None:
         self._world.wires.pop(self._node, None)
@@ -144,14 +144,14 @@ class Cable(Dealer):
 
 @dataclass
 class Microphones:
-    """What an array sends, interval by interval, as a segmenter does: marks, frames around sound, and a run-up."""
+    """The messages of an array, as a segmenter makes them: marks, frames around sound, and a pre-roll."""
 
     array: str
     active: frozenset[int]
     sequence: int = 0
     began: int | None = None
 
-    def hear(self, frame_index: int) -> list[Message]:
+    def messages_at(self, frame_index: int) -> list[Message]:
         if self.began is None:
             self.began = frame_index
         if not any(frame_index - k in self.active for k in range(HANG_OVER + 1) if frame_index - k >= self.began):
@@ -403,7 +403,11 @@ class World:
             first = self.frame_index - 1 if node.next_raster is None else node.next_raster
             if not node.stopped:  # else its device's buffer holds what is heard
                 node.link.send(
-                    [m for frame_index in range(first, self.frame_index) for m in node.microphones.hear(frame_index)]
+                    [
+                        m
+                        for frame_index in range(first, self.frame_index)
+                        for m in node.microphones.messages_at(frame_index)
+                    ]
                 )
                 first = self.frame_index
             node.next_raster = first
@@ -456,18 +460,18 @@ class World:
         self.run(max(0, self.end - self.frame_index) + ticks)
 
     def events(self) -> list[Event]:
-        """What is stored, oldest first, without what depends on when it was found out."""
+        """The stored events, oldest first, without the fields that depend on when an event was found."""
         found, _ = self.store.find(Query(limit=1000))
         timeless = ("latency_s", "latency_stages_s", "late", "replaces", "late_frames", "start_s")
         return [{key: value for key, value in event.items() if key not in timeless} for event in reversed(found)]
 
     @property
     def published_events(self) -> list[Event]:
-        """What subscribers were told."""
+        """The events that were published to subscribers."""
         return [message for message in self.published if message["kind"] == "event"]
 
     def groups(self) -> list[frozenset[int]]:
-        """The sounds, each with the intervals in which any array hears it."""
+        """The sounds, each with the frame indices at which any array detects it."""
         merged: list[frozenset[int]] = []
         for _, active in sorted(self.sounds, key=lambda sound: min(sound[1])):
             if merged and min(active) <= max(merged[-1]) + HANG_OVER:
@@ -485,7 +489,7 @@ class World:
         ]
 
     def was_up(self, sound: frozenset[int]) -> bool:
-        """Whether no node was down from the run-up of a sound to its end."""
+        """Return whether all nodes were up from the pre-roll of a sound to its end."""
         first, last = min(sound) - 2 * PRE_ROLL, max(sound) + 2 * HANG_OVER
         return not any(since <= last and until >= first for spans in self.down.values() for since, until in spans)
 

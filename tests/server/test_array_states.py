@@ -18,7 +18,7 @@ from livessl.server.ingest import Ingest
 from livessl.server.run import live_run
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Finalized, Store, StoreError
-from small_site import frame, mark, site_of
+from small_site import mark, site_of
 
 SITE = site_of()
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
@@ -100,18 +100,6 @@ def test_disabled_state_hides_the_other_one_and_names_it() -> None:
     assert (desk.array("south")["state"], desk.array("south")["enabled"]) == ("healthy", True)
     desk.states.enable("north", True)
     assert desk.array("north")["state"] == "healthy"
-
-
-def test_frames_of_a_disabled_array_are_not_active_for_the_fusion() -> None:
-    desk = Desk()
-    active, quiet = frame(1), frame(2, active=False)
-    assert desk.states.for_fusion(active) is active
-    desk.states.enable("north", False)
-    assert desk.states.for_fusion(active).active is False  # type: ignore[union-attr]
-    assert desk.states.for_fusion(quiet) is quiet
-    assert desk.states.for_fusion(mark()) == mark()
-    south = frame(1, array="south")
-    assert desk.states.for_fusion(south) is south
 
 
 def test_array_stays_enabled_if_the_store_cannot_remember_otherwise() -> None:

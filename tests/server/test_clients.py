@@ -12,7 +12,8 @@ import pytest
 from clients import MAX_CLIENT_KB, measure, open_client
 from livessl.server.app import Server
 from livessl.server.fanout import BACKLOG
-from small_site import running_server, site_of, wait_until
+from messages import update_message
+from small_site import HANG_S, running_server, site_of, wait_until
 
 
 @pytest.mark.processes
@@ -36,12 +37,12 @@ def test_client_that_leaves_with_messages_on_their_way_causes_no_log_line(caplog
         def leave() -> None:
             client.close()
             for number in range(BACKLOG):
-                server.parts.fanout.publish({"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": []})
+                server.parts.fanout.publish(update_message(event_id=str(number)))
             done.set()
 
         assert server.loop is not None
         server.loop.call_soon_threadsafe(leave)
-        assert done.wait(5)
+        assert done.wait(timeout=HANG_S)
         wait_until(lambda: server.parts.fanout.clients == 0, "its place to be free")
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == []
 
@@ -54,7 +55,7 @@ def test_server_stops_while_a_client_closes_its_socket() -> None:
         assert server.loop is not None
         text = "x" * 100_000  # more than the two sockets' buffers hold
         for number in range(8):
-            message = {"kind": "update", "event_id": str(number), "confidence": 1.0, "zones": [], "text": text}
+            message = update_message(event_id=f"{number}{text}")
             server.loop.call_soon_threadsafe(server.parts.fanout.publish, message)
         wait_until(lambda: any(c.transport.get_write_buffer_size() for c in connections(server)), "the unread")
         client.sendall(bytes([0x88, 0x80, 0, 0, 0, 0]))  # a closing frame, masked with zeros

@@ -26,7 +26,7 @@ from livessl.server.receiver import Joined, Receiver
 from livessl.site import keys
 from livessl.site.keys import KeyPair, NodeKeys
 from livessl.site.models import Site
-from small_site import Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
+from small_site import HANG_S, Changes, frame, running_server, scene, scene_recordings, site_of, wait_until
 
 CLOCK = SystemClock()
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0})
@@ -210,7 +210,7 @@ class Tap:
         for each in self._sockets:
             each.close()
         for thread in self._threads:
-            thread.join(timeout=5)
+            thread.join(timeout=HANG_S)
 
     def said(self) -> list[bytes]:
         """Return the stream of bytes of each connection."""

@@ -13,7 +13,7 @@ from livessl.core.geometry import Grid
 from livessl.core.locate.estimator import PowerMaps
 from livessl.core.types import GCC, ArraySpec, Evidence, Window
 from livessl.server.maps import HEADER, INTERVAL_NS, Maps
-from small_site import wait_until
+from small_site import HANG_S, wait_until
 
 CLOCK = SystemClock()
 GRID = Grid(((0.0, 1.0), (2.0, 4.0), (0.0, 1.5)), 0.5)
@@ -32,7 +32,7 @@ class Artist:
 
     def draw(self, window: Window, arrays: frozenset[str]) -> PowerMaps:
         self.begun.set()
-        assert self.may_go_on.wait(5)
+        assert self.may_go_on.wait(timeout=HANG_S)
         self.drew.append((window.time_ns, arrays))
         power = (np.arange(GRID.size) + 0.25).astype(np.float32)
         return PowerMaps(GRID, power, {"north": 2 * power} if "north" in arrays else {})
@@ -142,11 +142,11 @@ def test_map_of_another_run_is_never_shown(maps: Maps, artist: Artist) -> None:
     maps.show(window(1), artist.draw)
     asking = threading.Thread(target=maps.newest, args=("fused",))
     asking.start()
-    assert artist.begun.wait(5)
+    assert artist.begun.wait(timeout=HANG_S)
     maps.clear()
     artist.may_go_on.set()
     wait_until(lambda: artist.drew, "the drawing")
-    asking.join(timeout=5)
+    asking.join(timeout=HANG_S)
     assert not asking.is_alive()
     assert maps.newest("fused") is None
     other = Artist()

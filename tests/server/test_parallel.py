@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from livessl.server.parallel import FEW, Parallel
+from small_site import HANG_S
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def test_each_item_is_done_once(parallel: Parallel, count: int) -> None:
 
 
 def test_two_threads_work(parallel: Parallel) -> None:
-    both = threading.Barrier(2, timeout=10.0)  # no thread passes alone
+    both = threading.Barrier(2, timeout=HANG_S)  # no thread passes alone
 
     def meet(number: int) -> None:
         if number < 2:

@@ -13,6 +13,7 @@ import pytest
 from livessl.core.types import FRAME_NS
 from livessl.server.api.encode import JsonObject
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
+from small_site import HANG_S
 
 START_NS = 1_767_225_600_000_000_000
 NS = 1_000_000_000
@@ -166,7 +167,7 @@ def test_slow_query_does_not_delay_an_event(tmp_path: Path) -> None:
     adding = Thread(target=lambda: store.add(event(1), START_NS + NS))
     with store._reading.lock:
         adding.start()
-        adding.join(timeout=5)
+        adding.join(timeout=HANG_S)
         assert not adding.is_alive()
     assert ids(store) == [1, 0]
     store.close()

@@ -29,7 +29,7 @@ def test_disabled_array_is_shown_as_such() -> None:
         north = array(server.url, "north")
         assert (north["state"], north["enabled"]) == ("disabled", False)
         assert north["reason"] == (
-            "an operator has disabled it, and its sound is not used; otherwise starting: not heard from yet"
+            "an operator has disabled it, and its sound is not used; otherwise starting: no message yet"
         )
         assert array(server.url, "south")["enabled"]
         health = httpx.get(f"{server.url}/api/v1/health").json()

@@ -239,7 +239,7 @@ def test_length_is_the_longest_decay_or_the_way_across() -> None:
         ({"microphones_m": [1, 1, 1]}, r"expected shape \(n, 3\), got \(3,\)"),
         ({"room_size_m": [4, 5]}, "three finite lengths"),
         ({"room_size_m": [4, 5, -1]}, "three finite lengths"),
-        ({"rt60s_s": [0.4, 0.05]}, "at least 0.105 s by Sabine .* got 0.05 s; give more, or 0"),
+        ({"rt60s_s": [0.4, 0.05]}, "at least 0.105 s by Sabine .* got 0.05 s; choose a longer time, or 0"),
         ({"rt60s_s": [-1.0]}, "finite seconds, 0 or more, got -1"),
         ({"rt60s_s": [np.inf]}, "finite seconds, 0 or more, got inf"),
         ({"rt60s_s": []}, "one or more, got none"),

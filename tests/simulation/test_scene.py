@@ -221,9 +221,9 @@ def test_files_are_read_as_mono_at_the_wanted_rate(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("samples", "message"),
     [
-        (np.zeros(0), r"bad.wav: expected sound, got a file of no samples; replace it"),
-        (np.zeros(100), r"bad.wav: expected sound, got only zeros; replace it"),
-        (np.array([0.1, np.nan]), r"bad.wav: expected finite samples, got NaN or infinity; replace it"),
+        (np.zeros(0), r"bad.wav: expected sound, got a file of no samples; replace or remove it"),
+        (np.zeros(100), r"bad.wav: expected sound, got only zeros; replace or remove it"),
+        (np.array([0.1, np.nan]), r"bad.wav: expected finite samples, got NaN or infinity; replace or remove it"),
     ],
     ids=["empty", "silent", "NaN"],
 )
@@ -235,7 +235,8 @@ def test_useless_files_are_named(tmp_path: Path, samples: np.ndarray[Any, Any], 
 
 def test_unreadable_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "bad.wav").write_bytes(b"RIFF and then nothing of the kind")
-    with pytest.raises(ValueError, match=r"bad.wav: expected a readable WAV or FLAC file, got .*; replace it"):
+    message = r"bad.wav: expected a readable WAV or FLAC file, got .*; replace or remove it"
+    with pytest.raises(ValueError, match=message):
         read_sounds(tmp_path, RATE_HZ)
 
 

@@ -39,8 +39,9 @@ END_NS: Final = 1_000_000_000
 """Recorded time, in ns, at the end of a replay that need not be settled. It exceeds the pre-roll of a next sound, which
 is never settled; once only this much is left, every event has been published."""
 
-STUCK_NS: Final = 1_000_000_000
-"""Time in ns without anything settled, after which a replay goes on anyway: an array is silent, or a sound lasts on."""
+STUCK_NS: Final = 3_000_000_000
+"""Time, in ns, after which a replay goes on although nothing has settled since the server received everything: an array
+is silent, or a sound lasts on. A busy server needs a part of it to process what it has received."""
 
 _log = logging.getLogger(__name__)
 
@@ -147,7 +148,7 @@ class _Lead:
 
     def exceeds(self, most_ns: int, end_ns: int) -> bool:
         """Return True if the server has yet to settle more than `most_ns` before `end_ns`, and makes progress."""
-        if self._link.settled != self._settled:
+        if self._link.settled != self._settled or self._link.pending:
             self._settled, self._since_ns = self._link.settled, self._clock.monotonic_ns()
         if self._settled is None or end_ns - self._settled * FRAME_NS <= most_ns:
             return False

@@ -1,4 +1,4 @@
-"""The command line: `main` reads arguments, and each command has a file of its own name.
+"""The command line: `main` runs a command, and each command is a module of its name.
 
-Commands parse, call and print; they hold no algorithm, and nothing imports them.
+Commands read arguments, call the other packages and print. They compute nothing themselves, and nothing imports them.
 """

@@ -1,6 +1,6 @@
-"""What the words of a command line stand for: each takes a text and gives a value, or tells what was expected.
+"""Types of command-line arguments: each function turns a text into a value.
 
-They are types of argparse, and raise its `ArgumentTypeError`.
+They are passed to argparse as `type`, and raise `ArgumentTypeError` with what was expected and what was given.
 """
 
 from __future__ import annotations
@@ -12,17 +12,23 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from livessl.clock import utc_ns
+from livessl.core.methods import is_method, unknown_method
 from livessl.site import keys as keyring
 from livessl.site.addresses import check_endpoint
 
 T = TypeVar("T")
 
 MAX_RT60_S: Final = 5.0
-"""Images grow with the cube of the reverberation time: more would take hours, and few rooms ring longer."""
+"""Longest reverberation time that is simulated, in seconds.
+
+The number of image sources grows with its cube: a longer one would take hours, and few rooms reverberate longer."""
 
 
 def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
-    """ARRAY=FILE or ARRAY=FILE,FILE,…: the array's name, and the files. A file may have commas in its name."""
+    """Return the array name and the paths of `ARRAY=FILE` or `ARRAY=FILE,FILE,…`.
+
+    The name of an existing file may have commas in it.
+    """
     name, equals, paths = text.partition("=")
     files = (paths,) if os.path.lexists(paths) else tuple(paths.split(","))
     if not (name and equals and all(files)):
@@ -31,7 +37,7 @@ def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
 
 
 def joint(text: str) -> tuple[str, list[str]]:
-    """NAME=ARRAY,ARRAY,…: the name, and the arrays' names."""
+    """Return the name of a joint array and the names of its arrays from `NAME=ARRAY,ARRAY,…`."""
     name, _, members = text.partition("=")
     arrays = members.split(",")
     if not (name and len(arrays) > 1 and all(arrays)):
@@ -40,7 +46,7 @@ def joint(text: str) -> tuple[str, list[str]]:
 
 
 def channels(text: str) -> tuple[str, list[int]]:
-    """ARRAY=1,2,3,4: the array's name, and the numbers."""
+    """Return the array name and the channel numbers of `ARRAY=1,2,3,4`."""
     name, equals, numbers = text.partition("=")
     try:
         channels = [int(number) for number in numbers.split(",")]
@@ -51,50 +57,57 @@ def channels(text: str) -> tuple[str, list[int]]:
     return name, channels
 
 
+def method(text: str) -> str:
+    """Return the name of a localization method after checking that it is registered or has the form `MODULE:NAME`."""
+    if not is_method(text):
+        raise argparse.ArgumentTypeError(unknown_method(text))
+    return text
+
+
 def endpoint(text: str) -> str:
-    """A ZeroMQ address that one can connect to."""
+    """Return a ZeroMQ address after checking that a socket can connect to it."""
     return _read(text, check_endpoint)
 
 
 def key(text: str) -> bytes:
-    """A public key of CURVE, as `livessl keys` tells it."""
+    """Return the bytes of a public key in the form that `livessl keys` prints."""
     return _read(text, keyring.as_key)
 
 
 def time(text: str) -> int:
-    """RFC 3339: nanoseconds UTC."""
+    """Return an RFC 3339 time as nanoseconds UTC."""
     return _read(text, utc_ns)
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 on."""
+    """Return a whole number >= 1."""
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected a whole number >= 1, got {text!r}")
     return int(text)
 
 
 def count(text: str) -> int:
-    """A whole number from 0 on."""
-    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number from 0 on"))
+    """Return a whole number >= 0."""
+    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number >= 0"))
 
 
 def rt60(text: str) -> float:
-    """A reverberation time, seconds."""
+    """Return a reverberation time in seconds, 0 to `MAX_RT60_S`."""
     return _number(text, lambda value: 0 <= value <= MAX_RT60_S, f"seconds from 0 to {MAX_RT60_S:g}")
 
 
 def not_negative(text: str) -> float:
-    """A number from 0 on."""
+    """Return a finite number >= 0."""
     return _number(text, lambda value: value >= 0, "a number >= 0")
 
 
 def above_zero(text: str) -> float:
-    """A number above 0."""
+    """Return a finite number > 0."""
     return _number(text, lambda value: value > 0, "a number > 0")
 
 
 def speed(text: str) -> float:
-    """Times real time; 'max' is without end."""
+    """Return a replay speed as a multiple of real time; 'max' gives infinity."""
     return float("inf") if text == "max" else _number(text, lambda value: value > 0, "a number > 0 or 'max'")
 
 

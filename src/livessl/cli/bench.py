@@ -1,4 +1,4 @@
-"""`livessl bench`: how fast this machine locates, and the load that it carries."""
+"""`livessl bench`: measure how fast this machine locates, or the load that a server on it carries."""
 
 from __future__ import annotations
 
@@ -17,16 +17,20 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--live", action="store_true", help="measure a server under load instead of the kernels alone")
     only = parser.add_argument_group("with --live")
-    only.add_argument("--arrays", type=argument.positive, default=4, help="arrays that sound all the time (default 4)")
-    only.add_argument("--clients", type=argument.positive, default=4, help="clients that subscribe (default 4)")
     only.add_argument(
-        "--watchers", type=argument.count, default=0, help="clients that watch the power map (default none)"
+        "--arrays", type=argument.positive, default=4, help="arrays that send sound all the time (default 4)"
     )
     only.add_argument(
-        "--seconds", type=argument.above_zero, default=20.0, help="time to measure, after a warm-up (default 20)"
+        "--clients", type=argument.positive, default=4, help="clients that subscribe to events and updates (default 4)"
     )
     only.add_argument(
-        "--spacing", type=argument.above_zero, default=0.1, metavar="M", help="spacing of the grid (default 0.1)"
+        "--watchers", type=argument.count, default=0, help="clients that subscribe to the power map (default 0)"
+    )
+    only.add_argument(
+        "--seconds", type=argument.above_zero, default=20.0, help="seconds to measure, after a warm-up (default 20)"
+    )
+    only.add_argument(
+        "--spacing", type=argument.above_zero, default=0.1, metavar="M", help="spacing of the search grid (default 0.1)"
     )
     only.add_argument(
         "--rt60",
@@ -35,7 +39,7 @@ def add_arguments(parser: Any) -> None:
         metavar="S",
         help="reverberation time of the simulated room (default 0.3)",
     )
-    only.add_argument("--spin", action="store_true", help="let a foreign process spin on each core")
+    only.add_argument("--spin", action="store_true", help="keep each core busy with another process meanwhile")
     add_json(parser, "print one JSON object")
 
 

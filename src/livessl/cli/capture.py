@@ -1,4 +1,4 @@
-"""`livessl capture`: a capture node, on its audio device or on what takes its place."""
+"""`livessl capture`: a capture node, on its audio device or on files or a simulated scene in its place."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--node", required=True, help="name of the node in the site file")
     add_joint(parser)
     add_wav(parser, "play FILE at real speed instead of the device; give one for each array of the node")
-    parser.add_argument("--loop", action="store_true", help="play the files again and again")
+    parser.add_argument("--loop", action="store_true", help="repeat the files until Ctrl-C")
     parser.add_argument(
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="when the files begin, RFC 3339 (default: now, or with several nodes the next full 5 s of the clock)",
+        help="start of the files, RFC 3339 (default: now; in a site of several nodes, the next multiple of 5 s)",
     )
 
 

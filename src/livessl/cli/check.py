@@ -1,4 +1,4 @@
-"""`livessl check`: whether a site file is valid, with every fault at once."""
+"""`livessl check`: validate a site file and list all its faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from livessl.site.load import load_site
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("site", type=Path, help="site file")
-    add_json(parser, "print the result as JSON")
+    add_json(parser, "print one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from livessl.cli.output import complain
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    add_json(parser, "print the list as JSON")
+    add_json(parser, "print one JSON array")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -29,6 +29,9 @@ def run(arguments: argparse.Namespace) -> int:
         for device in devices:
             print(f"{device.channels:8d}  {device.default_sample_rate_hz:6.0f}Hz  {device.host_api}: {device.name}")
     if not devices:
-        complain("no audio input found; connect an interface, and check that `arecord -l` lists it")
+        complain(
+            "no audio input found; connect an audio interface, then run `livessl devices` again "
+            "(on Linux, `arecord -l` must list it, too)"
+        )
         return FAILED
     return OK

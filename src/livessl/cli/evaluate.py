@@ -1,8 +1,12 @@
-"""`livessl evaluate`: campaigns in simulated rooms. Packages of the extra `evaluate` are imported only when it runs."""
+"""`livessl evaluate`: experiments in simulated rooms.
+
+The packages of the extra `evaluate` are imported only when an experiment runs, so that the help works without them.
+"""
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 from collections.abc import Callable
@@ -11,6 +15,7 @@ from typing import Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
+from livessl.cli.options import add_json
 from livessl.cli.output import complain
 from livessl.lab.evaluate.layout import layout_of
 from livessl.lab.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
@@ -18,56 +23,70 @@ from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, ROOMS, SCENARIOS, 
 from livessl.site.load import load_site
 
 REPORT: Final = "report"
-"""The experiment that runs nothing: it reports campaigns that were run."""
+"""Name of the experiment that simulates nothing and reports the results of earlier ones."""
 
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"{LOCALIZER}: onset against srp-phat; {REPORT}: only what --with names, reported together",
+        help=f"experiment of the paper; or {LOCALIZER}: compare the methods onset and srp-phat; or {REPORT}: simulate "
+        "nothing, and report the folders of --with together",
     )
-    parser.add_argument(
-        "--site", type=Path, help="site file with a room and arrays instead of the paper's, for one-array or diversity"
-    )
-    parser.add_argument("--events", type=Path, metavar="DIR", help="clips named like doorslam001.wav")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; a run that was cut resumes")
-    parser.add_argument(
+    add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
+    add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the results; an interrupted run resumes")
+    add(
         "--with",
         dest="others",
         action="append",
         type=Path,
         default=[],
         metavar="DIR",
-        help="another experiment's --out, to be reported together; may be given more than once",
+        help="--out of another experiment, to be reported together; may be repeated",
     )
-    parser.add_argument(
-        "--positions", type=argument.positive, metavar="N", help="of the source (default: as many as the paper)"
-    )
-    parser.add_argument("--rt", metavar="S,S,…", help="reverberation times, seconds; 0:2:0.2 is a range")
-    parser.add_argument("--seed", type=int, default=0, help="same seed, same results (default 0)")
-    parser.add_argument("--jobs", type=argument.positive, help="processes (default: one a core)")
-    parser.add_argument("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of processes here")
-    parser.add_argument("--classes", default=",".join(CLASSES), help=f"of sounds (default {','.join(CLASSES)})")
-    parser.add_argument(
+    add("--jobs", type=argument.positive, help="worker processes (default: one for each core)")
+    add("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")
+    add_json(parser, "print the paths of the files written as one JSON object")
+    _add_simulation(parser.add_argument_group("simulation"))
+    _add_localization(parser.add_argument_group("localization"))
+    _add_comparison(parser.add_argument_group(f"with {LOCALIZER}"))
+
+
+def _add_simulation(group: Any) -> None:
+    add = group.add_argument
+    add("--positions", type=argument.positive, metavar="N", help="source positions (default: as many as in the paper)")
+    add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
+    add("--seed", type=int, default=0, help="random seed; the same seed gives the same results (default 0)")
+    add("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
+    add(
         "--snr",
         metavar="DB[,DB…]",
-        help=f"white sensor noise, so far below each recording's mean power, inf for none (default: none); {LOCALIZER} "
-        "takes several",
+        help="signal-to-noise ratio: white sensor noise this far below each recording's mean power; inf for no noise "
+        f"(default: no noise); only {LOCALIZER} takes several",
     )
-    parser.add_argument("--grid", type=float, metavar="M", help="search grid's spacing (default: the paper's)")
-    parser.add_argument("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="of the simulation")
-    parser.add_argument("--segment", choices=("longest", "peak"), default="longest", help="which one is localized")
-    parser.add_argument("--half", choices=HALVES, default="test", help=f"{LOCALIZER}: half of the clips (default test)")
-    parser.add_argument(
+    add("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="sampling rate (default 16000)")
+
+
+def _add_localization(group: Any) -> None:
+    add = group.add_argument
+    add("--grid", type=float, metavar="M", help="spacing of the search grid (default: the paper's)")
+    add("--segment", choices=("longest", "peak"), default="longest", help="segment to localize (default longest)")
+    add("--no-band-limit", action="store_true", help="do not limit the band to avoid spatial aliasing")
+
+
+def _add_comparison(group: Any) -> None:
+    add = group.add_argument
+    add("--half", choices=HALVES, default="test", help="half of the sounds to play (default test)")
+    add(
         "--scenario",
         default=ROOMS,
         metavar="NAME[,NAME…]",
-        help=f"{LOCALIZER}: some of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); or one of "
-        f"{', '.join(SESSIONS)}",
+        help=f"one or more of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); "
+        f"or one of {', '.join(SESSIONS)} alone",
     )
-    parser.add_argument("--no-band-limit", action="store_true", help="do not limit the band against spatial aliasing")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -78,20 +97,23 @@ def run(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         complain(str(error))
         return WRONG_USE
+    if arguments.json:
+        print(json.dumps({"files": [str(path) for path in written]}))
+        return OK
     for path in written:
         print(path)
     return OK
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
-    """Return the settings that the arguments describe.
+    """Return the settings of an experiment of the paper.
 
     Raises
     ------
     ValueError
-        Where a value is impossible.
+        If a value is impossible.
     ConfigError
-        Where the site file is wrong.
+        If the site file is invalid.
     """
     layout = None if arguments.site is None else layout_of(load_site(arguments.site))
     experiment = experiment_of(arguments.experiment, layout)
@@ -122,33 +144,42 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
-    """Run the campaign and write what it found; return the files.
+    """Run an experiment, write its results and its report, and return the paths of the files.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+    jobs : int
+        Worker processes.
+    show : callable
+        Called with the number of positions done and the total.
 
     Raises
     ------
     ValueError
-        Where an argument, a sound or the folder is not as it must be, or an extra is not installed.
+        If an argument, a sound or the folder is unusable, or the extra `evaluate` is not installed.
     """
     try:
-        from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
+        from livessl.lab.evaluate.campaign import run_campaign
+        from livessl.lab.evaluate.job import Job, read_clips
         from livessl.lab.evaluate.report import require_campaign, write_report
     except ImportError as error:
-        raise ValueError(f"evaluate needs more packages: pip install 'livessl[evaluate]' ({error})") from error
+        raise ValueError(
+            f"evaluate: expected the packages of the extra 'evaluate' ({error}); run pip install 'livessl[evaluate]'"
+        ) from error
 
     if arguments.experiment == REPORT:
         if arguments.site is not None:
-            raise ValueError("evaluate report: runs nothing, so expected no --site; take it away")
+            raise ValueError("evaluate report: runs nothing, so expected no --site; remove it")
         if not arguments.others:
-            raise ValueError(
-                "evaluate report: expected one or more folders of campaigns, got none; name them by --with"
-            )
+            raise ValueError("evaluate report: expected one or more folders of results, got none; add --with DIR")
         return write_report(arguments.out, arguments.others)
     if arguments.events is None:
-        raise ValueError("evaluate: expected sounds to play, got none; name their folder by --events")
+        raise ValueError("evaluate: expected sounds to play, got none; add --events DIR")
     if arguments.experiment == LOCALIZER:
         return _run_localizer(arguments, jobs, show)
     for folder in arguments.others:
-        require_campaign(folder)  # now, not when hours are over
+        require_campaign(folder)  # before hours of computation
     settings = settings_of(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
@@ -157,7 +188,8 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
 
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
-    from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
+    from livessl.lab.evaluate.campaign import run_campaign
+    from livessl.lab.evaluate.job import Job, read_clips
     from livessl.lab.evaluate.localizer_report import write_localizer_report
     from livessl.lab.evaluate.sessions import SessionSettings
     from livessl.lab.evaluate.sessions_report import write_sessions_report
@@ -172,7 +204,7 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int
 
 
 def _localizer_settings(arguments: argparse.Namespace) -> Any:
-    """Return the settings that the arguments describe: of a session's scenario, or of the localizer's rooms."""
+    """Return the settings of the experiment that compares methods, in rooms or in sessions."""
     from livessl.lab.evaluate import localizer, sessions
 
     names = _scenarios(arguments.scenario)
@@ -198,12 +230,12 @@ def _localizer_settings(arguments: argparse.Namespace) -> Any:
 
 
 def reverberation_times_s(text: str) -> tuple[float, ...]:
-    """Reverberation times from `0,0.4` or `0:2:0.2` (both ends included), seconds, ascending.
+    """Return reverberation times in seconds, ascending, from `0,0.4` or `0:2:0.2` (both ends included).
 
     Raises
     ------
     ValueError
-        Where the text is neither.
+        If the text is neither.
     """
     try:
         if ":" in text:
@@ -220,12 +252,12 @@ def reverberation_times_s(text: str) -> tuple[float, ...]:
 
 
 def levels_db(text: str) -> tuple[float, ...]:
-    """Levels from `inf,20,10`, dB.
+    """Return levels in decibels from `inf,20,10`.
 
     Raises
     ------
     ValueError
-        Where the text is none.
+        If the text holds none.
     """
     try:
         levels = tuple(dict.fromkeys(float(part) for part in text.split(",")))
@@ -241,7 +273,7 @@ def _one_level_db(text: str | None) -> float | None:
         return None
     level, *more = levels_db(text)
     if more:
-        raise ValueError(f"--snr: expected one level, for only {LOCALIZER} takes several, got {text}")
+        raise ValueError(f"--snr: expected one level, got {text}; only {LOCALIZER} takes several")
     return None if level == math.inf else level
 
 

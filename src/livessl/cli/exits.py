@@ -1,4 +1,4 @@
-"""How commands end: exit codes, and what Ctrl-C and SIGTERM do."""
+"""Exit codes of the commands, and their handling of Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Make Ctrl-C and SIGTERM only set the event that this yields: loops check it and end in order."""
+    """Make Ctrl-C and SIGTERM set the event that this yields and do nothing else; loops check it to end in order."""
     stop = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     previous = [signal.signal(number, lambda *_: stop.set()) for number in numbers]

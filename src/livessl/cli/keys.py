@@ -1,4 +1,4 @@
-"""`livessl keys`: key pairs of server and nodes, and tokens of clients."""
+"""`livessl keys`: key pairs of the server and of nodes, and access tokens of clients."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from livessl.cli import argument
 from livessl.cli.exits import OK
@@ -15,6 +15,8 @@ from livessl.cli.options import add_json, add_site
 from livessl.errors import ConfigError, Fault
 from livessl.site import keys, tokens
 from livessl.site.load import load_site
+
+ONE_OBJECT: Final = "print one JSON object"
 
 
 def add_arguments(parser: Any) -> None:
@@ -29,26 +31,38 @@ def add_arguments(parser: Any) -> None:
         add_site(sub)
         return sub
 
-    action("server", _server, "make the server's key pair", "server --site site.yaml")
-    sub = action("node", _node, "make a node's key pair, on the node", "node lab-pc --site site.yaml --server 4f8a…")
+    sub = action("server", _server, "make the server's key pair", "server --site site.yaml")
+    add_json(sub, ONE_OBJECT)
+    sub = action(
+        "node", _node, "make a node's key pair; run it on the node", "node lab-pc --site site.yaml --server 4f8a…"
+    )
     sub.add_argument("name", help="name of the node in the site file; `replay` for sending sessions to a server")
     sub.add_argument(
         "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` printed it"
     )
-    sub = action("enrol", _enrol, "admit a node, on the server", "enrol lab-pc 9c01… --site site.yaml")
+    add_json(sub, ONE_OBJECT)
+    sub = action("enrol", _enrol, "admit a node; run it on the server", "enrol lab-pc 9c01… --site site.yaml")
     sub.add_argument("name", help="name of the node in the site file")
     sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` printed it")
-    sub = action("token", _token, "make a token for a client", "token --site site.yaml --name wall --role viewer")
-    sub.add_argument("--name", required=True, help="name of the client, to revoke its token by")
-    sub.add_argument("--role", choices=[str(role) for role in tokens.Role], default="viewer", help="default viewer")
-    sub = action("revoke", _revoke, "stop admitting a node or a client", "revoke --site site.yaml --token wall")
-    which = sub.add_mutually_exclusive_group(required=True)
-    which.add_argument("--node", metavar="NAME")
-    which.add_argument("--token", metavar="NAME")
-    add_json(
-        action("list", _list, "list the nodes and clients that may connect", "list --site site.yaml"),
-        "print one JSON object",
+    sub = action(
+        "token", _token, "make an access token for a client", "token --site site.yaml --name wall --role viewer"
     )
+    sub.add_argument("--name", required=True, help="name of the client, by which its token can be revoked")
+    sub.add_argument(
+        "--role",
+        choices=[str(role) for role in tokens.Role],
+        default="viewer",
+        help="what the client may do (default viewer)",
+    )
+    add_json(sub, ONE_OBJECT)
+    sub = action(
+        "revoke", _revoke, "remove the key of a node or the token of a client", "revoke --site site.yaml --token wall"
+    )
+    which = sub.add_mutually_exclusive_group(required=True)
+    which.add_argument("--node", metavar="NAME", help="node to remove")
+    which.add_argument("--token", metavar="NAME", help="client whose token to revoke")
+    sub = action("list", _list, "list the nodes and clients that may connect", "list --site site.yaml")
+    add_json(sub, ONE_OBJECT)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -74,36 +88,41 @@ def _tokens_file(arguments: argparse.Namespace) -> Path:
 
 def _server(arguments: argparse.Namespace) -> int:
     key = keys.make_server_keys(_folder(arguments))
-    print(key.hex())
-    logging.info("the server's public key; on each node: livessl keys node NAME --site SITE --server %s", key.hex())
+    print(json.dumps({"public_key": key.hex()}) if arguments.json else key.hex())
+    logging.info(
+        "this is the server's public key; on each node run: livessl keys node NAME --site SITE --server %s", key.hex()
+    )
     return OK
 
 
 def _node(arguments: argparse.Namespace) -> int:
     key = keys.make_node_keys(_folder(arguments), arguments.name, arguments.server)
-    print(key.hex())
+    print(json.dumps({"name": arguments.name, "public_key": key.hex()}) if arguments.json else key.hex())
     logging.info(
-        "the node's public key; on the server: livessl keys enrol %s %s --site SITE", arguments.name, key.hex()
+        "this is the node's public key; on the server run: livessl keys enrol %s %s --site SITE",
+        arguments.name,
+        key.hex(),
     )
     return OK
 
 
 def _enrol(arguments: argparse.Namespace) -> int:
     keys.enrol(_folder(arguments), arguments.name, arguments.key)
-    logging.info("node %r is enrolled; restart a running server, so that it admits the node", arguments.name)
+    logging.info("node %r is enrolled; restart a running server to admit it", arguments.name)
     return OK
 
 
 def _token(arguments: argparse.Namespace) -> int:
-    print(tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role))
-    logging.info("the token is shown only now; a running server accepts it within a second")
+    token = tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role)
+    print(json.dumps({"name": arguments.name, "role": arguments.role, "token": token}) if arguments.json else token)
+    logging.info("store the token now, because it is shown only once; a running server accepts it within a second")
     return OK
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
     if arguments.node is not None:
         keys.dismiss(_folder(arguments), arguments.node)
-        logging.info("node %r is no longer enrolled; restart a running server to shut it out", arguments.node)
+        logging.info("node %r is no longer enrolled; restart a running server to disconnect it", arguments.node)
     else:
         tokens.revoke_token(_tokens_file(arguments), arguments.token)
         logging.info("a running server refuses the token within a second")

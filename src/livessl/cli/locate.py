@@ -1,4 +1,4 @@
-"""`livessl locate`: the whole pipeline on recordings, as fast as it can."""
+"""`livessl locate`: the whole pipeline on recordings, as fast as this machine can."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from livessl import offline
 from livessl.cli import progress
 from livessl.cli.exits import OK
-from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, read_site, wavs
+from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, import_from_here, read_site, wavs
 from livessl.cli.output import complain, print_event, print_warnings
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event
@@ -19,7 +19,7 @@ from livessl.server.api.encode import Messages
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
-    add_wav(parser, "recording of an array; all begin together", required=True)
+    add_wav(parser, "recording of an array, WAV or FLAC; give one for each array; all begin together", required=True)
     add_method(parser)
     add_joint(parser)
     add_json(parser)
@@ -27,6 +27,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import_from_here()
     site = read_site(arguments)
     print_warnings(site)
     parts = assign_files(site, *wavs(arguments))

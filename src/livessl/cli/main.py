@@ -1,4 +1,4 @@
-"""The command line: which commands there are, what ends them, and exit codes. Each command is a module of its name."""
+"""The command line: the list of commands, and `main`, which runs one and turns its errors into exit codes."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Command:
     Parameters
     ----------
     name : str
-        Its name, and that of its module in `livessl.cli`, which has `add_arguments(parser)` and `run(arguments)`.
+        Name of the command and of its module in `livessl.cli`, which has `add_arguments(parser)` and `run(arguments)`.
     text : str
-        What it does, for the help.
+        One line of help.
     example : str
-        How to call it.
+        A complete command line, shown at the end of the help.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Command:
 
 
 COMMANDS: Final = (
-    Command("demo", "show everything with no hardware", "livessl demo --once"),
+    Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
@@ -61,26 +61,27 @@ COMMANDS: Final = (
     ),
     Command(
         "bench",
-        "measure the load that this machine carries, and its latency",
+        "measure how fast this machine locates, or the load that a server on it carries",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
         "plan",
-        "predict the error everywhere in the room, and where arrays should go",
+        "predict the error everywhere in the room, and suggest where arrays should go",
         "livessl plan --site site.yaml --rt60 0.7 --out plan/",
     ),
-    Command("keys", "make and enrol keys and tokens", "livessl keys token --site site.yaml --name wall"),
-    Command("check", "validate a site file, all faults at once", "livessl check site.yaml"),
-    Command("devices", "list audio devices", "livessl devices"),
+    Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
+    Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
+    Command("devices", "list the audio inputs of this machine", "livessl devices"),
 )
-"""All commands, in the order of the help."""
+"""All commands, in the order in which the help lists them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code.
 
-    0 is success, also of a command that runs until Ctrl-C or SIGTERM; 1 is a failure at run time; 2 is wrong use or a
-    wrong configuration; 130 means that Ctrl-C or SIGTERM cut a command short before its own end.
+    0 means success, also if Ctrl-C or SIGTERM ended a command that runs until then; 1 means a failure at run time;
+    2 means wrong use or an invalid configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by
+    itself.
     """
     given = sys.argv[1:] if arguments is None else arguments
     parsed = _parser(given).parse_args(given)
@@ -88,14 +89,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
     try:
-        # matrix products are small here: a second BLAS thread mostly spins, for eight times the CPU time in all
+        # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
         with sigterm_as_ctrl_c(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except UseError as error:
         for line in str(error).splitlines():
             complain(line)
         return WRONG_USE
-    except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
+    except BrokenPipeError:  # the program that reads our output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except (RunError, OSError) as error:
@@ -108,10 +109,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the command that is given is imported and described in full."""
     parser = argparse.ArgumentParser(
-        prog="livessl", description="Locates sounds in a room, live.", epilog="example: livessl demo"
+        prog="livessl", description="Locate sounds in a room, live.", epilog="example: livessl demo"
     )
     parser.add_argument("--version", action="version", version=f"livessl {__version__}")
-    parser.add_argument("--verbose", action="store_true", help="log more to stderr")
+    parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     chosen = next((word for word in given if not word.startswith("-")), None)
     for command in COMMANDS:

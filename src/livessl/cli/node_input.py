@@ -1,4 +1,4 @@
-"""What a node captures or records: its audio device, or the files or the simulated scene in its place."""
+"""The input of a capture node: its audio device, or files or a simulated scene in its place."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from livessl.site.node_models import NodeConfig, SoundDeviceConfig
 
 
 def node_config(site: Site, name: str, path: Path) -> NodeConfig:
-    """Return the part of a site that configures a node.
+    """Return the configuration of one node of a site.
 
     Raises
     ------
     ConfigError
-        Where the site has no node of that name.
+        If the site has no node of that name.
     """
     if name not in site.nodes:
         known = ", ".join(site.nodes) or "none"
@@ -65,7 +65,7 @@ def audio_device(arguments: argparse.Namespace, config: NodeConfig, clock: Clock
 
 
 def recordings(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[AssignedRecording]:
-    """Return what a node plays instead of an audio device: the files of --wav, or what the site file names."""
+    """Return the recordings that replace a node's audio device: the files of --wav, or what the site file names."""
     from livessl.capture.playback import node_recordings
     from livessl.recordings.assign import assign_files, common_start_ns, looped
 
@@ -79,5 +79,5 @@ def recordings(arguments: argparse.Namespace, site: Site, now_ns: int) -> list[A
 
 
 def run_id(node: str, clock: Clock) -> str:
-    """Return a name of this run that no other has; short enough for the wire, whatever the node is called."""
+    """Return a unique name for this run of a node, cut to the 64 characters that the wire format allows."""
     return f"{clock.now_ns()}-{os.getpid()}-{node}"[:64]

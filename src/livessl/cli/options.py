@@ -1,8 +1,9 @@
-"""Options that several commands share, and how their values are read."""
+"""Options that several commands share, and functions that read their values."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +24,22 @@ def add_site(parser: Any) -> None:
 
 def add_method(parser: Any) -> None:
     """Add --method."""
-    parser.add_argument("--method", choices=sorted(METHODS), help="estimator (default: the site's)")
+    parser.add_argument(
+        "--method",
+        type=argument.method,
+        metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
+        help="localization method; MODULE:NAME imports one of your own (default: the site's)",
+    )
+
+
+def import_from_here() -> None:
+    """Make modules in the current directory importable, for a method that is named `MODULE:NAME`.
+
+    The directory comes last, so that no file in it hides an installed module.
+    """
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def add_json(parser: Any, text: str = "print one JSON object per event") -> None:
@@ -70,7 +86,7 @@ def read_site(arguments: argparse.Namespace) -> Site:
 
 
 def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the arrays that --joint joins, by the name of the joint array."""
+    """Return the names of the arrays that --joint joins, by the name of the joint array."""
     return _each_once(arguments.joint, "--joint")
 
 

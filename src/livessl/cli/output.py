@@ -1,4 +1,4 @@
-"""What commands print: events on stdout, complaints and notes on stderr."""
+"""Output that commands share: events on stdout, errors and notes on stderr."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def complain(text: str, kind: str = "error") -> None:
 
 
 def print_warnings(site: Site) -> None:
-    """Print what is valid in a site and yet unlikely to work."""
+    """Print the warnings of a site: settings that are valid but unlikely to work."""
     for warning in site.warnings:
         complain(warning, kind="note")
 

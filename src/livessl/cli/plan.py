@@ -1,4 +1,4 @@
-"""`livessl plan`: the error to expect, before anything is built, and advice on where arrays should go."""
+"""`livessl plan`: the error to expect before anything is built, and advice on where arrays should go."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
     parser.add_argument(
-        "--rt60", type=argument.not_negative, default=0.7, metavar="S", help="reverberation time (default 0.7)"
+        "--rt60", type=argument.not_negative, default=0.7, metavar="S", help="reverberation time, seconds (default 0.7)"
     )
     parser.add_argument(
-        "--height", type=argument.not_negative, metavar="M", help="height of the sounds (default 1.5, if searched)"
+        "--height",
+        type=argument.not_negative,
+        metavar="M",
+        help="height of the sounds, metres (default 1.5 if the search volume holds it)",
     )
     parser.add_argument(
         "--calibration",
         type=argument.above_zero,
         default=design.CALIBRATION_M,
         metavar="M",
-        help=f"standard deviation of the microphones' positions (default {design.CALIBRATION_M:g})",
+        help=f"standard deviation of the microphone positions, metres (default {design.CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")

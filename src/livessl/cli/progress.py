@@ -1,4 +1,4 @@
-"""Progress bars: on stderr, only on a terminal, only for what takes longer than two seconds."""
+"""Progress bars on stderr. They appear only on a terminal, and only once a command has run for `DELAY_S`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 DELAY_S: Final = 2.0
+"""Time in seconds before a bar appears, so that quick commands show none."""
 
 
 @contextmanager
 def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar over things: call what it yields with (done, total)."""
+    """Show a bar that counts items; yield a function to be called with the number done and the total."""
     from tqdm import tqdm
 
     bar: Any = tqdm(desc=what, unit=unit, delay=DELAY_S, leave=False, disable=None, total=1)
@@ -26,7 +27,10 @@ def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def timed(what: str, start_ns: int, end_ns: int | None) -> Iterator[Callable[[int], None]]:
-    """A bar over site time: call what it yields with the time reached. Without an end it only counts seconds."""
+    """Show a bar over site time; yield a function to be called with the time that was reached, in nanoseconds.
+
+    With `end_ns` None the bar counts seconds without a total.
+    """
     total_s = 0 if end_ns is None else round((end_ns - start_ns) / 1e9)
     with counted(what, "s") as show:
         yield lambda now_ns: show(round((now_ns - start_ns) / 1e9), total_s)

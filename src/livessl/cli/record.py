@@ -1,4 +1,4 @@
-"""`livessl record`: a session for replay, from a node's audio device or from what takes its place."""
+"""`livessl record`: record a session for replay, from a node's audio device or from files in its place."""
 
 from __future__ import annotations
 
@@ -25,18 +25,24 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     parser.add_argument("--node", required=True, help="name of the node in the site file")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the session")
-    parser.add_argument("--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV")
+    parser.add_argument(
+        "--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV (default flac)"
+    )
     parser.add_argument(
         "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)"
     )
-    add_wav(parser, "record FILE at real speed instead of the device: a rehearsal")
+    add_wav(
+        parser, "record FILE at real speed instead of the device, as a rehearsal; give one for each array of the node"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     site = load_site(arguments.site)
     if site.privacy == "positions-only":
-        what = "positions-only: no sound may be stored, so nothing is recorded; change it if everyone there agrees"
+        what = (
+            "positions-only: sound must not be stored, so nothing is recorded; change it if everyone in the room agrees"
+        )
         raise ConfigError([Fault(f"{arguments.site}: privacy", what)])
     config = node_config(site, arguments.node, arguments.site)
     check_files(arguments, config)
@@ -61,14 +67,16 @@ def run(arguments: argparse.Namespace) -> int:
             parts = recordings(arguments, site, begun_ns)
             recorded = record_playback(arguments.out, site, parts, clock, over, arguments.format)
     if not recorded:
-        complain("nothing was recorded: the device delivered no sound")
+        complain(
+            "nothing was recorded, because the device delivered no sound; check its connection with `livessl devices`"
+        )
         return FAILED
     logging.info("recorded to %s", arguments.out)
     return OK
 
 
 def _refuse_to_overwrite(directory: Path) -> None:
-    """Refuse a folder that holds recordings: they are never overwritten, nor mixed with others."""
+    """Raise an error if a folder holds recordings: they are neither overwritten nor mixed with others."""
     held = directory.iterdir() if directory.is_dir() else ()
     names = sorted(path.name for path in held if path.name == SESSION_FILE or path.suffix.lower() in (".wav", ".flac"))
     if names:

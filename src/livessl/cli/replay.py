@@ -1,4 +1,4 @@
-"""`livessl replay`: a recorded session through a running server, or through one in this process."""
+"""`livessl replay`: play a recorded session to a running server, or to one in this process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from livessl.capture.node import send_session
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.node_input import run_id
-from livessl.cli.options import add_joint, add_json, add_method, joints
+from livessl.cli.options import add_joint, add_json, add_method, import_from_here, joints
 from livessl.cli.output import print_event
 from livessl.cli.serve import run_until_stopped
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
@@ -28,14 +28,23 @@ from livessl.site.server_models import HttpConfig, StoreConfig
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
-        "directories", type=Path, metavar="DIR", nargs="+", help="made by record or simulate; one for each node"
+        "directories",
+        type=Path,
+        metavar="DIR",
+        nargs="+",
+        help="session folders made by record or simulate; one for each node",
     )
     parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
-    parser.add_argument("--speed", type=argument.speed, default=1.0, help="times real time, or 'max' (default 1)")
+    parser.add_argument("--speed", type=argument.speed, default=1.0, help="multiple of real time, or 'max' (default 1)")
     parser.add_argument(
-        "--server", type=argument.endpoint, metavar="ENDPOINT", help="a running server, such as tcp://127.0.0.1:5570"
+        "--server",
+        type=argument.endpoint,
+        metavar="ENDPOINT",
+        help="running server to play to, such as tcp://127.0.0.1:5570 (default: a server in this process)",
     )
-    parser.add_argument("--once", action="store_true", help="end with the session instead of keeping the dashboard up")
+    parser.add_argument(
+        "--once", action="store_true", help="exit at the end of the session instead of keeping the dashboard running"
+    )
     add_json(parser)
     add_method(parser)
     add_joint(parser)
@@ -43,6 +52,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import_from_here()
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = joints(arguments)
     site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
@@ -56,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[AssignedRecording]) -> None:
-    """Run a server in this process, with dashboard, and play the session to it."""
+    """Run a server with a dashboard in this process, and play the session to it."""
     server = Server(
         _private(site, own_http=arguments.site is not None),
         SystemClock(),
@@ -76,7 +86,7 @@ def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Assig
         if arguments.once or failures:
             server.stop()
         else:
-            logging.info("the session has ended; the dashboard stays until Ctrl-C")
+            logging.info("the session has ended; the dashboard runs until Ctrl-C")
 
     sender = threading.Thread(target=send, daemon=True)
     sender.start()
@@ -88,9 +98,10 @@ def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Assig
 
 
 def _private(site: Site, *, own_http: bool) -> Site:
-    """Return the site for a server that only this machine reaches and that stores nothing.
+    """Return the site for a server that binds to this machine only, without keys, and stores nothing.
 
-    Keys and history belong to the real server; the site that a session carries does not say who may look here.
+    Keys and history belong to the site's real server. Unless the user named the site file (`own_http`), the HTTP
+    settings of the session's own copy are dropped, too, because they were meant for another machine.
     """
     http = site.server.http if own_http else HttpConfig(port=site.server.http.port)
     here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "http": http, "events_db": None, "sinks": ()})

@@ -1,4 +1,4 @@
-"""`livessl serve`: the fusion server, its API and its dashboard."""
+"""`livessl serve`: run the fusion server, its API and its dashboard."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import logging
 from typing import Any
 
 from livessl.cli.exits import OK
-from livessl.cli.options import add_joint, add_method, add_site, read_site
+from livessl.cli.options import add_joint, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import print_warnings
 from livessl.clock import SystemClock
 from livessl.server.app import Server
@@ -22,6 +22,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import_from_here()
     site = read_site(arguments)
     print_warnings(site)
     server = Server(site, SystemClock(), method=arguments.method)

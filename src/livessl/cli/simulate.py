@@ -1,4 +1,4 @@
-"""`livessl simulate`: what the arrays of a site would record of a scene, as a session on disk."""
+"""`livessl simulate`: write what the arrays of a site would record of a scene, as a session."""
 
 from __future__ import annotations
 
@@ -23,20 +23,32 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
     parser.add_argument(
-        "--events", type=Path, metavar="DIR", help="WAV or FLAC files to play (default: our own sounds)"
+        "--events", type=Path, metavar="DIR", help="folder of WAV or FLAC files to play (default: built-in sounds)"
     )
     parser.add_argument(
-        "--rt60", type=argument.rt60, default=0.7, metavar="S", help="reverberation time, 0 to 5 (default 0.7)"
+        "--rt60",
+        type=argument.rt60,
+        default=0.7,
+        metavar="S",
+        help=f"reverberation time in seconds, 0 to {argument.MAX_RT60_S:g} (default 0.7)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder without recordings")
-    parser.add_argument("--count", type=argument.positive, default=8, help="sounds in the scene (default 8)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for the session; a recorded session there is not overwritten",
+    )
+    parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
     parser.add_argument(
         "--sample-rate",
         type=argument.positive,
         metavar="HZ",
-        help="default: as each node's device has in the site, else 44100",
+        help="sampling rate of the recordings (default: that of each node's device in the site file, else 44100)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="same seed, same session (default 0)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="random seed; the same seed gives the same session (default 0)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

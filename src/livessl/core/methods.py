@@ -23,8 +23,19 @@ A factory is a callable, or the text "module:attribute" of one that is imported 
 `livessl.core.locate.estimator.register` to add a method and `create` to make an estimator."""
 
 
+def is_import_path(name: str) -> bool:
+    """Return whether a name has the form `MODULE:NAME`, such as `my_methods:Loudest`; nothing is imported."""
+    module, colon, attribute = name.partition(":")
+    return bool(colon) and all(part.isidentifier() for part in (*module.split("."), *attribute.split(".")))
+
+
+def is_method(name: str) -> bool:
+    """Return whether a name may be that of a method: it is registered, or has the form `MODULE:NAME`."""
+    return name in METHODS or is_import_path(name)
+
+
 def unknown_method(name: str) -> str:
-    """Return the error text for a name that is not in `METHODS`, with the nearest name that is."""
+    """Return the error text for a name that is no method, with the nearest registered name."""
     close = get_close_matches(name, METHODS, n=1)
-    guess = f"; did you mean {close[0]!r}?" if close else ""
-    return f"expected one of {', '.join(METHODS)}, got {name!r}{guess}"
+    cure = f"did you mean {close[0]!r}?" if close else "write a method of your own as MODULE:NAME"
+    return f"expected one of {', '.join(METHODS)}, got {name!r}; {cure}"

@@ -1,13 +1,14 @@
-"""The demo: a simulated scene through real processes and real sockets, and how far off each answer was."""
+"""The demo: a simulated scene through real processes and real sockets, and the error of each result."""
 
 from __future__ import annotations
 
 import json
 import math
 import socket
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,10 +30,13 @@ from livessl.site.models import Site
 SITE_FILE: Final = Path(__file__).with_name("demo.yaml")
 
 LEAD_NS: Final = 5_000_000_000
-"""From the command to the scene's first sample: the nodes must be up by then."""
+"""Time, in nanoseconds, from the command to the scene's first sample, in which the nodes start."""
 
 MATCH_S: Final = 1.0
-"""An event that begins this near to a source's start is its event."""
+"""Longest time, in seconds, between the starts of a source and of its event."""
+
+LAST_NS: Final = 10_000_000_000
+"""Time, in nanoseconds, that a busy server gets for its final results after the nodes have ended."""
 
 RATE_HZ: Final = 44100.0
 SEED: Final = 1
@@ -44,7 +48,7 @@ class DemoError(RunError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """One source of the scene, and the event that was made of it."""
+    """One source of the scene and its event, if there is one."""
 
     name: str
     start_s: float
@@ -53,17 +57,47 @@ class Outcome:
 
     @property
     def located(self) -> bool:
-        """Whether there is a position."""
+        """True if the event has a position."""
         return self.event is not None and self.event["status"] == "located"
 
     @property
     def error_m(self) -> float | None:
-        """Distance from the truth."""
+        """Distance from the true position, in metres; None without a position."""
         return (
             None
             if self.event is None or self.event["position_m"] is None
             else math.dist(self.event["position_m"], self.true_position_m)
         )
+
+
+@dataclass
+class Running:
+    """The demo's processes.
+
+    Parameters
+    ----------
+    url : str
+        The dashboard's address.
+    start_ns : int
+        Site time at which the scene begins, in nanoseconds.
+    nodes : sequence of Popen
+        The capture nodes.
+    clock : Clock
+    """
+
+    url: str
+    start_ns: int
+    nodes: Sequence[subprocess.Popen[bytes]]
+    clock: Clock
+    _ended_ns: int | None = field(default=None, init=False)
+
+    def silent_ns(self) -> int:
+        """Return how long ago all nodes had ended, in nanoseconds; 0 while one plays."""
+        if any(node.poll() is None for node in self.nodes):
+            return 0
+        if self._ended_ns is None:
+            self._ended_ns = self.clock.monotonic_ns()
+        return self.clock.monotonic_ns() - self._ended_ns
 
 
 def prepare(directory: Path, http_port: int, events: int, progress: Callable[[int, int], None]) -> tuple[Site, Scene]:
@@ -85,39 +119,42 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
 
 
 @contextmanager
-def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[tuple[str, int]]:
-    """Server and nodes as processes while the context lasts; yields the dashboard's address and the scene's start, ns.
+def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[Running]:
+    """Run server and nodes as processes while the context lasts.
 
-    The scene starts when the server is there: the first time on a machine that takes some seconds.
+    The scene starts when the server is ready, which takes some seconds at the first start on a machine.
 
     Raises
     ------
     NotStartedError
-        Where one of them does not come up.
+        If one of the processes does not start.
     """
     http = site.server.http
     url = f"http://{http.host}:{http.port}"
     common = ["--site", str(directory / "site.yaml")]
-    started = [processes.start("serve", *common)]
+    server = processes.start("serve", *common)
+    nodes: list[subprocess.Popen[bytes]] = []
     try:
-        processes.wait_until_ready(url, started, clock)
+        processes.wait_until_ready(url, [server], clock)
         start_ns = (clock.now_ns() + LEAD_NS) // FRAME_NS * FRAME_NS
         for node in site.nodes:
             extra = ["--loop"] if loop else []
             at = utc_text(start_ns)
-            started.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
-        yield url, start_ns
+            nodes.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
+        yield Running(url, start_ns, nodes, clock)
     finally:
-        processes.end(started)
+        processes.end([server, *nodes])
 
 
-def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObject]:
-    """Events from the WebSocket, as any subscriber gets them, until a time or for ever."""
+def events_of(url: str, is_over: Callable[[], bool]) -> Iterator[JsonObject]:
+    """Yield events from the WebSocket, as any client receives them; end in a pause in which `is_over()` is true."""
     with connect(f"ws{url.removeprefix('http')}/api/v1/live?kinds=event", open_timeout=10) as live:
-        while until_ns is None or clock.now_ns() < until_ns:
+        while True:
             try:
                 message = json.loads(live.recv(timeout=0.5))
             except TimeoutError:
+                if is_over():
+                    return
                 continue
             except ConnectionClosed as error:
                 raise DemoError("the server ended") from error
@@ -126,14 +163,14 @@ def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObje
 
 
 def read_truth(directory: Path) -> list[dict[str, Any]]:
-    """The scene's sources."""
+    """Read the sources of the scene."""
     return [json.loads(line) for line in (directory / TRUTH_FILE).read_text(encoding="utf-8").splitlines()]
 
 
 def match(
     truth: Sequence[dict[str, Any]], events: Sequence[JsonObject], start_ns: int, period_s: float
 ) -> list[Outcome]:
-    """For each source the event nearest in time, within `MATCH_S`; scene time repeats after `period_s`."""
+    """Pair each source with the event nearest in time, within `MATCH_S`; scene time repeats after `period_s`."""
     outcomes = []
     for source in truth:
         near = [(abs(_scene_time_s(event, start_ns, period_s) - source["start_s"]), event) for event in events]
@@ -145,7 +182,7 @@ def match(
 
 
 def nearest_source(truth: Sequence[dict[str, Any]], event: JsonObject, start_ns: int, period_s: float) -> Outcome:
-    """The source that an event was made of."""
+    """Pair an event with the source that is nearest in time."""
     time_s = _scene_time_s(event, start_ns, period_s)
     source = min(truth, key=lambda entry: abs(entry["start_s"] - time_s))
     x, y, z = source["position_m"]
@@ -157,7 +194,7 @@ def _scene_time_s(event: JsonObject, start_ns: int, period_s: float) -> float:
 
 
 def _need_free(host: str, port: int) -> None:
-    """Fail before anything is simulated; and never take another server's answers for the demo's."""
+    """Fail early if the port is in use, so that results of another server are never mistaken for the demo's."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -165,5 +202,5 @@ def _need_free(host: str, port: int) -> None:
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise DemoError(
-                f"--port {port}: cannot be used: {reason}; stop what listens there or choose another"
+                f"--port {port}: cannot be used: {reason}; stop the program that uses it or choose another port"
             ) from error

@@ -1,4 +1,4 @@
-"""Our own commands as processes: started, waited for, ended."""
+"""The project's own commands as processes: start, wait until ready, stop."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.errors import RunError
 
-READY_NS: Final = 60_000_000_000
+READY_NS: Final = 300_000_000_000
+"""Longest start of a server, in nanoseconds; the first one on a busy machine compiles kernels for minutes."""
+
 POLL_NS: Final = 50_000_000
+"""Time, in nanoseconds, between two checks whether a server is ready."""
+
 END_S: Final = 5.0
+"""Time, in seconds, after which a process that does not stop is killed."""
 
 
 class NotStartedError(RunError):
-    """A command did not come up; it has said why itself."""
+    """A command did not start; its own message gives the reason."""
 
 
 def start(*arguments: str) -> subprocess.Popen[bytes]:
     """Run a livessl command."""
-    return subprocess.Popen([sys.executable, "-m", "livessl", *arguments])  # noqa: S603 - ourselves
+    return subprocess.Popen([sys.executable, "-m", "livessl", *arguments])  # noqa: S603 - this package
 
 
 def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock: Clock) -> None:
@@ -33,12 +38,12 @@ def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock
     Raises
     ------
     NotStartedError
-        Where one of the processes ends first, or it does not answer in time.
+        If one of the processes ends first, or the server does not answer in time.
     """
     deadline_ns = clock.monotonic_ns() + READY_NS
     while clock.monotonic_ns() < deadline_ns:
         if any(process.poll() is not None for process in started):
-            raise NotStartedError("the server did not start; it says why above")
+            raise NotStartedError("the server did not start; its message above gives the reason")
         if _answers(url):
             return
         clock.sleep_until_ns(clock.now_ns() + POLL_NS)
@@ -46,7 +51,7 @@ def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock
 
 
 def end(started: Sequence[subprocess.Popen[bytes]]) -> None:
-    """End processes, the youngest first, and wait for them."""
+    """Stop processes, the youngest first, and wait for them."""
     for process in reversed(started):
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
@@ -59,7 +64,7 @@ def end(started: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on."""
+    """Return a free TCP port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -11,7 +11,6 @@ from typing import Final
 from livessl.clock import Clock, utc_text
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.final_pass import TwoPassFusion
-from livessl.core.types import Frame, Message
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
 from livessl.server.site_time import SiteTime
@@ -94,12 +93,6 @@ class ArrayStates:
         with self._switching:
             self._store.enable(self._site.site, array, enabled)
             self._disabled = self._disabled - {array} if enabled else self._disabled | {array}
-
-    def for_fusion(self, message: Message) -> Message:
-        """Return the message as the fusion shall get it: no frame of a disabled array is active."""
-        if message.array in self._disabled and isinstance(message, Frame) and message.active:
-            return replace(message, active=False)
-        return message
 
     def describe(self, *, levels: bool = True) -> list[JsonObject]:
         """Return the state of every array as JSON objects, without waiting for a localization in progress.

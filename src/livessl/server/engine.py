@@ -74,7 +74,7 @@ class Engine:
     @property
     def updates_left_out(self) -> int:
         """Windows of this run that were not localized because newer ones were due."""
-        return self._run.fusion.live.updates_left_out
+        return self._run.fusion.updates_left_out
 
     def start(self) -> None:
         """Start the thread."""
@@ -104,7 +104,7 @@ class Engine:
                 batch = []
                 self._handle(item)
             else:
-                batch.append(self._array_states.for_fusion(item))
+                batch.append(item)
         self._step(batch)
         if batch:
             self._site_time.note_sound()
@@ -152,7 +152,7 @@ class Engine:
             self._switch(live_run(self._site, self._event_log.begin_live(), self._parallel.for_each))
             self._site_time.begin_live()
         for array, rate_hz in hello.arrays.items():
-            self._run.fusion.live.prepare(array, rate_hz)
+            self._run.fusion.prepare(array, rate_hz)
 
     def _leave(self, hello: wire.Hello) -> None:
         _log.info("node %r has ended", hello.node)

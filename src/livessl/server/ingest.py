@@ -141,8 +141,8 @@ class Ingest:
         wrong = self._wrong_rate(peer, message) if isinstance(message, Frame) else None
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
-        if isinstance(message, Frame) and message.sequence == 0:
-            return Received(message=message)  # requested, and outside the sequence
+        if isinstance(message, Frame) and message.requested:
+            return Received(message=message)  # it stands outside the node's own count of frames
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
             return Received(message=message)

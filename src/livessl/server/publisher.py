@@ -69,7 +69,7 @@ class Publisher:
                     self._tracks.note(output, message)
                     self._publish(message)
                 case Window():
-                    self._maps.show(output, run.fusion.live.power_maps)
+                    self._maps.show(output, run.fusion.power_maps)
                 case BackfillRequest():
                     self._request(output)
                 case _:

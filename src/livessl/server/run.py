@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.stream.correlation_cache import Each
+from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import Messages
 from livessl.server.store import Finalized
-from livessl.site.build.fusion import make_clock_offsets, make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_two_pass_fusion
 from livessl.site.models import Site
 
 
@@ -32,19 +32,19 @@ class Run:
     messages: Messages | None = None
 
 
-def live_run(site: Site, done: Finalized, for_each: Each) -> Run:
+def live_run(site: Site, done: Finalized, for_each: ForEach) -> Run:
     """Return a live run of all arrays that goes on where the final pass of the last one stopped."""
     return _run(site, [spec.name for spec in site.processed], done, for_each, live=True)
 
 
-def replay_run(site: Site, arrays: Iterable[str], for_each: Each) -> Run:
+def replay_run(site: Site, arrays: Iterable[str], for_each: ForEach) -> Run:
     """Return the replay of a recording of these arrays."""
     return _run(site, arrays, Finalized(None, None), for_each, live=False)
 
 
-def _run(site: Site, arrays: Iterable[str], done: Finalized, for_each: Each, *, live: bool) -> Run:
+def _run(site: Site, arrays: Iterable[str], done: Finalized, for_each: ForEach, *, live: bool) -> Run:
     clock_offsets = make_clock_offsets(site)
     if done.clocks is not None:
         clock_offsets.restore(done.clocks)
-    fusion = make_fusion(site, live=live, clock_offsets=clock_offsets, each=for_each)
-    return Run(TwoPassFusion(fusion, arrays, done.until), clock_offsets)
+    fusion = make_two_pass_fusion(site, arrays, done.until, live=live, clock_offsets=clock_offsets, for_each=for_each)
+    return Run(fusion, clock_offsets)

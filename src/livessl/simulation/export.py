@@ -1,4 +1,4 @@
-"""A simulated scene as a session on disk: a WAV for each array, the truth, and what replay needs."""
+"""A simulated scene as a session on disk: a WAV for each array, the truth, and the data for replay."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from livessl.site.models import Site
 TRUTH_FILE: Final = "truth.jsonl"
 
 NOMINAL_START_NS: Final = 1_767_225_600_000_000_000
-"""Start of every simulated session, 2026-01-01T00:00:00Z: two sessions of one seed are the same to the byte."""
+"""Start of every simulated session, 2026-01-01T00:00:00Z, so that sessions of the same seed have the same bytes."""
 
 
 def write_scene(
@@ -50,7 +50,7 @@ def write_scene(
     Raises
     ------
     OSError
-        Where the folder cannot be written.
+        If the folder cannot be written.
     """
     directory.mkdir(parents=True, exist_ok=True)
     pieces = []

@@ -1,4 +1,4 @@
-"""The sum over images, compiled: what `room` does with arrays, some times faster, for campaigns. Needs numba."""
+"""The sum over images as compiled code, several times faster than that of `room`, for campaigns. Needs numba."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from livessl.core.kernels.jit import jit
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 _SHELLS: Final = 48
-"""Shells of equal volume the lattice is met in, so that the part of the time axis being written stays in the cache."""
+"""Number of shells of equal volume in which images are added: the written part of the time axis stays cached."""
 
 Axis = tuple[FloatArray, IntArray]
-"""Squared distances along an axis (n,), ascending, square metres, and numbers of reflections (n,)."""
+"""Squared distances along an axis (n,), in square metres, ascending, and numbers of reflections (n,)."""
 
 
 def lay_down_all(
@@ -26,11 +26,11 @@ def lay_down_all(
     axes : three of Axis
     reach_m : float
     bins_per_m : float
-        Bins of the time axis to a metre of way.
+        Bins of the time axis per metre of path.
     beta : (R,) float64
         Reflection factors; 0 is anechoic.
     ends : (R,) int64
-        Bins from which on nothing is wanted; images well beyond are not added, which is most of the time saved.
+        Bins at which the responses end; images well beyond are skipped, which saves most of the time.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A source that moves through a room, and what microphones record of it: responses along its way, crossfaded."""
+"""A source that moves through a room, as microphones record it: responses along its way, crossfaded."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from livessl.core.types import Float32Array, FloatArray
 from livessl.simulation.room import impulse_responses
 
 STEP_S: Final = 0.05
-"""Time between two responses. At a walk of 1 m/s they lie 5 cm apart, and a source is never further than half of that
-from one of them."""
+"""Time, in seconds, between two responses. At a walk of 1 m/s they lie 5 cm apart, and a source is never further than
+half of that from one of them."""
 
 
 def place_on_way(times_s: ArrayLike, waypoints_m: ArrayLike, at_s: ArrayLike) -> FloatArray:
-    """Where something is that goes straight, at an even pace, from waypoint to waypoint, and stands still outside.
+    """Interpolate a way at constant speed between waypoints; before the first and after the last it stands still.
 
     Parameters
     ----------
     times_s : (N,)
-        When it is at each waypoint, seconds, ascending.
+        Time at each waypoint, in seconds, ascending.
     waypoints_m : (N, 3)
-        Metres.
+        Waypoints, in metres.
     at_s : (T,)
-        Seconds.
+        Times, in seconds, at which the position is wanted.
 
     Returns
     -------
@@ -36,7 +36,7 @@ def place_on_way(times_s: ArrayLike, waypoints_m: ArrayLike, at_s: ArrayLike) ->
     Raises
     ------
     ValueError
-        Where times and waypoints differ in number, or the times do not ascend.
+        If times and waypoints differ in number, or the times do not ascend.
     """
     times, points_m = np.asarray(times_s, dtype=np.float64), as_positions_m(waypoints_m)
     if times.shape != (len(points_m),) or not (np.diff(times) > 0).all():
@@ -61,14 +61,14 @@ def render_moving(
 ) -> Float32Array:
     """Compute what microphones record of a source that moves while it sounds.
 
-    The sound is cut into overlapping triangles `step_s` apart that add up to one; each sounds from where the source is
-    at its middle, through that place's responses. So the place is that of emission, reverberation comes from where the
-    sound was made, and between two places one fades into the next; there is no Doppler shift.
+    The sound is cut by overlapping triangles `step_s` apart that add up to one. Each part is emitted at the position of
+    the source at the part's middle, through the responses of that position. Reverberation thus belongs to the position
+    of emission, one position fades into the next, and there is no Doppler shift.
 
     Parameters
     ----------
     sound : (n,) float32
-        From time 0 on.
+        Sound from time 0 on.
     times_s : (N,)
     waypoints_m : (N, 3)
         The way: as in `place_on_way`.
@@ -82,12 +82,13 @@ def render_moving(
     Returns
     -------
     (K, m) float32
-        As long as sound and response together; sample 0 is the emission of the sound's first. No noise, no level set.
+        Recording as long as sound and response together; sample 0 is the emission of the first sample of the sound.
+        It has no noise, and its level is not normalized.
 
     Raises
     ------
     ValueError
-        Where `step_s` is shorter than a sample, or an argument is not what those functions expect.
+        If `step_s` is shorter than a sample, or another argument is invalid.
     """
     step = round(step_s * sample_rate_hz)
     if step < 1:
@@ -114,6 +115,6 @@ def render_moving(
         part = sound[first : middle + step]
         if len(part):
             weight = 1.0 - np.abs(np.arange(first, first + len(part)) - middle) / step
-            heard = oaconvolve(responses, (weight * part).astype(np.float32)[None], axes=1)
-            recorded[:, first : first + heard.shape[1]] += heard
+            wet = oaconvolve(responses, (weight * part).astype(np.float32)[None], axes=1)
+            recorded[:, first : first + wet.shape[1]] += wet
     return recorded

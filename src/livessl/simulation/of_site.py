@@ -1,4 +1,4 @@
-"""Scenes in a site's own room, and what its arrays would record of them."""
+"""Scenes in a site's own room, and the recordings of its arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from livessl.site.load import load_site
 from livessl.site.models import Site
 
 DEFAULT_RATE_HZ = 44100.0
-"""Sampling rate, in hertz, where neither the caller nor the site says one: the paper's."""
+"""Default sampling rate, in hertz, of sites whose devices have none: the paper's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Simulation:
     scene : Scene
         Room and sources: `scene.sources` has the true positions and start times.
     recordings : mapping of array name to (channels, n) float32
-        What each array records; all begin together.
+        Recording of each array; all begin together.
     sample_rate_hz : float
         Sampling rate of the recordings.
     """
@@ -56,14 +56,14 @@ def simulate(
     sample_rate_hz : float or None
         Sampling rate, hertz; None takes the rate of the site's first device, or 44100.
     sounds : sequence of (name, (n,) float32) or None
-        What is played, at that rate; None takes the project's own sounds.
+        Sounds to play, at that rate; None takes the project's own sounds.
     seed : int
         The same seed and arguments give the same recordings.
 
     Raises
     ------
     ValueError
-        Where there is no such scene: see `make_scene`.
+        If there is no such scene: see `make_scene`.
     """
     site = site if isinstance(site, Site) else load_site(site)
     rate_hz = sample_rate_hz or next(iter(device_rates_hz(site).values()), DEFAULT_RATE_HZ)
@@ -102,9 +102,9 @@ def rendered(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[tuple[ArraySpec, Float32Array]]:
-    """Yield each array of a site, or each of those named, with what it records of a scene (channels, n).
+    """Yield each array of a site, or each of those named, with its recording of a scene (channels, n).
 
-    An array's noise depends on the seed and on its place in the site file alone, so arrays may be rendered apart.
+    An array's noise depends only on the seed and on its position in the site file, so arrays may be rendered apart.
     """
     chosen = [(number, spec) for number, spec in enumerate(site.specs) if arrays is None or spec.name in arrays]
     total = len(chosen) * len(scene.sources)

@@ -14,24 +14,24 @@ from livessl.core.geometry import as_positions_m
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 OVERSAMPLING: Final = 8
-"""Bins per sample of the time axis on which images are laid down, two bins each in proportion.
+"""Bins per sample of the time axis to which images are added; each image is shared by its two nearest bins.
 
-An image between two bins, at the part a of their distance D, errs by a(1-a)(2 pi f D)^2/2. Its mean over a is taken out
-with the droop; what is left has the rms (2 pi f D)^2/(12 sqrt 5): 0.6 % at the Nyquist frequency, less below.
+An image between two bins, at the fraction a of their distance D, has the error a(1-a)(2 pi f D)^2/2. The mean over a is
+removed with the droop; the rest has the RMS (2 pi f D)^2/(12 sqrt 5): 0.6 % at the Nyquist frequency, less below.
 """
 
 SHELL_IMAGES: Final = 1 << 18
-"""Images worked on at once: a few MB for each of their properties, whatever the reverberation time."""
+"""Number of images that are processed at once: a few MB for each of their properties."""
 
 ROLL_OFF: Final = 0.9
-"""Part of the Nyquist frequency above which the response fades out, so that its ringing is short."""
+"""Fraction of the Nyquist frequency above which the response fades out, so that its ringing is short."""
 
 GUARD: Final = 256
-"""Samples after the response, thrown away: ringing before time 0 wraps into them."""
+"""Samples after the response that are discarded, because ringing before time 0 wraps into them."""
 
 
 def absorption(rt60_s: float, room_size_m: ArrayLike, c_m_s: float = 343.0) -> float:
-    """Absorption coefficient that gives equal walls a reverberation time: alpha = 24 ln(10) V / (c S T).
+    """Return the absorption coefficient that gives equal walls a reverberation time: alpha = 24 ln(10) V / (c S T).
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ def absorption(rt60_s: float, room_size_m: ArrayLike, c_m_s: float = 343.0) -> f
     Raises
     ------
     ValueError
-        Where no wall absorbs enough (alpha > 1), or an argument is not a finite number of the right sign.
+        If no wall absorbs enough (alpha > 1), or an argument is not a finite number of the right sign.
 
     Notes
     -----
-    Sabine, Collected Papers on Acoustics, 1922. The time is nominal: the decay of images in a box is no exponential,
-    and what T30 measures lies below it in a dead room, above it in a live one.
+    Sabine, Collected Papers on Acoustics, 1922. The time is nominal: the decay of images in a box is not exponential,
+    and T30 is shorter in a dead room and longer in a live one.
     """
     x, y, z = _as_room_m(room_size_m)
     if not (np.isfinite(rt60_s) and rt60_s >= 0):
@@ -63,7 +63,7 @@ def absorption(rt60_s: float, room_size_m: ArrayLike, c_m_s: float = 343.0) -> f
     if rt60_s < shortest_s:
         raise ValueError(
             f"reverberation time: a room of {x:g} x {y:g} x {z:g} m has at least {shortest_s:.3g} s by Sabine "
-            f"(walls absorb all), got {rt60_s:g} s; give more, or 0 for no reflections"
+            f"(the walls absorb everything), got {rt60_s:g} s; choose a longer time, or 0 for no reflections"
         )
     return float(shortest_s / rt60_s)
 
@@ -80,11 +80,11 @@ def impulse_responses(
     own_lengths: bool = False,
     compiled: bool = False,
 ) -> Float32Array:
-    """Responses from a source to microphones, all omnidirectional, by the image method.
+    """Compute the responses from a source to microphones, all omnidirectional, by the image method.
 
-    An image n reflections deep at distance d sounds after d/c with amplitude beta^n / (4 pi d). Neither d nor n knows
-    the reverberation time, so the images are met once: h = A B, where A (time, n) sums 1 / (4 pi d) and B (n, R) holds
-    beta^n, with beta = sqrt(1 - alpha) and alpha of `absorption`.
+    An image after n reflections at distance d arrives after d/c with amplitude beta^n / (4 pi d). Neither d nor n
+    depends on the reverberation time, so the images are visited once: h = A B, where A (time, n) sums 1 / (4 pi d) and
+    B (n, R) holds beta^n, with beta = sqrt(1 - alpha) and alpha of `absorption`.
 
     Parameters
     ----------
@@ -101,12 +101,13 @@ def impulse_responses(
     c_m_s : float
         Speed of sound, m/s.
     duration_s : float or None
-        Length in seconds; every image that sounds within it is there. None is the longest reverberation time, or the
-        way across the room where that is longer.
+        Length in seconds; it contains every image that arrives within it. None takes the longest reverberation time,
+        or the time across the room if that is longer.
     own_lengths : bool
-        Each response is zero after its own reverberation time (or the way across the room), 60 dB down.
+        Whether each response is zero after its own reverberation time (or the time across the room).
     compiled : bool
-        Sum the images by compiled code: some times as fast, equal but for rounding. Needs numba (the extra `evaluate`).
+        Whether the images are summed by compiled code: several times faster, and equal except for rounding. Needs
+        numba (the extra `evaluate`).
 
     Returns
     -------
@@ -116,13 +117,13 @@ def impulse_responses(
     Raises
     ------
     ValueError
-        Where a position lies outside the room, or an argument has another shape, sign or size than stated.
+        If a position lies outside the room, or an argument has another shape, sign or size than stated.
 
     Notes
     -----
     Allen & Berkley, Image method for efficiently simulating small-room acoustics, JASA 65(4), 1979, without their
     high-pass: below 100 Hz, where images only ever add, the response rings longer than the time asked for. The lattice
-    is met in shells of equal volume, so memory does not grow with the number of images.
+    is visited in shells of equal volume, so memory does not grow with the number of images.
     """
     room_m = _as_room_m(room_size_m)
     source = _as_inside_m(np.atleast_2d(np.asarray(source_m)), room_m, "source")[0]
@@ -171,7 +172,7 @@ def _all(
     beta: FloatArray,
     bins: int,
 ) -> FloatArray:
-    """All images within reach on the fine time axis: (bins, R)."""
+    """Add all images within reach to the fine time axis: (bins, R)."""
     fine = np.zeros((bins, len(beta)))
     for distance_m, order in _shells(room_m, source_m, microphone_m, reach_m):
         _lay_down(fine, distance_m * bins_per_m, order, distance_m, beta)
@@ -187,7 +188,7 @@ def _all_compiled(
     beta: FloatArray,
     ends: IntArray,
 ) -> Float32Array:
-    """Do the same by compiled code, each up to its own end: (R, bins)."""
+    """Add all images by compiled code, each response up to its own end: (R, bins)."""
     from livessl.simulation.images import lay_down_all
 
     x, y, z = (_axis(*each, reach_m) for each in zip(room_m, source_m, microphone_m, strict=True))
@@ -216,7 +217,7 @@ def _xyz(position_m: FloatArray) -> str:
 
 
 def _axis(length_m: float, source_m: float, microphone_m: float, reach_m: float) -> tuple[FloatArray, IntArray]:
-    """Squared distance along one axis and number of reflections of the images within reach, nearest first."""
+    """Return squared distances along one axis and numbers of reflections of images within reach, nearest first."""
     ends = int(reach_m / length_m) + 2
     index = np.arange(-ends, ends + 1, dtype=np.int64)
     image_m = index * length_m + np.where(index % 2 == 0, source_m, length_m - source_m)
@@ -229,11 +230,11 @@ def _axis(length_m: float, source_m: float, microphone_m: float, reach_m: float)
 def _shells(
     room_m: FloatArray, source_m: FloatArray, microphone_m: FloatArray, reach_m: float
 ) -> Iterator[tuple[FloatArray, IntArray]]:
-    """Distance and number of reflections of every image within reach, in spherical shells around the microphone."""
+    """Yield distances and numbers of reflections of all images within reach, in shells around the microphone."""
     (x2, x_order), (y2, y_order), (z2, z_order) = (
         _axis(*each, reach_m) for each in zip(room_m, source_m, microphone_m, strict=True)
     )
-    column2 = np.add.outer(y2, z2).ravel()  # lines of images along x
+    column2 = np.add.outer(y2, z2).ravel()  # lines of images parallel to x
     column_order = np.add.outer(y_order, z_order).ravel()
     images = 4.0 / 3.0 * np.pi * reach_m**3 / room_m.prod()
     shells = int(np.ceil(images / SHELL_IMAGES))

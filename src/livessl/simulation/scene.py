@@ -1,4 +1,4 @@
-"""A scene, what sounds where and when in a room, and what microphones there would record of it."""
+"""Scenes, i.e. sounds at positions and times in a room, and the recordings of microphones in it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_JITTER_S: Final = 0.5
 """Longest random addition to the pause between sources, so that they keep no beat."""
 
 TRIES: Final = 10_000
-"""Draws of a position before there is taken to be no room for it."""
+"""Number of draws after which no position is taken to be free."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Source:
     Parameters
     ----------
     name : str
-        What it is.
+        Name of the sound.
     start_s : float
         Emission of its first sample, seconds after the start of the scene.
     position_m : (3,) float64
@@ -49,7 +49,7 @@ class Source:
     Raises
     ------
     ValueError
-        Where a shape, type or sign is another.
+        If a shape, type or sign is wrong.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A room and all that sounds in it.
+    """A room and all sounds in it.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ class Scene:
     c_m_s : float
         Speed of sound, m/s.
     sample_rate_hz : float
-        Of the sounds and of what is rendered.
+        Sample rate of the sounds and of the rendered recordings.
     sources : tuple of Source
         In order of their starts.
     duration_s : float
-        Seconds; what sounds later is cut off.
+        Length in seconds; later sound is cut off.
     noise_dbfs : float
         RMS of each microphone's own white noise, dB re full scale (1.0).
     level_dbfs : float
@@ -122,8 +122,8 @@ def make_scene(
 ) -> Scene:
     """Place sounds at random in a room, one after the other.
 
-    Positions are uniform in the part of the room allowed. Sounds are taken in random order, each as often as any
-    other. Starts fall on whole samples and keep no beat; each waits until the former sound's reverberation is over.
+    Positions are uniform in the allowed part of the room. Sounds are taken in random order, each as often as any
+    other. Starts fall on whole samples and keep no beat; each sound begins after the reverberation of the one before.
 
     Parameters
     ----------
@@ -132,11 +132,11 @@ def make_scene(
     rt60_s : float
         Nominal reverberation time, seconds.
     sounds : sequence of (name, (n,) float32)
-        What there is to play, at `sample_rate_hz`.
+        Sounds to choose from, at `sample_rate_hz`.
     count : int
         Number of sources, 1 or more.
     sample_rate_hz : float
-        Of the scene.
+        Sample rate of the scene.
     c_m_s : float
         Speed of sound, m/s.
     keep_away_m : (n, 3)
@@ -155,7 +155,7 @@ def make_scene(
     Raises
     ------
     ValueError
-        Where there is no sound, none wanted, no place for one, or no such reverberation time in such a room.
+        If there is no sound, `count` is below 1, no position is free, or the room cannot have the reverberation time.
     """
     absorption(rt60_s, room_size_m, c_m_s)
     if not sounds:
@@ -192,11 +192,11 @@ def render(
     Parameters
     ----------
     scene : Scene
-        What sounds; a start between two samples is moved to the nearer.
+        The scene; a start between two samples is moved to the nearer.
     microphones_m : (K, 3)
         Absolute positions, metres.
     seed : int
-        For the microphones' own noise. Microphones rendered apart need different seeds to have noise of their own.
+        Seed of the microphones' own noise. Microphones rendered apart need different seeds to have independent noise.
     progress : callable or None
         Called with (sources done, sources in all) after each.
 
@@ -208,7 +208,7 @@ def render(
     Raises
     ------
     ValueError
-        Where a source or microphone is outside the room, or the sound would clip.
+        If a source or microphone is outside the room, or the sound would clip.
     """
     microphones = as_positions_m(microphones_m)
     rate_hz = scene.sample_rate_hz
@@ -225,10 +225,10 @@ def render(
             sample_rate_hz=rate_hz,
             c_m_s=scene.c_m_s,
         )[0]
-        heard = oaconvolve(responses, gain * source.sound[None], axes=1)
+        wet = oaconvolve(responses, gain * source.sound[None], axes=1)
         first = round(source.start_s * rate_hz)
-        span = recorded[:, first : first + heard.shape[1]]
-        span += heard[:, : span.shape[1]]
+        span = recorded[:, first : first + wet.shape[1]]
+        span += wet[:, : span.shape[1]]
         if progress is not None:
             progress(done, len(scene.sources))
     peak = float(np.abs(recorded).max(initial=0.0))
@@ -241,7 +241,7 @@ def render(
 
 
 def truth(scene: Scene) -> list[dict[str, object]]:
-    """What a perfect localiser would report, ready for JSON.
+    """Return the results of a perfect localizer, ready for JSON.
 
     Returns
     -------
@@ -261,7 +261,7 @@ def truth(scene: Scene) -> list[dict[str, object]]:
 
 
 def synthesised_sounds(sample_rate_hz: float, seed: int) -> list[NamedSound]:
-    """Give one of each of the project's own sounds, (name, (n,) float32), the same for the same seed."""
+    """Synthesise one of each of the project's own sounds, (name, (n,) float32); the seed determines them."""
     return [
         (name, sound(np.random.default_rng([seed, index]), sample_rate_hz))
         for index, (name, sound) in enumerate(SOUNDS.items())
@@ -276,7 +276,7 @@ def read_sounds(directory: Path, sample_rate_hz: float) -> list[NamedSound]:
     directory : Path
         Its subdirectories are not searched.
     sample_rate_hz : float
-        Wanted rate; files of another are resampled.
+        Sample rate of the result; files with another rate are resampled.
 
     Returns
     -------
@@ -286,7 +286,7 @@ def read_sounds(directory: Path, sample_rate_hz: float) -> list[NamedSound]:
     Raises
     ------
     ValueError
-        Where there is no such file, or one cannot be read, is empty, silent or holds values that are not finite.
+        If there is no such file, or one cannot be read, is empty, silent or has values that are not finite.
     """
     paths = sorted(path for path in directory.glob("*") if path.suffix.lower() in {".wav", ".flac"})
     if not paths:
@@ -298,16 +298,14 @@ def _read(path: Path, sample_rate_hz: float) -> Float32Array:
     try:
         samples, rate_hz = soundfile.read(path, dtype="float32", always_2d=True)
     except (OSError, soundfile.LibsndfileError) as error:
-        raise ValueError(
-            f"{path}: expected a readable WAV or FLAC file, got {error}; replace it or take it away"
-        ) from error
+        raise ValueError(f"{path}: expected a readable WAV or FLAC file, got {error}; replace or remove it") from error
     if len(samples) == 0:
-        raise ValueError(f"{path}: expected sound, got a file of no samples; replace it or take it away")
+        raise ValueError(f"{path}: expected sound, got a file of no samples; replace or remove it")
     if not np.isfinite(samples).all():
-        raise ValueError(f"{path}: expected finite samples, got NaN or infinity; replace it or take it away")
+        raise ValueError(f"{path}: expected finite samples, got NaN or infinity; replace or remove it")
     mono = samples.mean(axis=1)
     if not mono.any():
-        raise ValueError(f"{path}: expected sound, got only zeros; replace it or take it away")
+        raise ValueError(f"{path}: expected sound, got only zeros; replace or remove it")
     ratio = Fraction(sample_rate_hz).limit_denominator(1000) / rate_hz
     return np.asarray(resample_poly(mono, ratio.numerator, ratio.denominator), dtype=np.float32)
 
@@ -317,7 +315,7 @@ def _amplitude(level_db: float) -> float:
 
 
 def _gain(scene: Scene) -> np.float32:
-    """Factor from samples to sound that gives the largest peak of all sources `level_dbfs` at 1 m.
+    """Return the factor that gives the largest peak of all sources the level `level_dbfs` at 1 m.
 
     A direct path has the amplitude 1/(4 pi) there, and the diffuse field 16 pi (1 - alpha) / (alpha S) times its power
     (critical distance: Kuttruff, Room Acoustics, ch. 5).

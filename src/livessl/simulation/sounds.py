@@ -1,4 +1,4 @@
-"""Synthesised sounds for the demo, with the onsets and spectra of real ones; they know no room and no place."""
+"""Synthesised sounds for the demo, with the onsets and spectra of real ones, without room or position."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.signal import butter, lfilter, sosfilt
 from livessl.core.types import Float32Array, FloatArray
 
 BAND_HZ: Final = (100.0, 6000.0)
-"""Where the energy of every sound is."""
+"""Band, in hertz, that contains the energy of every sound."""
 
 PEAK: Final = 0.9
 """Largest absolute sample of every sound."""
@@ -27,14 +27,14 @@ FORMANT_WIDTHS_HZ: Final = (70, 100, 140, 220)
 
 
 def door_slam(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
-    """A door falls shut (0.4 s): the latch, then the leaf's thud and crack.
+    """Synthesise a door that falls shut (0.4 s): the latch, then the leaf's thud and crack.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Every draw is another door.
+        Source of randomness; every draw is another door.
     sample_rate_hz : float
-        Above 200 Hz.
+        Sample rate, above 200 Hz.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def door_slam(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
 
 
 def dropped_keys(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
-    """A bunch of keys falls and bounces (0.6 s): weaker and weaker clinks, irregular in time.
+    """Synthesise a bunch of keys that falls and bounces (0.6 s): ever weaker clinks, irregular in time.
 
     Parameters and result are those of `door_slam`.
     """
@@ -64,7 +64,7 @@ def dropped_keys(rng: np.random.Generator, sample_rate_hz: float) -> Float32Arra
 
 
 def phone(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
-    """A telephone rings once (1.2 s): two tones in quick turn, rich in harmonics, with a click at each turn.
+    """Synthesise a telephone that rings once (1.2 s): two tones in quick turn, rich in harmonics, with clicks between.
 
     Parameters and result are those of `door_slam`.
     """
@@ -82,7 +82,7 @@ def phone(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
 
 
 def voice(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
-    """A few syllables of a voice (1.5 s): glides in pitch, changes its vowel, hisses and pauses in between.
+    """Synthesise a few syllables of a voice (1.5 s) with gliding pitch, changing vowels, hisses and pauses.
 
     Parameters and result are those of `door_slam`.
     """
@@ -113,12 +113,12 @@ def _times(duration_s: float, sample_rate_hz: float) -> FloatArray:
 
 
 def _since(t: FloatArray, start_s: float) -> FloatArray:
-    """Seconds since a start; before it, so long ago that any decay is over."""
+    """Return the seconds since a start, infinite before it, so that any decay is 0 there."""
     return np.where(t >= start_s, t - start_s, np.inf)
 
 
 def _noise(t: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """White noise, as strong in the band at every sample rate: rms 1 if sampled at twice the band's upper edge."""
+    """Draw white noise of the same density at every sample rate: RMS 1 if sampled at twice the band's upper edge."""
     return np.asarray(rng.standard_normal(len(t)) / np.sqrt(2.0 * BAND_HZ[1] * t[1]))
 
 
@@ -129,7 +129,7 @@ def _burst(t: FloatArray, start_s: float, decay_s: float, rng: np.random.Generat
 def _struck(
     t: FloatArray, start_s: float, modes_hz: FloatArray, decays_s: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """A body's modes, struck at once: damped sines that start at zero, of random level."""
+    """Return the modes of a struck body: damped sines that start at zero, with random levels."""
     levels = rng.uniform(0.3, 1.0, len(modes_hz))
     since_s = _since(t, start_s)
     return np.asarray(
@@ -141,7 +141,7 @@ def _struck(
 
 
 def _glottal_flow_rate(phase: FloatArray) -> FloatArray:
-    """Rate of change of the flow through the glottis: slow opening, abrupt closure (Rosenberg, JASA 49(2B), 1971)."""
+    """Return the rate of change of the glottal flow: slow opening, abrupt closure (Rosenberg, JASA 49(2B), 1971)."""
     flow = np.select(
         [phase < 0.4, phase < 0.56],
         [0.5 - 0.5 * np.cos(np.pi * phase / 0.4), np.cos(np.pi / 2.0 * (phase - 0.4) / 0.16)],
@@ -159,7 +159,7 @@ def _formants(sound: FloatArray, vowel: int, sample_rate_hz: float) -> FloatArra
 
 
 def _window(t: FloatArray, start_s: float, stop_s: float) -> FloatArray:
-    """From 0 to 1 and back, with ramps of 15 ms at most."""
+    """Return a window that rises from 0 to 1 and falls back, with ramps of at most 15 ms."""
     return np.clip(np.minimum(t - start_s, stop_s - t) / 0.015, 0.0, 1.0)
 
 

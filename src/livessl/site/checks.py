@@ -11,7 +11,7 @@ import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import microphone_pairs
-from livessl.core.methods import METHODS, unknown_method
+from livessl.core.methods import is_method, unknown_method
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.errors import Fault
@@ -40,7 +40,7 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield ("temperature_c",), "expected either speed_of_sound_m_s or temperature_c, got both; remove one"
     if site.band_hz[0] >= site.band_hz[1]:
         yield ("band_hz",), f"expected [low, high] with low < high, got {list(site.band_hz)}"
-    if site.fusion.method not in METHODS:
+    if not is_method(site.fusion.method):
         yield ("fusion", "method"), unknown_method(site.fusion.method)
     yield from _name_faults(site)
     count = len(site.arrays) + len(site.processed) - len(site.specs)

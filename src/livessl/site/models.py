@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_origin
+from typing import Annotated, Any, Final, Literal, get_origin
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo, ValidatorFunctionWrapHandler
 
 from livessl.core.methods import ONSET
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec
 from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
+
+_ACTIVITY: Final = ActivityParameters()
+_FUSION: Final = FusionParameters()
 
 MicrophonesM = Annotated[list[Position], Field(min_length=MIN_MICROPHONES, max_length=MAX_MICROPHONES)]
 
@@ -137,26 +143,26 @@ class ArrayConfig(Model):
 class ActivityConfig(Model):
     """Parameters of the activity detection: see `livessl.core.stream.activity`."""
 
-    threshold: Annotated[float, Field(gt=0, le=1)] = 0.1
-    release_s: Positive = 1.0
-    floor_window_s: Positive = 3.0
-    floor_factor: Annotated[float, Field(ge=1, le=1e6)] = 4.0
-    min_level_dbfs: Annotated[float, Field(ge=-300, le=0)] = -90.0
-    pre_roll_s: Annotated[float, Field(ge=0, le=5)] = 0.4
-    hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = 0.3
+    threshold: Annotated[float, Field(gt=0, le=1)] = _ACTIVITY.threshold
+    release_s: Positive = _ACTIVITY.release_s
+    floor_window_s: Positive = _ACTIVITY.floor_window_s
+    floor_factor: Annotated[float, Field(ge=1, le=1e6)] = _ACTIVITY.floor_factor
+    min_level_dbfs: Annotated[float, Field(ge=-300, le=0)] = 10.0 * math.log10(_ACTIVITY.min_power)
+    pre_roll_s: Annotated[float, Field(ge=0, le=5)] = _ACTIVITY.pre_roll_s
+    hang_over_s: Annotated[float, Field(ge=0.05, le=5)] = _ACTIVITY.hang_over_s
 
 
 class FusionConfig(Model):
     """Parameters of the fusion of arrays: see `livessl.core.stream.fusion`."""
 
     method: str = ONSET
-    deadline_s: Annotated[float, Field(gt=0, le=10)] = 0.5
-    window_s: Annotated[float, Field(ge=0.05, le=2)] = 0.2
-    update_s: Annotated[float, Field(ge=0.05, le=2)] = 0.1
-    max_event_s: Annotated[float, Field(ge=0.5, le=60)] = 10.0
-    min_arrays: Annotated[int, Field(ge=1)] = 1
-    sources: Annotated[int, Field(ge=1, le=2)] = 2
-    live_sources: Annotated[int, Field(ge=1, le=2)] = 1
+    deadline_s: Annotated[float, Field(gt=0, le=10)] = _FUSION.deadline_s
+    window_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.window_s
+    update_s: Annotated[float, Field(ge=0.05, le=2)] = _FUSION.update_s
+    max_event_s: Annotated[float, Field(ge=0.5, le=60)] = _FUSION.max_event_s
+    min_arrays: Annotated[int, Field(ge=1)] = _FUSION.min_arrays
+    sources: Annotated[int, Field(ge=1, le=2)] = _FUSION.sources
+    live_sources: Annotated[int, Field(ge=1, le=2)] = _FUSION.live_sources
 
 
 class Zone(Model):

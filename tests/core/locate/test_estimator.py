@@ -15,6 +15,7 @@ from livessl.core.locate.map_estimator import MapEstimator
 from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.methods import METHODS
 from livessl.core.stream.fusion import Fusion
+from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, Event, Frame, Mark, Message, Update, Window
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
@@ -61,7 +62,7 @@ def test_every_built_in_method_makes_an_estimator_of_its_name() -> None:
 
 
 def test_a_minimal_method_locates_windows_and_events_through_fusion(registered: str) -> None:
-    fusion = Fusion("lab", ARRAYS, create(registered, ARRAYS, GRID, C_M_S))
+    fusion = Fusion(SiteState("lab", ARRAYS, create(registered, ARRAYS, GRID, C_M_S)))
     for spec in ARRAYS:
         fusion.prepare(spec.name, RATE_HZ)
     outputs = fusion.step(messages(), 24 * FRAME_NS) + fusion.flush(24 * FRAME_NS)
@@ -88,7 +89,7 @@ def test_an_unknown_method_is_an_error_with_the_known_ones_and_a_guess(registere
     message = rf"expected one of onset, .*, {registered}, got 'srp-fat'; did you mean 'srp-phat'\?"
     with pytest.raises(ValueError, match=message):
         create("srp-fat", ARRAYS, GRID, C_M_S)
-    with pytest.raises(ValueError, match=r"got 'music'$"):
+    with pytest.raises(ValueError, match=r"got 'music'; write a method of your own as MODULE:NAME$"):
         create("music", ARRAYS, GRID, C_M_S)
 
 

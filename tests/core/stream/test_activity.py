@@ -42,14 +42,14 @@ def test_sine_has_half_its_amplitude_squared(rate_hz: float, n: int) -> None:
     np.testing.assert_allclose(band_power(samples, rate_hz, BAND_HZ), [0.8**2 / 2, 0.1**2 / 2], rtol=1e-5)
 
 
-def test_outside_the_band_there_is_nothing() -> None:
+def test_sine_outside_the_band_has_no_power() -> None:
     low, high, inside = sine(80.0, 0.5), sine(6020.0, 0.5), sine(1000.0, 0.01)
     samples = np.stack([low + high + 0.3, low + high + 0.3 + inside]).astype(np.float32)
     # what rounding to float32 leaves: (6e-8)^2
     np.testing.assert_allclose(band_power(samples, RATE_HZ, BAND_HZ), [0.0, 0.01**2 / 2], rtol=1e-4, atol=1e-12)
 
 
-def test_band_has_its_edges() -> None:
+def test_band_includes_its_edges() -> None:
     for frequency_hz, power in ((80.0, 0.0), (100.0, 0.5), (6000.0, 0.5), (6020.0, 0.0)):
         samples = sine(frequency_hz, 1.0)[None].astype(np.float32)
         assert band_power(samples, RATE_HZ, BAND_HZ)[0] == pytest.approx(power, abs=1e-6)
@@ -73,34 +73,34 @@ def test_bins_lie_in_the_band_and_never_at_zero(band_hz: tuple[float, float], ex
     assert band_bins(800, RATE_HZ, band_hz) == expected  # of 20 Hz
 
 
-def test_rule_is_active_at_the_very_threshold() -> None:
+def test_frame_at_the_threshold_is_active() -> None:
     assert THRESHOLD == 0.1  # the paper's
     below = np.nextafter(0.25, 0.0)
     assert is_active(np.array([below, 0.25, 1.0]), 1.0, 0.25).tolist() == [False, True, True]
     assert is_active(np.array([2.0, 2.0]), np.array([20.0, 20.1])).tolist() == [True, False]
 
 
-def test_nothing_is_never_active() -> None:
+def test_frame_without_power_is_never_active() -> None:
     assert is_active(np.zeros(2), 0.0).tolist() == [False, False]
     assert exact_mask(np.zeros(3)).tolist() == [False] * 3
     assert exact_mask(np.zeros(0)).tolist() == []
 
 
-def test_exact_mask_refers_to_the_events_own_maximum() -> None:
+def test_exact_rule_refers_to_the_maximum_of_the_event() -> None:
     power = np.array([0.05, 0.5, 0.3, 0.019, 0.02, 0.2, 0.01])
     assert exact_mask(power, 0.04).tolist() == [True, True, True, False, True, True, False]
     assert exact_mask(power).tolist() == [True, True, True, False, False, True, False]
     assert exact_mask(1e-6 * power).tolist() == exact_mask(power).tolist()
 
 
-def test_runs_are_half_open() -> None:
+def test_runs_are_half_open_intervals() -> None:
     assert runs(np.array([True, True, False, True, False, False, True])) == [(0, 2), (3, 4), (6, 7)]
     assert runs(np.array([False, True, False])) == [(1, 2)]
     assert runs(np.zeros(3, dtype=np.bool_)) == runs(np.zeros(0, dtype=np.bool_)) == []
 
 
 @given(mask=arrays.arrays(np.bool_, st.integers(0, 40)))
-def test_runs_are_the_mask(mask: BoolArray) -> None:
+def test_runs_cover_exactly_the_active_frames(mask: BoolArray) -> None:
     again = np.zeros_like(mask)
     for start, stop in runs(mask):
         assert not again[max(0, start - 1) : stop].any()  # apart, and in order
@@ -119,7 +119,7 @@ def test_click_after_noise_is_sound() -> None:
     assert np.flatnonzero(causal(power)[1:]).tolist() == [79]
 
 
-def test_sound_must_stand_out_by_the_floor_factor() -> None:
+def test_sound_must_exceed_the_background_by_the_floor_factor() -> None:
     for times, sound in ((3.9, False), (4.0, True)):
         assert causal([NOISE] * 50 + [times * NOISE])[-1] == sound
 
@@ -133,7 +133,7 @@ def test_least_power_is_where_the_rule_begins_to_hold() -> None:
             assert activity.push(times * least) == active
 
 
-def test_a_primed_floor_counts_from_the_first_frame() -> None:
+def test_primed_background_applies_from_the_first_frame() -> None:
     activity = CausalActivity(ActivityParameters())
     activity.prime(NOISE)
     assert activity.floor_power == NOISE
@@ -179,7 +179,7 @@ def test_quieter_sound_after_a_pause_is_found() -> None:
     assert runs(causal(np.concatenate([noise(60), first, second, noise(20)]))[1:]) == [(59, 69)]
 
 
-def test_floor_follows_a_noise_that_stays() -> None:
+def test_background_follows_a_lasting_noise() -> None:
     power = np.concatenate([noise(60), noise(200, 100 * NOISE)])
     active = causal(power)[60:]
     window = round(3.0 / FRAME_S)

@@ -1,4 +1,4 @@
-"""Clocks that differ, told by sounds: how far, how surely, and what the fusion makes of it."""
+"""Offsets of clocks from sounds: their size, their uncertainty, and the corrections made of them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_NS = 1_700_000_000 * SECOND_NS
 
 
 def frames_of(spec: ArraySpec, sound: FloatArray, ahead_s: float = 0.0, noise: float = 1e-4) -> list[Frame]:
-    """A sound from the source as an array hears it after its travel, cut by a clock that is ahead."""
+    """A sound from the source as an array receives it after its travel, in frames of a clock that is ahead."""
     travel_s = np.linalg.norm(spec.microphones_m - SOURCE_M, axis=1) / C_M_S
     samples = delayed(sound, travel_s)
     samples += (noise * np.random.default_rng(len(spec.name)).standard_normal(samples.shape)).astype(np.float32)
@@ -48,14 +48,14 @@ def travel_s(specs: Iterable[ArraySpec]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 0.0137, -0.15, 0.31])
-def test_lateness_is_the_clocks_difference(ahead_s: float) -> None:
+def test_difference_of_arrival_is_the_offset_of_the_clocks(ahead_s: float) -> None:
     heard = {"north": frames_of(NORTH, knocks()), "south": frames_of(SOUTH, knocks(), ahead_s)}
     late = lateness_s(heard, travel_s([NORTH, SOUTH]))
     # a rise is known to the piece it falls into; three of them, interpolated, to half a piece
     assert late["south"] - late["north"] == pytest.approx(ahead_s, abs=HOP_S / 2)
 
 
-def test_travel_time_is_taken_off() -> None:
+def test_travel_time_is_subtracted() -> None:
     heard = {"north": frames_of(NORTH, knocks()), "east": frames_of(EAST, knocks())}
     true_s = travel_s([NORTH, EAST])
     assert true_s["east"] - true_s["north"] > 2 * HOP_S
@@ -64,7 +64,7 @@ def test_travel_time_is_taken_off() -> None:
     assert without["east"] == pytest.approx(true_s["east"] - true_s["north"], abs=HOP_S / 2)
 
 
-def test_a_sound_that_repeats_itself_tells_nothing() -> None:
+def test_periodic_sound_gives_no_offset() -> None:
     """Six knocks each half a second: by one of them later or earlier, five fit."""
     sound = np.zeros(round(3.0 * RATE_HZ))
     for k in range(6):
@@ -77,7 +77,7 @@ def test_a_sound_that_repeats_itself_tells_nothing() -> None:
     assert len(lateness_s(once, travel_s([NORTH, SOUTH]))) == 2
 
 
-def test_noise_tells_nothing() -> None:
+def test_noise_gives_no_offset() -> None:
     silence = np.zeros(round(2.0 * RATE_HZ))
     heard = {"north": frames_of(NORTH, silence), "south": frames_of(SOUTH, silence)}
     assert lateness_s(heard, travel_s([NORTH, SOUTH])) == {}
@@ -86,7 +86,7 @@ def test_noise_tells_nothing() -> None:
 def learned(
     ahead_s: Sequence[float], sounds: int = 12, drift: float = 0.0, wrong: Iterable[int] = (), every_s: float = 20.0
 ) -> ClockOffsets:
-    """Offsets learned from sounds that each clock of `a`, `b`, … hears so late, to 3 ms; the last one drifts."""
+    """Offsets learned from sounds that are so late at the clocks `a`, `b`, …, to 3 ms; the last one drifts."""
     names = "abcdef"[: len(ahead_s)]
     clocks = ClockOffsets({name: name for name in names}, C_M_S)
     rng = np.random.default_rng(1)
@@ -97,7 +97,7 @@ def learned(
     return clocks
 
 
-def test_offset_is_not_believed_before_some_sounds() -> None:
+def test_offset_is_unknown_before_three_sounds() -> None:
     assert learned([0.0, 0.15], sounds=LEAST_SOUNDS - 1).of("b") is None
     known = learned([0.0, 0.15], sounds=LEAST_SOUNDS).of("b")
     assert known is not None
@@ -105,7 +105,7 @@ def test_offset_is_not_believed_before_some_sounds() -> None:
 
 
 @pytest.mark.parametrize("wrong", [(), (0, 1, 5, 9)])
-def test_offset_and_its_uncertainty(wrong: tuple[int, ...]) -> None:
+def test_offset_lies_within_its_uncertainty(wrong: tuple[int, ...]) -> None:
     known = learned([0.0, 0.15], wrong=wrong).of("b")
     assert known is not None
     assert known.reference == "a"
@@ -115,13 +115,13 @@ def test_offset_and_its_uncertainty(wrong: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("drift", [100e-6, -100e-6])
 def test_drift_is_followed(drift: float) -> None:
-    """After 31 sounds in ten minutes a clock of 100 ppm is 62 ms off; without the line's slope half of it is missed."""
+    """A clock of 100 ppm is 62 ms off after 31 sounds in ten minutes; without the line's slope half of it is missed."""
     known = learned([0.0, 0.0], sounds=32, drift=drift).of("b")
     assert known is not None
     assert known.offset_s == pytest.approx(drift * 31 * 20, abs=0.006)
 
 
-def test_a_clock_that_is_set_is_believed_after_some_sounds() -> None:
+def test_offset_of_a_clock_that_was_set_is_known_after_three_sounds() -> None:
     clocks = learned([0.0, 0.15])
     for k in range(LEAST_SOUNDS):
         clocks.learn(START_NS + (300 + k) * SECOND_NS, {"a": 0.0, "b": 0.01})
@@ -130,14 +130,14 @@ def test_a_clock_that_is_set_is_believed_after_some_sounds() -> None:
     assert known.offset_s == pytest.approx(0.01, abs=0.003)
 
 
-def test_the_middle_clock_is_the_reference() -> None:
+def test_median_clock_is_the_reference() -> None:
     clocks = learned([0.15, 0.0, 0.003])
     known = {name: clocks.of(name) for name in "abc"}
     assert all(offset is not None and offset.reference == "c" for offset in known.values())
     assert [clocks.frames_ahead(name) for name in "abc"] == [3, 0, 0]
 
 
-def test_clocks_meet_over_a_third() -> None:
+def test_clocks_without_common_sounds_are_compared_over_a_third() -> None:
     clocks = ClockOffsets({name: name for name in "abc"}, C_M_S)
     for k in range(8):
         late = {"a": 0.0, "b": 0.1} if k % 2 else {"b": 0.1, "c": -0.1}
@@ -148,10 +148,10 @@ def test_clocks_meet_over_a_third() -> None:
     assert c.offset_s - b.offset_s == pytest.approx(-0.2, abs=0.002)
 
 
-def test_arrays_of_one_node_tell_nothing_of_its_clock() -> None:
+def test_arrays_of_one_node_give_no_offset() -> None:
     clocks = ClockOffsets({"north": "pc", "south": "pc", "east": "other"}, C_M_S)
-    assert not clocks.tell_apart(["north", "south"])
-    assert clocks.tell_apart(["north", "east"])
+    assert not clocks.differ(["north", "south"])
+    assert clocks.differ(["north", "east"])
     for k in range(LEAST_SOUNDS):
         clocks.learn(START_NS + k * SECOND_NS, {"north": 0.0, "south": 0.004, "east": 0.102})
     assert clocks.of("north") == clocks.of("south")
@@ -160,7 +160,7 @@ def test_arrays_of_one_node_tell_nothing_of_its_clock() -> None:
     assert known.offset_s == pytest.approx(0.1, abs=1e-3)
 
 
-def test_corrections_do_not_come_and_go() -> None:
+def test_correction_has_a_hysteresis() -> None:
     """30 ms are left alone; 40 ms are a frame; and a frame stays one until an offset is 35 ms off it."""
     clocks = ClockOffsets({"a": "a", "b": "b"}, C_M_S)
     frames = []
@@ -171,7 +171,7 @@ def test_corrections_do_not_come_and_go() -> None:
     assert clocks.rest_s("a") == 0.0
 
 
-def test_state_goes_through_json() -> None:
+def test_state_survives_json() -> None:
     clocks = learned([0.0, 0.15])
     again = ClockOffsets({"a": "a", "b": "b"}, C_M_S)
     again.restore(json.loads(json.dumps(clocks.state())))

@@ -1,4 +1,4 @@
-"""Live and settled: what is told at once, what stays, and for how long an array is waited for."""
+"""Early and final results: what is reported at once, what is final, and how long an array is awaited."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
-from test_fusion import HANG_OVER, START, Arrivals, frame, fusion_of, mark, node, now_ns
+from test_fusion import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, state_of
 
-from livessl.core.stream import final_pass
 from livessl.core.stream.array_health import LOST_NS
-from livessl.core.stream.final_pass import HOLD_NS, FinalResults, TwoPassFusion
+from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")
 SECOND = 20
 
 
-def settling_of(settled: int | None = None) -> TwoPassFusion:
-    return TwoPassFusion(fusion_of(), NAMES, settled)
+def two_passes(settled: int | None = None, *, hold_ns: int = HOLD_NS, hold_bytes: int = HOLD_BYTES) -> TwoPassFusion:
+    return TwoPassFusion(state_of(), NAMES, settled, hold_ns=hold_ns, hold_bytes=hold_bytes)
 
 
 def play(into: TwoPassFusion, arrivals: Arrivals, until: int, since: int = 0) -> list[tuple[int, Event | FinalResults]]:
@@ -43,8 +43,8 @@ def both(active: range, frame_indices: range) -> Arrivals:
     return node("north", active, frame_indices) + node("south", active, frame_indices)
 
 
-def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() -> None:
-    said = play(settling_of(), both(range(10, 16), range(40)), 40)
+def test_without_delays_only_final_events_are_reported_and_at_once() -> None:
+    said = play(two_passes(), both(range(10, 16), range(40)), 40)
     assert provisional(said) == []
     ((when, output),) = said
     assert when == 16 + HANG_OVER
@@ -55,27 +55,27 @@ def test_on_time_only_settled_events_are_told_as_soon_as_live_ones_would_be() ->
     assert output.until == START + 16  # the sound's end: what follows may be the run-up of the next
 
 
-def test_what_is_settled_grows_with_silence_but_for_a_run_up() -> None:
-    into = settling_of()
+def test_silence_is_settled_except_for_a_pre_roll() -> None:
+    into = two_passes()
     assert into.settled is None
     play(into, both(range(0), range(100)), 100)
     assert into.settled == START + 100 - 8
 
 
-def test_sound_that_lasts_holds_what_it_needs() -> None:
-    into = settling_of()
+def test_sound_that_goes_on_is_not_settled() -> None:
+    into = two_passes()
     play(into, both(range(30, 90), range(60)), 60)
     assert into.settled == START + 30 - 8
 
 
-def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
-    into = settling_of()
+def test_array_that_is_away_delays_no_early_event_and_corrects_the_final_one() -> None:
+    into = two_passes()
     north, south = node("north", range(40, 46), range(200)), node("south", range(40, 46), range(30))
     said = play(into, north + south, 100)
     assert settled_events(said) == []
     (event,) = provisional(said)
     assert event.heard_by == ("north",)
-    # it comes back, and has kept what it heard
+    # it comes back, and has kept its frames
     into.greet("south", (START + 38, START + 50), now_ns(100))
     kept: Arrivals = [(101.0, m) for _, m in node("south", range(40, 46), range(35, 50)) if isinstance(m, Frame)]
     said = play(into, north + kept + [(101.0, mark("south", 100))], 110, 101)
@@ -88,9 +88,8 @@ def test_array_that_is_away_delays_nothing_and_is_waited_for() -> None:
     assert into.backfilled == {"north": 0, "south": len(kept)}
 
 
-def test_nobody_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(final_pass, "HOLD_NS", 5 * 1_000_000_000)
-    into = settling_of()
+def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:
+    into = two_passes(hold_ns=5 * 1_000_000_000)
     said = play(into, node("north", range(40, 46), range(300)) + node("south", (), range(30)), 300)
     (event,) = settled_events(said)
     assert (event.heard_by, event.late) == (("north",), False)
@@ -98,7 +97,7 @@ def test_nobody_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (event.id, event.start_ns, event.end_ns) == (told.id, told.start_ns, told.end_ns)
     # the last frame of its hang-over came at 52
     assert next(when for when, output in said if isinstance(output, FinalResults)) == 52 + 5 * SECOND + 1
-    # what the other kept of that time comes too late, and is counted
+    # the frames that the other has kept come too late, and are counted
     into.greet("south", (START + 38, START + 52), now_ns(300))
     play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
     assert into.too_late == {"north": 0, "south": 6}
@@ -108,18 +107,17 @@ def test_hold_is_longer_than_a_restart_takes() -> None:
     assert HOLD_NS > 60 * 1_000_000_000 > LOST_NS
 
 
-def test_memory_that_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_held_frames_is_bounded() -> None:
     size = frame("north", 0).samples.nbytes
-    monkeypatch.setattr(final_pass, "HOLD_BYTES", 50 * size)
-    into = settling_of()
+    into = two_passes(hold_bytes=50 * size)
     play(into, node("south", (), range(5)), 5)
     said = play(into, node("north", range(10, 400), range(5, 420)), 420, 5)
-    assert into._bytes <= 50 * size
+    assert into.held_bytes <= 50 * size
     assert len(settled_events(said)) >= 1
 
 
-def test_good_bye_is_waited_for_by_nobody() -> None:
-    into = settling_of()
+def test_array_whose_node_has_ended_is_not_awaited() -> None:
+    into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
     said = play(into, node("north", range(10, 16), range(14, 40)), 40, 15)
@@ -127,8 +125,8 @@ def test_good_bye_is_waited_for_by_nobody() -> None:
     assert event.heard_by == NAMES
 
 
-def test_when_all_have_left_everything_is_settled() -> None:
-    into = settling_of()
+def test_everything_is_settled_when_all_nodes_have_ended() -> None:
+    into = two_passes()
     play(into, both(range(10, 16), range(14)), 14)
     into.leave("south")
     into.leave("north")
@@ -136,12 +134,12 @@ def test_when_all_have_left_everything_is_settled() -> None:
     assert event.heard_by == NAMES
 
 
-def test_what_was_settled_before_is_not_told_again() -> None:
-    """A server that starts again knows up to where it has told all; what comes again of that is dropped."""
-    into = settling_of()
+def test_settled_events_are_not_reported_again_after_a_restart() -> None:
+    """A server that starts again knows up to where all results are final; frames of that time are dropped."""
+    into = two_passes()
     first = play(into, both(range(10, 16), range(30)), 30)
     (output,) = [output for _, output in first if isinstance(output, FinalResults)]
-    again = settling_of(output.until)
+    again = two_passes(output.until)
     for name in NAMES:
         again.greet(name, (START + 8, START + 31), now_ns(31))
     kept: Arrivals = [(31.0, m) for _, m in both(range(10, 16), range(30)) if isinstance(m, Frame)]
@@ -154,8 +152,8 @@ def test_what_was_settled_before_is_not_told_again() -> None:
     assert sum(again.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
 
 
-def test_clock_of_the_server_set_back_begins_anew() -> None:
-    into = settling_of()
+def test_final_pass_begins_anew_when_the_servers_clock_is_set_back() -> None:
+    into = two_passes()
     play(into, both(range(10, 16), range(100)), 100)
     hour = 3600 * SECOND
     said: list[tuple[int, Event | FinalResults]] = []
@@ -168,9 +166,9 @@ def test_clock_of_the_server_set_back_begins_anew() -> None:
     assert event.start_ns == now_ns(-hour + 10)
 
 
-def test_no_event_lies_in_the_future() -> None:
-    """A node an hour ahead is refused and told so; the other goes on."""
-    into = settling_of()
+def test_node_an_hour_ahead_is_rejected_with_a_reason() -> None:
+    """The messages of a node an hour ahead are rejected; the other node goes on."""
+    into = two_passes()
     ahead = [
         (w, replace(m, frame_index=m.frame_index + 3600 * SECOND)) for w, m in node("south", range(10, 16), range(40))
     ]
@@ -181,3 +179,26 @@ def test_no_event_lies_in_the_future() -> None:
     assert south.counters["rejected"] == len(ahead)
     assert south.reason is not None
     assert "ahead of the server's; set both by NTP" in south.reason
+
+
+def test_excluded_array_is_neither_used_nor_awaited() -> None:
+    into = two_passes()
+    into.exclude({"south"})
+    said = play(into, node("north", range(10, 16), range(40)) + node("south", range(8, 18), range(20)), 40)
+    ((when, output),) = said
+    assert isinstance(output, FinalResults)
+    assert [event.heard_by for event in output.events] == [("north",)]
+    assert when == 16 + HANG_OVER
+
+
+def test_only_active_frames_of_excluded_arrays_are_changed() -> None:
+    state = state_of()
+    active, quiet, south = frame("north", 1), frame("north", 2, active=False), frame("south", 1)
+    assert state.without_excluded(active) is active
+    state.exclude({"north"})
+    changed = state.without_excluded(active)
+    assert isinstance(changed, Frame)
+    assert not changed.active
+    assert state.without_excluded(quiet) is quiet
+    assert state.without_excluded(mark("north", 1)) == mark("north", 1)
+    assert state.without_excluded(south) is south

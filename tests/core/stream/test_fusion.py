@@ -21,8 +21,12 @@ from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
 from livessl.core.locate.estimator import Localization, PowerMaps, Sound
 from livessl.core.locate.srp_phat import SrpPhat
-from livessl.core.stream.array_health import ArrayState, ArrayStatus
-from livessl.core.stream.fusion import LET_GO_FRAMES, MOST_KEPT, Fusion, FusionParameters
+from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
+from livessl.core.stream.array_stream import ArrayStream
+from livessl.core.stream.evidence import KEPT_ARRAYS, RELEASE_FRAMES
+from livessl.core.stream.fusion import EVENTS_ONLY, Fusion, Role
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.stream.site_state import SiteState
 from livessl.core.types import (
     FRAME_NS,
     GCC,
@@ -63,7 +67,7 @@ Arrivals = list[tuple[float, Message]]
 
 
 class Scripted:
-    """An estimator that says one place and remembers what it was given."""
+    """An estimator that returns one position and remembers what it was given."""
 
     name = "scripted"
 
@@ -91,8 +95,12 @@ def located() -> SrpPhat:
     return SrpPhat([NORTH, SOUTH], GRID, C_M_S)
 
 
+def state_of(estimator: Any = None, arrays: Sequence[ArraySpec] = (NORTH, SOUTH), **parameters: Any) -> SiteState:
+    return SiteState("site", arrays, estimator or Scripted(), FusionParameters(**parameters))
+
+
 def fusion_of(estimator: Any = None, *, updates: bool = False, **parameters: Any) -> Fusion:
-    return Fusion("site", [NORTH, SOUTH], estimator or Scripted(), FusionParameters(**parameters), updates=updates)
+    return Fusion(state_of(estimator, **parameters), Role(updates=updates))
 
 
 def frame(array: str, frame_index: int, active: bool = True, power: float = 1e-2, **changes: Any) -> Frame:
@@ -114,7 +122,7 @@ def mark(array: str, frame_index: int, **changes: Any) -> Mark:
 
 
 def node(array: str, active: Collection[int], frame_indices: Iterable[int], delay: float = 0.0) -> Arrivals:
-    """What a node sends, each as its interval ends: frames while active and for a hang-over after, else marks."""
+    """The messages of a node, each as its frame index ends: frames while active and in a hang-over, else marks."""
     sent: Arrivals = []
     for frame_index in frame_indices:
         lately = any(frame_index - k in active for k in range(HANG_OVER + 1))
@@ -166,7 +174,7 @@ def status_of(fusion: Fusion, array: str, now: float) -> ArrayStatus:
 def sound_frames(
     spec: ArraySpec, first: int, count: int, rate_hz: float = RATE_HZ, *, noise: float = 0.0
 ) -> list[Frame]:
-    """A burst of noise from the source as an array hears it, in frames: real samples, power and activity."""
+    """A burst of noise from the source as an array receives it, in frames: real samples, power and activity."""
     n = round(0.05 * rate_hz)
     samples = heard(spec, SOURCE_M, burst(n * count), rate_hz)
     samples += (noise * np.random.default_rng(1).standard_normal(samples.shape)).astype(np.float32)
@@ -218,7 +226,7 @@ def test_two_arrays_locate_together(located: SrpPhat) -> None:
     assert event.contributions[0].azimuth_deg == pytest.approx(np.degrees(np.arctan2(3.31 - 4.2, 1.13 - 2.7)), abs=0.2)
 
 
-def test_arrays_need_not_agree_to_the_sample(located: SrpPhat) -> None:
+def test_clocks_may_differ_by_a_fraction_of_a_frame(located: SrpPhat) -> None:
     """An array's clock a whole frame off costs nothing: delays are formed within an array only."""
     frames = [sound_frames(spec, first, 6) for spec, first in ((NORTH, 10), (SOUTH, 11))]
     event = only_event(play(fusion_of(located), live(frames[0], 30) + live(frames[1], 30), 30))
@@ -233,21 +241,21 @@ def test_sounds_apart_are_two_events_of_one_array_each() -> None:
     assert only_event(play(fusion_of(), arrivals, 50)).heard_by == ("north", "south")
 
 
-def test_one_small_array_tells_the_direction_only() -> None:
+def test_one_small_array_gives_only_a_direction() -> None:
     spec = tetra("north", NORTH.centre_m, edge_m=0.06)
-    fusion = Fusion("site", [spec], SrpPhat([spec], GRID, C_M_S), updates=False)
+    fusion = Fusion(state_of(SrpPhat([spec], GRID, C_M_S), [spec]), EVENTS_ONLY)
     event = only_event(play(fusion, live(sound_frames(spec, 10, 6, noise=0.03), 30), 30))
     # Its lags change with distance by d^2 / (2 c R^2) = 1.6 us a metre; side lobes of 0.1 in the GCCs leave them
     # uncertain by s / sqrt(kappa) = 0.1 / 22 kHz = 5 us.
     assert event.status is Status.DIRECTION_ONLY
     assert event.reason is not None
-    assert event.reason.startswith("one array cannot tell how far away it is: ±")
+    assert event.reason.startswith("one array cannot resolve the distance: ±")
     towards, right = position_of(event) - spec.centre_m, SOURCE_M - spec.centre_m
     # the direction by 5 us of 0.06 m over sqrt(3) independent lags, 0.9 degrees; by far less in truth, at 10 dB
     assert towards @ right / np.linalg.norm(towards) / np.linalg.norm(right) > np.cos(np.radians(0.9))
 
 
-def test_wide_array_is_not_looked_from_its_centre() -> None:
+def test_distance_from_a_wide_array_is_at_least_half_its_aperture() -> None:
     """Half a centimetre from its middle, a place may be as uncertain as a quarter of the half width, not of that."""
     both = joined([NORTH, SOUTH], {"north": "rack", "south": "rack"}, "both")
 
@@ -258,7 +266,7 @@ def test_wide_array_is_not_looked_from_its_centre() -> None:
                 return replace(super().locate(sounds), position_m=place_m, covariance_m2=spread_m**2 * np.eye(3))
 
         frames = [frame("both", k, samples=np.ones((8, 20), dtype=np.float32)) for k in (10, 11)]
-        return only_event(play(Fusion("site", [both], Uncertain(), updates=False), live(frames, 30), 30)).status
+        return only_event(play(Fusion(state_of(Uncertain(), [both]), EVENTS_ONLY), live(frames, 30), 30)).status
 
     quarter_m = 0.25 * both.aperture_m / 2.0
     assert judged(0.99 * quarter_m) is Status.LOCATED
@@ -279,7 +287,7 @@ def test_arrays_of_different_rates_locate_together(located: SrpPhat) -> None:
     assert np.linalg.norm(position_of(event) - SOURCE_M) > 0.02
 
 
-def test_active_frames_are_the_exact_rules_and_gaps_part_segments() -> None:
+def test_event_uses_the_exact_rule_and_gaps_divide_segments() -> None:
     scripted = Scripted()
     powers = {10: 1e-2, 11: 1e-3, 12: 0.9e-3, 13: 5e-3, 15: 5e-3}  # the third is under a tenth; 14 never comes
     arrivals: Arrivals = [(k + 1.0, frame("north", k, power=power)) for k, power in powers.items()]
@@ -292,7 +300,7 @@ def test_active_frames_are_the_exact_rules_and_gaps_part_segments() -> None:
     assert (event.start_ns, event.end_ns) == (now_ns(10), now_ns(16))
 
 
-def test_sound_in_the_pre_roll_counts_where_the_exact_rule_says_so() -> None:
+def test_event_begins_in_the_pre_roll_where_the_exact_rule_is_met() -> None:
     """Live it was too soft to be sound, knowing only the past; it is a tenth of what then came."""
     arrivals: Arrivals = [(k + 1.0, mark("north", k)) for k in range(10)]
     arrivals += [(11.0, frame("north", k, False, 2e-3)) for k in (8, 9)]
@@ -303,12 +311,12 @@ def test_sound_in_the_pre_roll_counts_where_the_exact_rule_says_so() -> None:
     assert event.id == f"site-{(START + 10) * 50}"  # stable: it was told already in updates
 
 
-def test_too_few_arrays_are_refused() -> None:
+def test_event_of_too_few_arrays_is_refused() -> None:
     scripted = Scripted()
     arrivals = node("north", range(10, 15), range(30)) + node("south", (), range(30))
     event = only_event(play(fusion_of(scripted, min_arrays=2, updates=True), arrivals, 30))
     assert (event.status, event.estimate, event.contributions) == (Status.REFUSED, None, ())
-    assert event.reason == "heard by 1 of at least 2 arrays"
+    assert event.reason == "detected by 1 of at least 2 arrays"
     assert event.heard_by == ("north",)
     assert scripted.calls == []
 
@@ -339,7 +347,7 @@ def test_order_between_arrays_does_not_matter(data: st.DataObject, located: SrpP
     assert '"located"' in told(expected)
 
 
-def test_live_and_all_at_once_are_the_same() -> None:
+def test_result_is_the_same_live_and_all_at_once() -> None:
     active = {*range(10, 17), *range(40, 95)}
     arrivals = node("north", active, range(120)) + node("south", active, range(120))
     one, other = Scripted(), Scripted()
@@ -352,8 +360,8 @@ def test_live_and_all_at_once_are_the_same() -> None:
 
 
 @pytest.mark.parametrize("stops", [0, 5, 12, 18])
-def test_silent_array_delays_by_the_deadline_at_most(stops: int) -> None:
-    """It stops sending before, in or after a sound of the other's; a frame index later nobody waits for it."""
+def test_silent_array_delays_an_event_by_at_most_the_deadline(stops: int) -> None:
+    """It stops sending before, in or after a sound of the other array; one deadline later it is not awaited."""
     prompt = 16 + HANG_OVER
     arrivals = node("north", range(10, 16), range(60)) + node("south", range(10, 16), range(stops))
     ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
@@ -362,14 +370,14 @@ def test_silent_array_delays_by_the_deadline_at_most(stops: int) -> None:
     assert event.heard_by == (("north", "south") if stops > 10 else ("north",))
 
 
-def test_deadline_can_be_chosen() -> None:
+def test_delay_follows_the_chosen_deadline() -> None:
     arrivals = node("north", range(10, 16), range(60)) + node("south", (), range(12))
     for deadline_s in (0.1, 0.5, 1.0):
         ((when, _),) = events_of(play(fusion_of(deadline_s=deadline_s), arrivals, 60))
         assert when == max(22, 13 + round(deadline_s / 0.05))
 
 
-def test_late_array_is_waited_for_up_to_the_deadline() -> None:
+def test_late_array_is_awaited_up_to_the_deadline() -> None:
     for delay, heard_by in ((DEADLINE - 1, ("north", "south")), (3 * DEADLINE, ("north",))):
         arrivals = node("north", range(10, 16), range(80)) + node("south", range(10, 16), range(80), delay)
         (when, event), *_ = events_of(play(fusion_of(), arrivals, 80))
@@ -377,7 +385,7 @@ def test_late_array_is_waited_for_up_to_the_deadline() -> None:
         assert when <= 22 + DEADLINE
 
 
-def test_array_that_was_away_catches_up() -> None:
+def test_array_that_was_away_is_used_again() -> None:
     active = {*range(10, 16), *range(60, 66), *range(100, 106)}
     south = [
         (max(when, 46.0) if 5 <= message.frame_index - START < 45 else when, message)
@@ -392,14 +400,14 @@ def test_array_that_was_away_catches_up() -> None:
     assert status_of(fusion, "south", 140).counters["late"] == 6
 
 
-def test_array_that_is_always_late_delays_nobody() -> None:
+def test_array_that_is_always_late_delays_no_event() -> None:
     active = range(100, 106)
     arrivals = node("north", active, range(140)) + node("south", active, range(140), 3 * DEADLINE)
     (when, event), *_ = events_of(play(fusion_of(), arrivals, 140))
     assert (when, event.heard_by) == (106 + HANG_OVER, ("north",))
 
 
-def test_array_that_is_punctual_again_is_waited_for() -> None:
+def test_array_that_is_punctual_again_is_awaited() -> None:
     """Behind by less than the deadline, it never comes first again; but it need not."""
     active = {*range(10, 16), *range(100, 106)}
     south = node("south", active, range(140), 3 * DEADLINE)
@@ -421,7 +429,7 @@ def test_late_active_frames_are_counted() -> None:
     assert (status.state, status.reason) == (ArrayState.DEGRADED, "its frames come after their deadline")
 
 
-def test_long_sounds_are_parted_and_nothing_is_used_twice() -> None:
+def test_long_sound_is_split_and_no_frame_is_used_twice() -> None:
     active = range(10, 110)
     scripted = Scripted()
     arrivals = node("north", active, range(140)) + node("south", active, range(140))
@@ -436,7 +444,7 @@ def test_long_sounds_are_parted_and_nothing_is_used_twice() -> None:
     assert len({event.id for _, event in said}) == 3
 
 
-def test_event_ends_when_everyone_stops_sending() -> None:
+def test_event_ends_when_all_arrays_stop_sending() -> None:
     arrivals = node("north", range(10, 100), range(20)) + node("south", range(10, 100), range(20))
     ((when, event),) = events_of(play(fusion_of(), arrivals, 60))
     # heard last at 20; nothing more for a deadline and a hang-over
@@ -444,7 +452,7 @@ def test_event_ends_when_everyone_stops_sending() -> None:
     assert event.end_ns == now_ns(20)
 
 
-def test_flush_tells_what_is_open() -> None:
+def test_flush_reports_the_open_event() -> None:
     fusion = fusion_of()
     assert fusion.flush(now_ns(0)) == []
     said = play(fusion, node("north", range(10, 100), range(20)) + node("south", (), range(15)), 20)
@@ -464,7 +472,7 @@ def test_long_pause_is_skipped() -> None:
     assert [event.start_ns for _, event in events_of(said)] == [now_ns(10), now_ns(later + 10)]
 
 
-def test_servers_clock_set_back_starts_over() -> None:
+def test_fusion_starts_over_when_the_servers_clock_is_set_back() -> None:
     fusion = fusion_of(updates=True)
     hour = 20 * 3600
     said = play(fusion, node("north", range(hour + 10, hour + 100), range(hour, hour + 20)), hour + 20, start=hour)
@@ -501,13 +509,13 @@ def test_updates_come_only_while_there_is_sound() -> None:
     assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate
 
 
-def test_a_live_fusion_that_is_behind_looks_at_the_newest_window_only() -> None:
+def test_live_fusion_that_is_behind_locates_only_the_newest_window() -> None:
     arrivals = node("north", range(10, 20), range(30)) + node("south", range(10, 20), range(30))
-    site = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    site = Fusion(state_of(), Role(newest_only=True))
     said = play(site, arrivals, 16)  # in step: nothing is left out
     assert len([output for _, output in said if isinstance(output, Update)]) == 3
     assert site.updates_left_out == 0
-    behind = Fusion("site", [NORTH, SOUTH], Scripted(), updates=True, newest_only=True)
+    behind = Fusion(state_of(), Role(newest_only=True))
     told = behind.step(
         [message for when, message in sorted(arrivals, key=lambda arrival: arrival[0]) if when <= 17], now_ns(17)
     )
@@ -515,7 +523,7 @@ def test_a_live_fusion_that_is_behind_looks_at_the_newest_window_only() -> None:
     assert behind.updates_left_out == 2
 
 
-def test_offline_nobody_is_updated() -> None:
+def test_events_only_role_gives_no_updates() -> None:
     arrivals = node("north", range(10, 20), range(40))
     said = play(fusion_of(updates=False), arrivals, 40)
     assert [type(output) for _, output in said] == [Event]
@@ -548,7 +556,7 @@ def test_wrong_number_of_channels_is_rejected() -> None:
 
 
 @pytest.mark.parametrize(("off", "side"), [(72_000, "ahead of"), (-72_000, "behind")])
-def test_clock_an_hour_off_is_rejected_and_disturbs_nobody(off: int, side: str) -> None:
+def test_clock_an_hour_off_is_rejected_and_others_go_on(off: int, side: str) -> None:
     fusion = fusion_of()
     north = node("north", range(10, 16), range(40))
     astray = [
@@ -579,7 +587,7 @@ def test_frames_up_to_half_a_minute_old_are_accepted() -> None:
 def test_array_starts_then_is_healthy_then_lost() -> None:
     fusion = fusion_of()
     assert status_of(fusion, "north", 0) == ArrayStatus(
-        "north", ArrayState.STARTING, "not heard from yet", False, None, None, None, (), None, None, None,
+        "north", ArrayState.STARTING, "no message yet", False, None, None, None, (), None, None, None,
         dict.fromkeys(("frames", "marks", "late", "rejected", "lost_frames", "overflows"), 0),
     )  # fmt: skip
     play(fusion, node("north", (), range(10)), 10)
@@ -590,7 +598,7 @@ def test_array_starts_then_is_healthy_then_lost() -> None:
     assert status.counters["marks"] == 10
     assert status_of(fusion, "north", 39).state is ArrayState.HEALTHY
     status = status_of(fusion, "north", 40)  # one and a half seconds later
-    assert (status.state, status.reason) == (ArrayState.LOST, "nothing heard from it for 1.5 s")
+    assert (status.state, status.reason) == (ArrayState.LOST, "no message for 1.5 s")
     play(fusion, node("north", (), range(60, 62)), 62, start=61)
     assert status_of(fusion, "north", 62).state is ArrayState.HEALTHY
     assert status_of(fusion, "south", 62).state is ArrayState.STARTING
@@ -607,7 +615,7 @@ def test_array_is_active_while_its_frames_are() -> None:
     assert not status_of(fusion, "north", 60).active  # lost
 
 
-def test_goodbye_is_told_and_nobody_waits() -> None:
+def test_node_that_has_ended_is_lost_and_not_awaited() -> None:
     fusion = fusion_of()
     play(fusion, node("north", (), range(10)) + node("south", (), range(10)), 10)
     fusion.leave("south")
@@ -627,7 +635,7 @@ def test_goodbye_is_told_and_nobody_waits() -> None:
         ((0.0,) * 4, "all channels are dead: all-zero samples; check cable, gain and channel numbers"),
     ],
 )
-def test_dead_microphone_is_told_after_a_second(powers: tuple[float, ...], said: str) -> None:
+def test_dead_microphone_is_reported_after_a_second(powers: tuple[float, ...], said: str) -> None:
     fusion = fusion_of()
     for frame_index in range(60):
         dead = 10 <= frame_index < 50
@@ -648,7 +656,7 @@ def test_dead_microphone_is_told_after_a_second(powers: tuple[float, ...], said:
         ({"clock": ClockState.STEPPED}, "its clock has stepped"),
     ],
 )
-def test_trouble_is_told_for_ten_seconds(trouble: dict[str, Any], said: str) -> None:
+def test_fault_is_reported_for_ten_seconds(trouble: dict[str, Any], said: str) -> None:
     fusion = fusion_of()
     lasting = {name: value for name, value in trouble.items() if name != "clock"}
     for frame_index in range(240):
@@ -662,13 +670,13 @@ def test_trouble_is_told_for_ten_seconds(trouble: dict[str, Any], said: str) -> 
     assert status.counters["lost_frames"] == trouble.get("lost_frames", 0)
 
 
-def test_old_trouble_of_a_node_is_no_news() -> None:
+def test_counters_from_before_the_connection_are_no_fault() -> None:
     fusion = fusion_of()
     play(fusion, [(1.0, mark("north", 0, overflows=7, lost_frames=9))], 1)
     assert status_of(fusion, "north", 1).state is ArrayState.HEALTHY
 
 
-def test_preparing_is_the_estimators() -> None:
+def test_prepare_is_passed_to_the_estimator() -> None:
     scripted = Scripted()
     fusion_of(scripted).prepare("north", 44_100.0)
     assert scripted.prepared == [("north", 44_100.0)]
@@ -725,14 +733,14 @@ class Gauged(Scripted):
         return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.5, heard)
 
 
-MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(MOST_KEPT + 6)]
+MANY = [replace(NORTH, name=f"a{k:02d}") for k in range(KEPT_ARRAYS + 6)]
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) -> None:
-    """What comes of the others stays: they are heard, and have part in the event."""
+def test_of_many_arrays_only_those_with_strong_onsets_keep_samples(order: int) -> None:
+    """The correlations of the other arrays stay: these arrays detect the event and contribute to it."""
     gauged = Gauged()
-    fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+    fusion = Fusion(state_of(gauged, MANY), EVENTS_ONLY)
     held: dict[str, list[weakref.ref[Float32Array]]] = {spec.name: [] for spec in MANY}
     most = dict.fromkeys(held, 0)
     events: list[Output] = []
@@ -757,10 +765,10 @@ def test_of_many_arrays_only_those_that_hear_clearly_keep_samples(order: int) ->
     for name, pieces in gauged.calls[-1].items():
         assert (sum(pieces) < 20 * 20) if name in let_go else (pieces == [80 * 20]), name
         # windows and a hang-over, and what has come since the last look; else all of it with the run-up
-        assert (most[name] <= 10 + LET_GO_FRAMES + 9) if name in let_go else (most[name] >= 88), name
+        assert (most[name] <= 10 + RELEASE_FRAMES + 9) if name in let_go else (most[name] >= 88), name
 
 
-def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
+def test_released_samples_do_not_depend_on_the_order_of_arrival() -> None:
     """One by one, in another order, or all at once, as a recording's: the same pieces are left of every array."""
     loudness = np.random.default_rng(1).uniform(0.5, 1.0, (len(MANY), 90)).astype(np.float32)
     frames: list[Message] = [
@@ -776,7 +784,7 @@ def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
         [frames + quiet],
     ):
         gauged = Gauged()
-        fusion = Fusion("site", MANY, gauged, FusionParameters(), updates=False)
+        fusion = Fusion(state_of(gauged, MANY), EVENTS_ONLY)
         said = [output for step in steps for output in fusion.step(step, now_ns(step[-1].frame_index - START + 1))]
         assert sum(isinstance(output, Event) for output in said) == 1
         left.append(gauged.calls[-1])
@@ -784,8 +792,8 @@ def test_which_samples_go_does_not_depend_on_how_the_frames_came() -> None:
     assert len({sum(pieces) for pieces in left[0].values()}) > 2  # some went early, some late, some not at all
 
 
-class Ear:
-    """Stands for a front end: it remembers what it heard, and says of each frame its number."""
+class FrontEnd:
+    """A front end that remembers what was pushed, and returns for each frame its number."""
 
     sample_rate_hz = RATE_HZ
 
@@ -800,8 +808,8 @@ class Ear:
         self.heard.append(None)
 
 
-class Listening(Scripted):
-    """An estimator that hears every frame."""
+class Correlating(Scripted):
+    """An estimator with a front end for every frame."""
 
     def __init__(self, refused: str | None = None) -> None:
         super().__init__()
@@ -812,7 +820,7 @@ class Listening(Scripted):
     def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
         assert (array, sample_rate_hz) == ("north", RATE_HZ)
         self.heard.append(None)  # a new one, that has heard nothing
-        return Ear(self.heard)
+        return FrontEnd(self.heard)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         onsets = summed(sounds["north"].onsets)
@@ -826,8 +834,8 @@ def numbered(frame_index: int, active: bool) -> Frame:
     )
 
 
-def test_a_listener_hears_each_frame_of_an_event_once_and_in_order() -> None:
-    estimator = Listening()
+def test_each_frame_of_an_event_is_correlated_once_and_in_order() -> None:
+    estimator = Correlating()
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 15)) for k in range(4, 40) if k != 13]
     events = events_of(play(fusion_of(estimator, updates=True), arrivals, 60))
     before = [(k, True) for k in range(4, 12)]  # 0.4 s of pre-roll
@@ -837,8 +845,8 @@ def test_a_listener_hears_each_frame_of_an_event_once_and_in_order() -> None:
     assert estimator.sums[-1] == (sum(range(4, 13)) + 14, 10.0)  # up to the last active one
 
 
-def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
-    on_time, late = Listening(), Listening()
+def test_late_frames_are_correlated_in_their_place() -> None:
+    on_time, late = Correlating(), Correlating()
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
     events_of(play(fusion_of(on_time), arrivals, 60))
     held = [(21.0 if frame.frame_index == START + 13 else when, frame) for when, frame in arrivals]
@@ -849,35 +857,34 @@ def test_frames_that_came_late_are_listened_to_in_their_place() -> None:
     assert on_time.heard.count(None) == 1
 
 
-def test_a_twin_hears_only_what_the_other_has_not() -> None:
-    """In step, all that one hears is the other's, too; from a frame that only one has on, each hears for itself."""
+def test_two_passes_correlate_each_frame_once() -> None:
+    """Each pass uses the correlations of the other while both have the same frames, and then makes its own."""
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18)) for k in range(4, 40)]
-    alone, both = Listening(), Listening()
+    alone, both = Correlating(), Correlating()
     play(fusion_of(alone), arrivals, 60)
-    first = fusion_of(both)
-    second = first.twin()
-    for fusion in (first, second):
+    shared = state_of(both)
+    for fusion in (Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)):
         play(fusion, arrivals, 60)
     assert both.heard == alone.heard
     assert both.sums == 2 * alone.sums
 
-    partly = Listening()
-    first = fusion_of(partly)
-    second = first.twin()
+    partly = Correlating()
+    shared = state_of(partly)
+    first, second = Fusion(shared, EVENTS_ONLY), Fusion(shared, EVENTS_ONLY)
     play(first, [arrival for arrival in arrivals if arrival[1].frame_index != START + 16], 60)
     play(second, arrivals, 60)
     assert partly.sums[-1] == alone.sums[-1]
 
 
 @pytest.mark.parametrize("pause", [5, 7, 9])
-def test_a_live_fusion_listens_ahead_and_says_the_same(pause: int) -> None:
-    """A sound's run-up has been heard when it comes, where it is known to begin where the last one ended."""
+def test_correlating_ahead_changes_no_result(pause: int) -> None:
+    """A pre-roll that is known to begin at the end of the last sound has been correlated when the next one comes."""
     again = range(18 + pause, 24 + pause)
     arrivals: Arrivals = [(k + 1.0, numbered(k, 12 <= k < 18 or k in again)) for k in range(4, 50)]
     told, heard_at_once = [], []
     for newest_only in (False, True):
-        estimator = Listening()
-        fusion = Fusion("site", [NORTH, SOUTH], estimator, newest_only=newest_only, updates=False)
+        estimator = Correlating()
+        fusion = Fusion(state_of(estimator), Role(updates=False, newest_only=newest_only))
         until = [arrival for arrival in arrivals if arrival[1].frame_index < START + again.start]
         play(fusion, until, again.start)
         before = len(estimator.heard)
@@ -895,14 +902,31 @@ def test_a_live_fusion_listens_ahead_and_says_the_same(pause: int) -> None:
     assert heard_at_once[1] == {5: 1, 7: 1, 9: 10}[pause]
 
 
-def test_sound_without_end_leaves_nothing_behind() -> None:
-    fusion = fusion_of(Listening(), max_event_s=1.0)
-    play(fusion, [(k + 1.0, numbered(k, k >= 12)) for k in range(4, 200)], 200)
-    assert len(fusion._streams["north"].ear.onsets) <= len(fusion._streams["north"].frames) < 60
+def test_memory_of_a_sound_without_end_is_bounded() -> None:
+    fusion = fusion_of(Correlating(), max_event_s=1.0)
+    held: list[weakref.ref[Float32Array]] = []
+    most = 0
+    for k in range(4, 200):
+        message = numbered(k, k >= 12)
+        held.append(weakref.ref(message.samples))
+        fusion.step([message], now_ns(k + 1))
+        del message
+        held = [reference for reference in held if reference() is not None]
+        most = max(most, len(held))
+    assert 20 <= most < 60  # a second of sound, and what windows and pre-rolls reach back to
+
+
+def test_correlations_are_pruned_with_their_frames() -> None:
+    stream = ArrayStream(NORTH, ArrayHealth(4))
+    for k in range(10):
+        stream.add(numbered(k, True))
+        stream.correlations.onsets[START + k] = OnsetGCC(np.zeros((1, 1), np.float32), np.ones(1))
+    stream.prune(START + 7)
+    assert list(stream.frames) == list(stream.correlations.onsets) == [START + k for k in (7, 8, 9)]
 
 
 @pytest.mark.parametrize("refused", [None, "too unsure"])
-def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None) -> None:
+def test_refused_location_gives_no_position_and_no_track(refused: str | None) -> None:
     estimator = Scripted()
     place = estimator.locate
     estimator.locate = lambda sounds: replace(place(sounds), refused=refused)  # type: ignore[method-assign]
@@ -915,8 +939,8 @@ def test_what_the_estimator_refuses_is_no_place_and_no_track(refused: str | None
     assert any(isinstance(output, Track) for output in said) == (refused is None)
 
 
-def test_microphone_that_dies_amid_sound_is_found_too() -> None:
-    """While there is sound no mark comes; a frame's samples tell the same."""
+def test_microphone_that_dies_during_a_sound_is_reported() -> None:
+    """No mark comes during a sound, but the samples of its frames show the same."""
     fusion = fusion_of()
     samples = np.full((4, 20), 0.1, np.float32)
     samples[2] = 0.0
@@ -929,11 +953,11 @@ def test_microphone_that_dies_amid_sound_is_found_too() -> None:
     assert status.reason == "microphone [3] is dead: all-zero samples; check cable, gain and channel numbers"
 
 
-# --- who agrees
+# --- consensus and outliers
 
 
 class Voting(Scripted):
-    """An estimator that is told who is outvoted."""
+    """An estimator that finds the outliers that the test names."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -949,22 +973,23 @@ class Voting(Scripted):
 
 
 EAST = tetra("east", [3.9, 2.4, 1.9])
+THREE = (NORTH, SOUTH, EAST)
 
 
 def sound_at(fusion: Fusion, frame_index: int, arrays: Sequence[str] = ("north", "south", "east")) -> list[Output]:
-    """One short sound that these arrays hear."""
+    """One short sound that these arrays detect."""
     span = range(frame_index, frame_index + 20)
     arrivals = [message for name in arrays for message in node(name, {frame_index + 5, frame_index + 6}, span)]
     return [output for _, output in play(fusion, arrivals, frame_index + 21, frame_index)]
 
 
-def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
+def test_repeated_outlier_is_named_becomes_suspect_and_is_cleared() -> None:
     estimator = Voting()
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator, updates=True)
+    fusion = Fusion(state_of(estimator, THREE))
     estimator.outliers = {"east": 29.6}
     for turn in range(4):
         (event,) = (output for output in sound_at(fusion, 20 * turn) if isinstance(output, Event))
-        assert event.reason == "located without 'east' (30° off): outvoted by the others"
+        assert event.reason == "located without the outlier 'east' (30° off)"
         assert event.status is Status.LOCATED
         assert event.estimate is not None
         assert event.estimate.arrays == ("north", "south")
@@ -975,10 +1000,10 @@ def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
         assert (status.agreed, status.disagreed) == (0, turn + 1)
         assert status.state is (ArrayState.HEALTHY if turn < 2 else ArrayState.DEGRADED)
     assert status.reason is not None
-    assert "disagrees with the others in 4 of the last 4 sounds, by 30°: is its pose right" in status.reason
+    assert "an outlier in 4 of the last 4 events, by 30°; check its pose" in status.reason
     assert status_of(fusion, "north", 80).state is ArrayState.HEALTHY
     assert estimator.suspect[-1] == {"east"}  # the fourth event
-    assert "east" not in estimator.calls[-2]  # its windows go without who is doubted, its answer does not
+    assert "east" not in estimator.calls[-2]  # updates leave out suspect arrays, events do not
     assert "east" in estimator.calls[-1]
     estimator.outliers = {}
     for turn in range(4, 7):
@@ -990,14 +1015,14 @@ def test_who_disagrees_again_and_again_is_named_doubted_and_forgiven() -> None:
 
 
 class Choosing(Voting):
-    """An estimator that needs no more than two arrays, and asks all of these."""
+    """An estimator that needs no more than two arrays, which agree."""
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         return replace(super().locate(sounds), unneeded={"north"}, outliers={})
 
 
-def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Choosing())
+def test_array_that_is_not_needed_detects_but_neither_contributes_nor_votes() -> None:
+    fusion = Fusion(state_of(Choosing(), THREE))
     (event,) = (output for output in sound_at(fusion, 0) if isinstance(output, Event))
     assert event.heard_by == ("north", "south", "east")
     assert event.estimate is not None
@@ -1006,19 +1031,20 @@ def test_an_array_that_is_not_needed_hears_but_has_no_part_and_no_vote() -> None
     assert [status_of(fusion, name, 20).agreed for name in ("north", "south", "east")] == [0, 1, 1]
 
 
-def test_two_arrays_hold_no_vote_and_a_twin_holds_the_same() -> None:
+def test_two_arrays_have_no_vote_and_two_passes_count_a_sound_once() -> None:
     estimator = Voting()
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], estimator)
+    shared = state_of(estimator, THREE)
+    fusion = Fusion(shared)
     sound_at(fusion, 0, ("north", "south"))
     assert (status_of(fusion, "north", 20).agreed, status_of(fusion, "north", 20).disagreed) == (0, 0)
-    twin = fusion.twin()
+    final = Fusion(shared, EVENTS_ONLY)
     estimator.outliers = {"south": 12.0}
-    sound_at(twin, 20)
-    sound_at(fusion, 20)  # told before and settled after: one sound
+    sound_at(final, 20)
+    sound_at(fusion, 20)  # the other pass's result of the same sound
     assert (status_of(fusion, "south", 40).agreed, status_of(fusion, "south", 40).disagreed) == (0, 1)
 
 
-def test_a_microphone_that_hears_nothing_is_told() -> None:
+def test_microphone_that_receives_no_sound_is_reported() -> None:
     samples = np.random.default_rng(3).standard_normal((4, 800)).astype(np.float32)
     samples[2] *= 1e-3
     arrivals: Arrivals = [(k + 1.0, frame("north", k, samples=samples.copy())) for k in range(10)]
@@ -1028,7 +1054,7 @@ def test_a_microphone_that_hears_nothing_is_told() -> None:
     status = status_of(fusion, "north", 40)
     assert status.state is ArrayState.DEGRADED
     assert status.reason is not None
-    assert "microphone [3] hears nothing of what the others hear" in status.reason
+    assert "microphone [3] receives next to nothing of what the others receive" in status.reason
     again: Arrivals = [(k + 1.0, frame("north", k, samples=samples[[0, 1, 0, 1]])) for k in range(40, 44)]
     play(fusion, again, 44, 40)
     assert status_of(fusion, "north", 44).state is ArrayState.HEALTHY
@@ -1050,11 +1076,11 @@ class Duet(Scripted):
         return replace(found, others=(replace(found, position_m=OTHER_M, confidence=0.7),))
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> Any:
-        return Ear([])
+        return FrontEnd([])
 
 
-def test_each_of_two_sources_has_an_event() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), updates=True)
+def test_each_of_two_sources_gives_an_event() -> None:
+    fusion = Fusion(state_of(Duet(), THREE))
     outputs = sound_at(fusion, 0, ("north", "south"))
     one, other = (output for output in outputs if isinstance(output, Event))
     assert (one.id, one.source) == (f"site-{(START + 5) * 50}", 1)
@@ -1065,12 +1091,12 @@ def test_each_of_two_sources_has_an_event() -> None:
     assert other.estimate.confidence == 0.7
     assert other.contributions[0].azimuth_deg != one.contributions[0].azimuth_deg
     assert all(output.others == () for output in outputs if isinstance(output, Update))  # unless it is asked for
-    alone = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(sources=1))
+    alone = Fusion(state_of(Duet(), THREE, sources=1))
     assert [event.source for event in sound_at(alone, 0, ("north", "south")) if isinstance(event, Event)] == [1]
 
 
-def test_windows_tell_of_a_second_where_the_site_asks() -> None:
-    fusion = Fusion("site", [NORTH, SOUTH, EAST], Duet(), FusionParameters(live_sources=2), updates=True)
+def test_updates_hold_a_second_source_where_the_site_asks_for_it() -> None:
+    fusion = Fusion(state_of(Duet(), THREE, live_sources=2))
     outputs = sound_at(fusion, 0, ("north", "south"))
     (update,) = (output for output in outputs if isinstance(output, Update))
     (other,) = update.others

@@ -1,4 +1,4 @@
-"""From sample to message: one for every frame index, in order, and no sound lost at its beginning or its end."""
+"""Samples become messages: one for every frame index, in order, and no sound is lost at its beginning or end."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ def frames_of(messages: list[Message]) -> list[Frame]:
     return [message for message in messages if isinstance(message, Frame)]
 
 
-def test_quiet_is_a_mark_for_every_interval() -> None:
+def test_every_quiet_frame_index_gives_a_mark() -> None:
     messages = run(sound([QUIET] * 40))
     assert frame_indices(messages, Mark) == list(range(40))
     assert {message.sequence for message in messages} == {0}
     assert {message.array for message in messages} == {"north"}
 
 
-def test_sound_is_frames_with_pre_roll_and_hang_over() -> None:
+def test_sound_gives_frames_with_pre_roll_and_hang_over() -> None:
     messages = run(sound([QUIET] * 20 + [LOUD] * 5 + [QUIET] * 20))
     assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 25 + HANG_OVER))
     assert frame_indices(messages, Mark) == [*range(20), *range(25 + HANG_OVER, 45)]  # the pre-roll was marked as quiet
@@ -93,7 +93,7 @@ def test_pre_roll_is_sent_once() -> None:
     assert frame_indices(messages, Mark) == [*range(20), 26, 27, *range(34, 41)]
 
 
-def test_pause_within_the_hang_over_does_not_part() -> None:
+def test_pause_within_the_hang_over_gives_frames() -> None:
     messages = run(sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * HANG_OVER + [LOUD] * 3 + [QUIET] * 10))
     assert frame_indices(messages, Frame) == list(range(20 - PRE_ROLL, 29 + HANG_OVER))
 
@@ -114,12 +114,12 @@ def test_steady_noise_from_the_start_is_quiet() -> None:
     assert [isinstance(message, Frame) for cut in cuts for message in made.push(cut, framer)] == [True, True]
 
 
-def test_short_stream_is_told_at_its_end() -> None:
+def test_short_stream_gives_its_messages_at_its_end() -> None:
     assert frame_indices(run(sound([QUIET, QUIET, LOUD, QUIET])), Frame) == [0, 1, 2, 3]
     assert run(sound([QUIET])[:, :400]) == []
 
 
-def test_samples_are_the_devices_in_order_of_the_microphones() -> None:
+def test_samples_are_in_the_order_of_the_microphones() -> None:
     samples = sound([QUIET] * 20 + [LOUD] * 3 + [QUIET] * 10)
     for frame in frames_of(run(samples)):
         first = (frame.frame_index - START) * N
@@ -136,7 +136,7 @@ def in_band(samples: Float32Array) -> FloatArray:
     return np.asarray((np.fft.irfft(spectrum, samples.shape[1], axis=1) ** 2).mean(axis=1))
 
 
-def test_mark_tells_powers_noise_and_the_device() -> None:
+def test_mark_holds_powers_noise_and_the_state_of_the_device() -> None:
     samples = sound([QUIET] * 30)
     samples[0] *= 2.0
     samples[1] = 0.0
@@ -153,7 +153,7 @@ def test_mark_tells_powers_noise_and_the_device() -> None:
     assert (mark.overflows, mark.lost_frames, mark.clock) == (0, 0, ClockState.SETTLING)
 
 
-def test_mark_counts_what_the_device_lost() -> None:
+def test_mark_counts_the_losses_of_the_device() -> None:
     framer, made = Framer(RATE_HZ), segmenter()
     samples = sound([QUIET] * 100)
     messages: list[Message] = []
@@ -177,7 +177,7 @@ def test_wrong_number_of_channels_is_refused() -> None:
     loud=st.lists(st.booleans(), min_size=WARM_UP_FRAMES, max_size=50),
     sizes=st.lists(st.integers(1, 3000), max_size=20),
 )
-def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes: list[int]) -> None:
+def test_messages_do_not_depend_on_the_size_of_blocks(loud: list[bool], sizes: list[int]) -> None:
     samples = sound([LOUD if one else QUIET for one in loud])
     whole, parted = run(samples, [samples.shape[1]]), run(samples, sizes)
     assert [(type(m), m.frame_index, m.sequence, m.power) for m in parted] == [
@@ -194,7 +194,7 @@ def test_messages_do_not_care_how_samples_came_in_blocks(loud: list[bool], sizes
     assert len(frame_indices(whole, Mark)) + len(set(sent) - set(frame_indices(whole, Mark))) == len(loud)
 
 
-def test_what_was_not_sent_is_remembered_for_a_while() -> None:
+def test_recent_frames_can_be_requested() -> None:
     framer, made = Framer(RATE_HZ), segmenter()
     samples = sound([QUIET] * 20 + [LOUD] * 2 + [QUIET] * (round(RECENT_S / FRAME_S) + 30))
     messages: list[Message] = []
@@ -202,7 +202,7 @@ def test_what_was_not_sent_is_remembered_for_a_while() -> None:
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
         if k == 30:
-            asked = frames_of(made.ask(START + 12, START + 21))
+            asked = frames_of(made.backfill(START + 12, START + 21))
             assert [frame.frame_index - START for frame in asked] == list(range(12, 22))
             assert {(frame.sequence, frame.active) for frame in asked} == {(0, False)}
             sent = {frame.frame_index: frame for frame in frames_of(messages)}
@@ -212,19 +212,19 @@ def test_what_was_not_sent_is_remembered_for_a_while() -> None:
                 )
                 assert frame.frame_index not in sent or sent[frame.frame_index].power == frame.power
     last = messages[-1].frame_index
-    assert made.ask(START, START + 40) == []
-    remembered = frames_of(made.ask(START, last))
+    assert made.backfill(START, START + 40) == []
+    remembered = frames_of(made.backfill(START, last))
     assert len(remembered) == round(RECENT_S / FRAME_S)
     assert remembered[-1].frame_index == last
     # asking takes nothing from what is sent by itself
     assert [frame.sequence for frame in frames_of(messages)] == list(range(1, len(frames_of(messages)) + 1))
 
 
-def test_nothing_is_remembered_over_a_gap() -> None:
+def test_frames_before_a_gap_cannot_be_requested() -> None:
     framer, made = Framer(RATE_HZ), segmenter()
     samples = sound([QUIET] * 40)
     for k in (*range(15), *range(18, 40)):
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         for cut in framer.push(block):
             made.push(cut, framer)
-    assert [frame.frame_index - START for frame in frames_of(made.ask(START, START + 25))] == list(range(18, 26))
+    assert [frame.frame_index - START for frame in frames_of(made.backfill(START, START + 25))] == list(range(18, 26))

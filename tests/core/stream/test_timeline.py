@@ -25,7 +25,7 @@ def ideal_ns(index: int, rate_hz: float = RATE_HZ, start_ns: int = START_NS, ppm
 
 
 def numbered(first: int, count: int) -> Float32Array:
-    """Two channels that tell which sample is which: float32 counts exactly to 16 million."""
+    """Two channels that number the samples; float32 counts exactly to 16 million."""
     index = np.arange(first, first + count, dtype=np.float32)
     return np.stack([index, -index])
 
@@ -74,7 +74,7 @@ def test_ideal_stamps_give_exact_boundaries(rate_hz: float, offset: int) -> None
     offset=st.integers(0, 3000),
     rate_hz=st.sampled_from([16000.0, 22050.0, 44100.0, 48000.0]),
 )
-def test_frames_do_not_care_how_samples_came_in_blocks(sizes: list[int], offset: int, rate_hz: float) -> None:
+def test_frames_do_not_depend_on_the_size_of_blocks(sizes: list[int], offset: int, rate_hz: float) -> None:
     start_ns = 1_700_000_000 * 10**9 + round(offset * 1e9 / rate_hz)
 
     def push(counts: list[int]) -> list[Cut]:
@@ -115,7 +115,7 @@ def test_one_sided_jitter_leaves_frames_whole() -> None:
     assert np.abs(np.array(late_ns) - JITTER_NS / 2).max() < 5 * 170_000
 
 
-def test_one_stamp_is_noise_but_many_are_not() -> None:
+def test_single_stamps_move_the_line_little() -> None:
     rng = np.random.default_rng(2)
     timeline = Timeline(RATE_HZ)
     errors_ns = []
@@ -168,7 +168,7 @@ def test_index_is_the_inverse_of_time() -> None:
         assert timeline.index_at(timeline.time_ns(index)) == pytest.approx(index, abs=1e-4)
 
 
-def test_time_before_the_first_stamp_is_not_known() -> None:
+def test_time_before_the_first_stamp_is_an_error() -> None:
     timeline = Timeline(RATE_HZ)
     assert not timeline.started
     with pytest.raises(RuntimeError, match="before the first stamp"):
@@ -188,7 +188,7 @@ def test_clock_is_locked_after_two_seconds() -> None:
 
 
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS, STEP_NS + 2 * JITTER_NS])
-def test_step_of_the_clock_is_seen_after_some_blocks(step_ns: int) -> None:
+def test_step_of_the_clock_is_found_after_three_blocks(step_ns: int) -> None:
     framer = Framer(RATE_HZ)
     before = cut_all(framer, stream(200))
     assert state_of(framer) is ClockState.LOCKED

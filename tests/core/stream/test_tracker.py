@@ -40,7 +40,7 @@ def walk(start_m: ArrayLike, steps: int = 60, seed: int = 1, velocity_m_s: Float
     return np.asarray(np.asarray(start_m) + time_s * velocity_m_s + scatter)
 
 
-def test_walker_is_one_track() -> None:
+def test_walking_source_is_one_track() -> None:
     steps = follow(Tracker(), [walk([1.0, 5.0, 1.5])])
     assert all(len(step) == 1 for step in steps)
     assert {step[0].id for step in steps} == {1}
@@ -48,7 +48,7 @@ def test_walker_is_one_track() -> None:
     assert [step[0].time_ns for step in steps] == [at_ns(k * STEP_S) for k in range(60)]
 
 
-def test_velocity_points_where_the_walker_goes() -> None:
+def test_velocity_points_in_the_direction_of_the_walk() -> None:
     for velocity_m_s in (WALK_M_S, -WALK_M_S):
         (track,) = follow(Tracker(), [walk([3.0, 5.0, 1.5], velocity_m_s=velocity_m_s)])[-1]
         # Of the steady state: with sd 0.11 m (0.1 and the least 0.05 m) each 0.1 s and 1 m/s^2 of acceleration the
@@ -100,7 +100,7 @@ def test_jump_beyond_the_gate_is_another_source() -> None:
         assert track.state is (TrackState.UPDATE if known else TrackState.NEW)
 
 
-def test_unsure_estimate_may_lie_further_off() -> None:
+def test_uncertain_estimate_may_be_further_away() -> None:
     tracker = Tracker()
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
     (track,) = tracker.step(at_ns(3.0), [estimate(3.0, [3.0, 1.0, 1.0], std_m=1.0)])
@@ -109,7 +109,7 @@ def test_unsure_estimate_may_lie_further_off() -> None:
     assert abs(track.position_m[0] - 1.0) < 0.1
 
 
-def test_unsure_direction_moves_the_track_little_along_it() -> None:
+def test_estimate_moves_a_track_little_along_its_uncertain_axis() -> None:
     tracker = Tracker()
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
     covariance = np.diag([4.0, 0.0025, 0.0025])
@@ -133,7 +133,7 @@ def test_track_ends_after_silence() -> None:
     assert (again.id, again.state) == (2, TrackState.NEW)
 
 
-def test_pause_widens_what_is_believed() -> None:
+def test_covariance_grows_in_a_pause() -> None:
     tracker = Tracker()
     before = follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])[-1][0]
     pause_s = 2.0
@@ -169,7 +169,7 @@ def test_two_estimates_of_one_moment_are_never_one_track() -> None:
         assert [track.id for track in tracker.step(at_ns(time_s), both)] == ids
 
 
-def test_walkers_that_cross_keep_their_names() -> None:
+def test_sources_that_cross_keep_their_tracks() -> None:
     """At a right angle, 0.2 m apart at the nearest, two scatters of an estimate: mostly each goes on as it went.
 
     By a coin's toss a run in two would swap; 16 of 20 or more happen so in 0.6 % of all series.
@@ -190,7 +190,7 @@ def test_walkers_that_cross_keep_their_names() -> None:
     assert kept >= 16
 
 
-def test_together_counts_not_who_comes_first() -> None:
+def test_estimates_are_assigned_together_whatever_their_order() -> None:
     """One estimate lies between two tracks and is nearer to the first, which the other estimate can only be of."""
     tracker = Tracker()
     follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1)), np.tile([2.0, 1.0, 1.0], (30, 1))])
@@ -198,7 +198,7 @@ def test_together_counts_not_who_comes_first() -> None:
     assert [track.id for track in told] == [2, 1]
 
 
-def test_a_stray_estimate_is_told_of_nobody() -> None:
+def test_single_stray_estimate_gives_no_track() -> None:
     tracker = Tracker()
     for k in range(60):
         time_s = k * STEP_S
@@ -214,8 +214,8 @@ def direction(time_s: float, position_m: ArrayLike) -> Estimate:
 
 
 @pytest.mark.parametrize("back_m", [0.6, 1.6])
-def test_who_turns_round_in_a_pause_keeps_the_name(back_m: float) -> None:
-    """After 0.7 s the prediction has gone 0.7 m on: 0.6 m back it is 1.3 m off, and who walked is found again."""
+def test_source_that_turns_round_in_a_pause_keeps_its_track(back_m: float) -> None:
+    """The prediction has moved on by 0.7 m after 0.7 s; 0.6 m back it is 1.3 m off, and the source is found again."""
     tracker = Tracker()
     path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
     follow(tracker, [path])
@@ -228,7 +228,7 @@ def test_who_turns_round_in_a_pause_keeps_the_name(back_m: float) -> None:
         assert np.linalg.norm(second.position_m - turned_m) < 0.2  # and not where it was going
 
 
-def test_a_direction_makes_no_source_of_a_stray_estimate() -> None:
+def test_direction_does_not_confirm_a_stray_estimate() -> None:
     for after, ids in ((direction(3.1, [3.2, 1.1, 1.0]), {1}), (estimate(3.1, [3.2, 1.0, 1.0]), {1, 2})):
         tracker = Tracker()
         follow(tracker, [np.tile([1.0, 1.0, 1.0], (30, 1))])
@@ -237,14 +237,14 @@ def test_a_direction_makes_no_source_of_a_stray_estimate() -> None:
         assert {track.id for track in told + again} == ids
 
 
-def test_a_direction_alone_is_followed_where_nobody_is() -> None:
+def test_direction_alone_starts_a_track_where_there_is_none() -> None:
     tracker = Tracker()
     (first,) = tracker.step(at_ns(0.0), [direction(0.0, [3.0, 1.0, 1.0])])
     (second,) = tracker.step(at_ns(0.1), [direction(0.1, [3.5, 1.0, 1.0])])
     assert (first.id, second.id) == (1, 1)
 
 
-def test_a_doubtful_estimate_moves_the_track_less() -> None:
+def test_estimate_of_low_confidence_moves_the_track_less() -> None:
     moved_m = []
     for confidence in (0.8, 0.9, 1.0):
         tracker = Tracker()
@@ -258,7 +258,7 @@ def test_a_doubtful_estimate_moves_the_track_less() -> None:
     assert float(track.position_m[0]) - 1.0 == pytest.approx(moved_m[2])
 
 
-def test_who_turned_while_only_a_direction_was_told_keeps_the_name() -> None:
+def test_source_that_turned_while_only_directions_came_keeps_its_track() -> None:
     """Then, too, it is the last place that counts, and not where it would be along the line of sight."""
     tracker = Tracker()
     path = np.array([1.0, 5.0, 1.5]) + STEP_S * np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""The load is what it says, and a tiny run of it, through real processes and sockets, tells what happened."""
+"""The load has its stated form, and a tiny run through real processes and sockets gives a complete report."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def test_generated_site_is_valid_and_every_array_is_apart(arrays: int) -> None:
     assert apart.min() > load.EDGE_M
 
 
-def test_updates_due_are_those_that_the_fusion_makes() -> None:
-    """The load's frames, straight into a fusion: an update for each window that is due, an event for each sound."""
+def test_updates_due_are_the_updates_of_the_fusion() -> None:
+    """The load's frames give an update for each window that is due and an event for each sound, without a server."""
     site = parse_site(load.site_text(2, 0.2, "tcp://127.0.0.1:5570", 8000))
     scene = load._scene(site, rt60_s=0.0)
     sounds = [load._Sound(spec, scene, seed) for seed, spec in enumerate(site.specs)]
@@ -74,27 +74,27 @@ def test_updates_due_are_those_that_the_fusion_makes() -> None:
         assert math.dist(event.estimate.position_m, source.position_m) < 0.05  # refined below the grid
 
 
-def test_what_was_dropped_is_no_success() -> None:
+def test_a_run_with_losses_is_no_success() -> None:
     assert GOOD.nothing_dropped
     for fault in ({"frames_dropped": 1}, {"lost": {"late": 1}}, {"updates": 83.5}):
         assert not replace(GOOD, **fault).nothing_dropped
 
 
-def test_table_tells_all() -> None:
-    told = live.table(GOOD)
-    assert "84.0 of 84 a client" in told
-    assert "nothing was dropped" in told
+def test_table_shows_losses() -> None:
+    shown = live.table(GOOD)
+    assert "84.0 of 84 per client" in shown
+    assert "nothing was dropped" in shown
     bad = live.table(replace(GOOD, lost={"late": 7}))
     assert "7 late" in bad
-    assert "more than the machine carries" in bad
+    assert "more than the machine can carry" in bad
 
 
 @pytest.mark.processes
-def test_a_tiny_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tiny_run_reports_every_number(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["bench", "--live", "--arrays", "2", "--clients", "2", "--watchers", "1", "--seconds", "3"]
     assert main([*arguments, "--spacing", "0.2", "--rt60", "0", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["demand"] == {
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["demand"] == {
         "arrays": 2,
         "clients": 2,
         "seconds": 3.0,
@@ -103,32 +103,34 @@ def test_a_tiny_run(capsys: pytest.CaptureFixture[str]) -> None:
         "rt60_s": 0.0,
         "spin": False,
     }
-    assert told["frames_received"] == told["frames_sent"] > 100
-    assert told["frames_dropped"] == 0
-    assert told["updates_due"] >= 20
-    assert told["updates"] > 0
-    assert told["events"] >= 1
-    assert told["pictures"] > 1
-    assert 0 < told["latency_ms"]["p50"] <= told["latency_ms"]["p95"] <= told["latency_ms"]["max"]
-    assert set(told["stages_ms"]) == {"load", "sent", "received", "located", "delivered"}
-    assert told["cpu_percent"] > 0
-    assert min(told["rss_mb"]) > 10
+    assert shown["frames_received"] == shown["frames_sent"] > 100
+    assert shown["frames_dropped"] == 0
+    assert shown["updates_due"] >= 20
+    assert shown["updates"] > 0
+    assert shown["events"] >= 1
+    assert shown["pictures"] > 1
+    assert 0 < shown["latency_ms"]["p50"] <= shown["latency_ms"]["p95"] <= shown["latency_ms"]["max"]
+    assert set(shown["stages_ms"]) == {"load", "sent", "received", "located", "delivered"}
+    assert shown["cpu_percent"] > 0
+    assert min(shown["rss_mb"]) > 10
 
 
-def test_a_server_that_does_not_come_up_is_told() -> None:
+def test_a_server_that_does_not_start_is_an_error() -> None:
     with pytest.raises(NotStartedError, match="did not start"):
         live.measure(DEMAND, SystemClock(), start=lambda _: subprocess.Popen([sys.executable, "-c", ""]))
 
 
-def test_kernels_are_measured_without_live(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_without_live_measures_the_kernels(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     report = kernels.KernelReport(
         "compiled", 0.25, (kernels.Timing("map, 2 arrays", 1.5, 2.5, 1.4, 1.2, 2.1, ratio=1.9),)
     )
     monkeypatch.setattr(kernels, "measure", lambda clock, progress: report)
     assert main(["bench"]) == 0
-    told = capsys.readouterr().out
-    assert "a bare look-up takes 0.25 ns" in told
+    shown = capsys.readouterr().out
+    assert "a bare look-up takes 0.25 ns" in shown
     row = ["map,", "2", "arrays", "1.500", "2.500", "1.200", "2.100", "1.90"]
-    assert row in [line.split() for line in told.splitlines()]
+    assert row in [line.split() for line in shown.splitlines()]
     assert main(["bench", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["timings"][0]["ratio"] == 1.9

@@ -1,4 +1,4 @@
-"""A campaign of seconds: dry rooms, a coarse grid, our own sounds."""
+"""A campaign that takes seconds: dry rooms, a coarse grid, synthesised sounds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import soundfile
 
-from livessl.lab.evaluate.campaign import Job, read_clips
+from livessl.lab.evaluate.job import Job, read_clips
 from livessl.lab.evaluate.paper import Settings
 from livessl.simulation.scene import synthesised_sounds
 

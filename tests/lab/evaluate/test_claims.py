@@ -1,15 +1,15 @@
-"""Medians, their intervals, and what follows from them for the paper's claims."""
+"""Medians, their intervals, and the verdicts on the paper's claims."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from livessl.lab.evaluate.claims import Verdict, claims, judged
-from livessl.lab.evaluate.figures import sigma_theta_deg
+from livessl.lab.evaluate.claims import claims
+from livessl.lab.evaluate.markdown import Block, Heading, Table, as_markdown
 from livessl.lab.evaluate.paper import RT60S_S
-from livessl.lab.evaluate.report import Block, Heading, Table, as_html, as_markdown
 from livessl.lab.evaluate.statistics import Interval, Results, summary
+from livessl.lab.evaluate.verdict import Verdict, judged
 
 CLASSES = ("door", "keys", "phone", "speech")
 
@@ -41,18 +41,18 @@ def by_name(**campaigns: Results) -> dict[str, tuple[Verdict, Interval | None]]:
     return {claim.name: (claim.verdict, claim.ours) for claim in claims(known)}
 
 
-def test_every_number_of_the_paper_is_asked_for() -> None:
+def test_every_number_of_the_paper_is_among_the_claims() -> None:
     text = " ".join(f"{claim.name} {claim.paper}" for claim in claims({}))
     for number in ("0.73 m", "0.64 m", "0.87 m", "0.8 s", "0.2 s", "0.4 s", "0.1 m", "0.6 s", "0.4 to 0.5 m", "0.44 m"):
         assert number in text
     for words in ("joint", "9.16", "0.13", "averaging", "cepstral", "2 m is worse", "±0.12", "±0.2 m", "±0.05"):
         assert words in text
-    only_theory = [claim.name for claim in claims({}) if claim.verdict is not Verdict.CANNOT_BE_TOLD]
-    assert only_theory == ["kd", "coherence"]  # what was not run cannot be told
+    only_theory = [claim.name for claim in claims({}) if claim.verdict is not Verdict.UNDECIDED]
+    assert only_theory == ["kd", "coherence"]  # without results nothing else is decided
     assert len({claim.name for claim in claims({})}) == len(claims({}))
 
 
-def test_results_like_the_papers_reproduce_it_and_others_do_not() -> None:
+def test_results_like_the_papers_reproduce_its_claims_and_others_do_not() -> None:
     good = by_name(
         one_array=results({"small": 0.73, "large": 0.64}, methods=METHODS),
         diversity=results(
@@ -84,9 +84,9 @@ def test_results_like_the_papers_reproduce_it_and_others_do_not() -> None:
     assert good["cepstral by 0.1 m at most, small"][0] is Verdict.REPRODUCED
 
 
-def test_too_few_positions_tell_nothing() -> None:
+def test_too_few_positions_decide_nothing() -> None:
     few = by_name(one_array=results({"small": 0.73, "large": 0.64}, positions=10, methods=METHODS))
-    assert few["anechoic, small"][0] is Verdict.CANNOT_BE_TOLD
+    assert few["anechoic, small"][0] is Verdict.UNDECIDED
     assert few["anechoic, small"][1] is not None
 
 
@@ -95,13 +95,13 @@ def test_too_few_positions_tell_nothing() -> None:
     [
         (Interval(0.5, 0.4, 0.6), Verdict.REPRODUCED),
         (Interval(0.5, 0.0, 1.0), Verdict.REPRODUCED),
-        (Interval(0.9, 0.8, 1.1), Verdict.CANNOT_BE_TOLD),
+        (Interval(0.9, 0.8, 1.1), Verdict.UNDECIDED),
         (Interval(1.5, 1.1, 1.6), Verdict.NOT_REPRODUCED),
         (Interval(-0.5, -0.6, -0.1), Verdict.NOT_REPRODUCED),
-        (Interval(0.5, -0.1, 1.1), Verdict.CANNOT_BE_TOLD),
+        (Interval(0.5, -0.1, 1.1), Verdict.UNDECIDED),
     ],
 )
-def test_an_interval_decides(interval: Interval, verdict: Verdict) -> None:
+def test_verdict_follows_from_the_interval(interval: Interval, verdict: Verdict) -> None:
     assert judged(interval, (0.0, 1.0)) is verdict
 
 
@@ -150,17 +150,6 @@ def test_summary_has_every_class_and_the_tails() -> None:
     assert every["over_1_m"] < 0.05
 
 
-def test_angular_error_is_that_of_the_formula() -> None:
-    theta_deg = np.array([0.0, 30.0, 60.0, 80.0])
-    assert sigma_theta_deg(theta_deg, 0.5, 44100.0) == pytest.approx([0.257, 0.298, 0.519, 1.61], rel=0.01)
-    assert sigma_theta_deg(theta_deg, 3.0, 44100.0) == pytest.approx([0.043, 0.050, 0.086, 0.250], rel=0.02)
-    assert np.isnan(sigma_theta_deg(np.array([80.0]), 0.1, 44100.0)).all()
-
-
-def test_the_report_escapes_what_markup_would_take() -> None:
+def test_markdown_escapes_bars_in_tables() -> None:
     blocks: list[Block] = [Heading(1, "a < b"), Table(("one",), [["|rho| < 1"]]), ("item",)]
-    assert "\\|rho\\| < 1" in as_markdown(blocks)
-    page = as_html("t", blocks)
-    assert "a &lt; b" in page
-    assert "|rho| &lt; 1" in page
-    assert "http" not in page
+    assert as_markdown(blocks) == "# a < b\n\n| one |\n| --- |\n| \\|rho\\| < 1 |\n\n- item\n"

@@ -1,4 +1,4 @@
-"""The localizer's campaign, in seconds: what is compared with what, and what its numbers mean."""
+"""The localizer's campaign, shortened to seconds: its comparisons and the meaning of its numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import pytest
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
 from livessl.cli.evaluate import add_arguments, evaluate
 from livessl.core.geometry import speed_of_sound_m_s
-from livessl.lab.evaluate.campaign import Job, compute, read_clips, run_campaign
+from livessl.lab.evaluate.campaign import compute, run_campaign
+from livessl.lab.evaluate.job import Job, read_clips
 from livessl.lab.evaluate.localizer import METHODS, LocalizerSettings, development_fit
-from livessl.lab.evaluate.localizer_report import area_under_roc, read_columns, summary, write_localizer_report
+from livessl.lab.evaluate.localizer_report import read_columns, summary, write_localizer_report
 from livessl.lab.evaluate.scenarios import ARRAYS, ROOM_C, ROOMS, SCENARIOS, Case
+from livessl.lab.evaluate.statistics import area_under_roc
 
 RT60S_S = (0.2,)
 SNRS_DB = (float("inf"), 20.0)
@@ -32,7 +34,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "out"
 
 
-def test_every_event_is_located_by_both_and_ours_is_near(finished: Path) -> None:
+def test_both_methods_locate_every_event_and_onset_is_near(finished: Path) -> None:
     columns = read_columns(finished / "results.parquet")
     assert len(columns["position"]) == 2 * len(CLASSES) * len(RT60S_S) * len(SNRS_DB) * len(METHODS)
     assert {name.rstrip("0123456789")[-3:] + name[-1] for name in columns["clip"]} == {"lam2", "eys2"}  # the test half
@@ -40,7 +42,7 @@ def test_every_event_is_located_by_both_and_ours_is_near(finished: Path) -> None
     assert np.median(columns["error_m"][ours]) < 0.05  # dry: below half of any grid
     found = np.stack([columns[f"found_{axis}_m"] - columns[f"{axis}_m"] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), columns["error_m"], atol=1e-4)
-    assert np.isnan(columns["confidence"][~ours]).all()  # the standard knows none
+    assert np.isnan(columns["confidence"][~ours]).all()  # the standard gives no confidence
     assert ((columns["confidence"][ours] >= 0.0) & (columns["confidence"][ours] <= 1.0)).all()
     assert columns["located"][~ours].all()
 
@@ -57,7 +59,7 @@ def test_the_halves_share_no_clip(tmp_path: Path) -> None:
     assert not clips["development"] & clips["test"]
 
 
-def test_report_says_what_is_better_on_the_same_events(finished: Path) -> None:
+def test_report_compares_methods_on_the_same_events(finished: Path) -> None:
     written = write_localizer_report(finished)
     assert all(path.stat().st_size for path in written)
     text = (finished / "report.md").read_text(encoding="utf-8")
@@ -80,7 +82,7 @@ def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "out"
 
 
-def test_every_case_hears_the_same_events_whatever_else_is_run(spoiled: Path, finished: Path) -> None:
+def test_a_case_has_the_same_events_whatever_other_cases_are_run(spoiled: Path, finished: Path) -> None:
     columns = read_columns(spoiled / "results.parquet")
     cases = {case.name for name, scenario in SCENARIOS.items() if name != ROOMS for case in scenario.cases}
     assert set(columns["case"]) == cases
@@ -91,7 +93,7 @@ def test_every_case_hears_the_same_events_whatever_else_is_run(spoiled: Path, fi
     assert (columns["error_m"][columns["case"] == "3 m apart"][:4] != alone["error_m"][:4]).all()
 
 
-def test_faults_spoil_and_more_arrays_help(spoiled: Path) -> None:
+def test_faults_increase_the_error(spoiled: Path) -> None:
     columns = read_columns(spoiled / "results.parquet")
     ours = columns["method"] == "onset"
 
@@ -102,11 +104,11 @@ def test_faults_spoil_and_more_arrays_help(spoiled: Path) -> None:
     assert median_m("2 cm off") > 2.0 * median_m("two arrays")
     assert median_m("10 degrees too warm") > median_m("two arrays")
     one = ours & (columns["case"] == "one array")
-    assert not columns["located"][one].any()  # it cannot tell how far
+    assert not columns["located"][one].any()  # one array does not determine the distance
     assert np.median(columns["bearing_deg"][one]) < 2.0
 
 
-def test_report_has_every_scenario_with_its_first_case_as_the_measure(spoiled: Path) -> None:
+def test_report_relates_every_scenario_to_its_first_case(spoiled: Path) -> None:
     write_localizer_report(spoiled)
     text = (spoiled / "report.md").read_text(encoding="utf-8")
     for name, scenario in SCENARIOS.items():
@@ -123,7 +125,7 @@ def test_report_has_every_scenario_with_its_first_case_as_the_measure(spoiled: P
     assert all(row["located"] == 0.0 and np.isnan(row["median_m"]) and row["lost"] == 1.0 for row in one)
 
 
-def test_what_is_believed_is_off_by_as_much_as_the_case_says() -> None:
+def test_believed_poses_are_off_by_the_amount_of_the_case() -> None:
     case = Case("x", "abc", moved_m=0.3, turned_deg=20.0, of_one=True)
     believed = case.believed(1, np.random.default_rng(0))
     for spec in believed:
@@ -136,7 +138,7 @@ def test_what_is_believed_is_off_by_as_much_as_the_case_says() -> None:
         assert shift_m == pytest.approx(0.3 if off else 0.0, abs=1e-9)
         assert np.degrees(np.arccos(min(1.0, cosine))) == pytest.approx(20.0 if off else 0.0, abs=1e-3)
     left = Case("y", "abc", of_one=True, without_it=True)
-    assert [left.listening(number) for number in range(4)] == ["bc", "ac", "ab", "bc"]
+    assert [left.used(number) for number in range(4)] == ["bc", "ac", "ab", "bc"]
     warm = Case("z", "ab", warmer_c=10.0)
     assert warm.c_m_s / 343.0 == pytest.approx(speed_of_sound_m_s(ROOM_C + 10.0) / speed_of_sound_m_s(ROOM_C), abs=1e-4)
 
@@ -149,7 +151,7 @@ def test_area_under_roc_is_the_share_of_pairs_in_order() -> None:
     assert np.isnan(area_under_roc(score, np.ones(60, dtype=bool)))
 
 
-def test_fit_finds_the_odds_that_made_the_events() -> None:
+def test_fit_recovers_the_odds_that_made_the_events() -> None:
     rng = np.random.default_rng(1)
     margin, standing = rng.uniform(0.0, 0.8, 40000), rng.uniform(0.0, 8.0, 40000)
     odds = -3.0 + 2.0 * margin + 1.0 * standing
@@ -169,7 +171,7 @@ def test_fit_finds_the_odds_that_made_the_events() -> None:
         (["--snr", "nan"], "got 'nan'"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(tmp_path: Path, option: list[str], said: str) -> None:
+def test_wrong_options_are_refused(tmp_path: Path, option: list[str], said: str) -> None:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     asked = ["localizer", "--events", str(write_sounds(tmp_path)), "--out", str(tmp_path / "out"), *option]

@@ -1,4 +1,4 @@
-"""Sessions through the whole fusion, in seconds: dry rooms, our own sounds."""
+"""Sessions through the whole fusion, shortened to seconds: dry rooms, synthesised sounds."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import soundfile
 
 from evaluate.small_campaign import CLASSES, RATE_HZ, write_sounds
 from livessl.cli.evaluate import add_arguments, evaluate
-from livessl.lab.evaluate.campaign import Job, read_clips, run_campaign
+from livessl.lab.evaluate.campaign import run_campaign
+from livessl.lab.evaluate.job import Job, read_clips
+from livessl.lab.evaluate.moments import APART_M
 from livessl.lab.evaluate.scenarios import SESSIONS
-from livessl.lab.evaluate.sessions import APART_M, BEFORE_S, SessionPosition, SessionSettings
+from livessl.lab.evaluate.sessions import BEFORE_S, SessionPosition, SessionSettings
 from livessl.lab.evaluate.sessions_report import summary
 from livessl.simulation.scene import synthesised_sounds
 
@@ -41,7 +43,7 @@ def summed(out: Path, scenario: str) -> dict[tuple[str, str], dict[str, float]]:
     return {(row["case"], row["method"]): row for row in rows}
 
 
-def test_each_sound_is_one_event_where_it_was_made_whatever_the_clocks(tmp_path: Path) -> None:
+def test_each_sound_is_one_event_near_its_source_whatever_the_clocks(tmp_path: Path) -> None:
     out = finished(tmp_path, "clocks")
     found = summed(out, "clocks")
     right = found["clocks agree", "onset"]
@@ -60,7 +62,7 @@ def test_each_sound_is_one_event_where_it_was_made_whatever_the_clocks(tmp_path:
     assert found["100 ppm fast", "onset"]["grown"] == pytest.approx(1.0, abs=0.5)
 
 
-def test_pairs_are_apart_together_and_found_alone(tmp_path: Path) -> None:
+def test_pairs_keep_their_distance_and_single_sounds_are_found(tmp_path: Path) -> None:
     out = finished(tmp_path, "two-sources")
     found = summed(out, "two-sources")
     assert found["alone", "onset"]["all_found"] == 1.0
@@ -74,7 +76,7 @@ def test_pairs_are_apart_together_and_found_alone(tmp_path: Path) -> None:
     ]
 
 
-def test_a_talker_is_tracked_by_the_command_itself(tmp_path: Path) -> None:
+def test_command_tracks_a_walking_talker(tmp_path: Path) -> None:
     import argparse
 
     parser = argparse.ArgumentParser()
@@ -97,16 +99,16 @@ def test_a_talker_is_tracked_by_the_command_itself(tmp_path: Path) -> None:
     assert len({(row["x_m"], row["y_m"]) for row in truths if row["case"] == "stands"}) == 1
 
 
-def test_sessions_are_the_same_twice_and_begin_alike_in_every_case(tmp_path: Path) -> None:
+def test_sessions_are_reproducible_and_events_belong_to_their_moment(tmp_path: Path) -> None:
     clips = read_clips(sounds(tmp_path), CLASSES, RATE_HZ)
     settings = SessionSettings(1, "two-sources", (0.0,), (30.0,), seed=3)
     first, again = (SessionPosition(settings, clips).rows(4) for _ in range(2))
-    assert str(first) == str(again)  # as text: what is not a number equals itself there
+    assert str(first) == str(again)  # as text, because NaN does not equal itself
     events = [row for row in first if row["kind"] == "event"]
     starts_s = {row["moment"]: row["time_s"] for row in first if row["kind"] == "truth"}
     assert all(abs(row["time_s"] - starts_s[row["moment"]]) < 2.0 + BEFORE_S for row in events)
 
 
-def test_what_cannot_be_is_refused_with_its_cure(tmp_path: Path) -> None:
+def test_a_walk_without_speech_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected speech among them, got door_slam, dropped_keys"):
         SessionPosition(SessionSettings(1, "walking", (0.0,), (30.0,)), read_clips(sounds(tmp_path), CLASSES, RATE_HZ))

@@ -1,4 +1,4 @@
-"""OSPA and the measures of tracks, on truths and findings made for the purpose."""
+"""OSPA and the measures of tracks, on made-up truths and estimates."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def shifted(places_m: FloatArray, along_x_m: float) -> FloatArray:
     return np.asarray(places_m + np.array([along_x_m, 0.0, 0.0]))
 
 
-def test_ospa_counts_errors_up_to_the_cut_off_and_what_is_missing_or_too_much_as_the_cut_off() -> None:
+def test_ospa_counts_errors_up_to_the_cut_off_and_unmatched_elements_as_the_cut_off() -> None:
     assert ospa_m(NONE_M, NONE_M) == 0.0
-    assert ospa_m(TWO_M, TWO_M[::-1]) == 0.0  # whoever is told first
+    assert ospa_m(TWO_M, TWO_M[::-1]) == 0.0  # the order does not matter
     assert ospa_m(TWO_M, shifted(TWO_M, 0.2)) == pytest.approx(0.2)
     assert ospa_m(ONE_M, shifted(ONE_M, 7.0)) == 1.0
     assert ospa_m(TWO_M, shifted(ONE_M, 0.2)) == pytest.approx((0.2 + 1.0) / 2.0)
@@ -29,13 +29,13 @@ def test_ospa_counts_errors_up_to_the_cut_off_and_what_is_missing_or_too_much_as
     assert ospa_m(ONE_M, NONE_M) == ospa_m(NONE_M, ONE_M) == 1.0
 
 
-def test_each_thing_found_is_for_one_source_at_most() -> None:
+def test_each_estimate_is_assigned_to_one_source_at_most() -> None:
     np.testing.assert_allclose(assigned(TWO_M, shifted(ONE_M, 0.2)), [0.2, np.inf])
     between_m = np.array([[1.6, 2.0, 1.5], [0.5, 2.0, 1.5]])  # the first is nearer to both; the sum decides
     np.testing.assert_allclose(assigned(TWO_M, between_m), [0.5, 2.4], atol=1e-12)
 
 
-def test_a_track_that_stays_with_the_talker() -> None:
+def test_a_track_that_stays_with_the_talker_is_perfect() -> None:
     found = score(TIMES_S, WALK_M, {4: (TIMES_S, shifted(WALK_M, 0.3))})
     assert found.rmse_m == pytest.approx(0.3)
     assert (found.detected, found.ids, found.swaps, found.breaks, found.false_per_s, found.latency_s) == (
@@ -49,7 +49,7 @@ def test_a_track_that_stays_with_the_talker() -> None:
     assert found.ospa_m == pytest.approx(0.3)
 
 
-def test_states_are_joined_by_lines_but_not_over_long_silences() -> None:
+def test_states_are_interpolated_but_not_over_long_gaps() -> None:
     sparse = slice(0, None, 8)  # 0.4 s apart
     known = score(TIMES_S, WALK_M, {1: (TIMES_S[sparse], WALK_M[sparse])})
     assert known.rmse_m == pytest.approx(0.0, abs=1e-9)
@@ -59,7 +59,7 @@ def test_states_are_joined_by_lines_but_not_over_long_silences() -> None:
     assert torn.breaks == 3
 
 
-def test_a_second_track_that_takes_over_late_and_a_false_one() -> None:
+def test_a_late_takeover_and_a_false_track_are_counted() -> None:
     tracks = {
         1: (TIMES_S[10:20], WALK_M[10:20]),
         2: (TIMES_S[20:], WALK_M[20:]),
@@ -73,7 +73,7 @@ def test_a_second_track_that_takes_over_late_and_a_false_one() -> None:
     assert found.ospa_m == pytest.approx((10 * 1.0 + 10 * 0.0 + 20 * 0.5) / 40)
 
 
-def test_without_any_track_nothing_was_found() -> None:
+def test_without_tracks_nothing_is_detected() -> None:
     found = score(TIMES_S, WALK_M, {})
     assert (found.detected, found.ids, found.ospa_m) == (0.0, 0, 1.0)
     assert np.isnan(found.rmse_m)

@@ -1,4 +1,4 @@
-"""One position, and the parts it is made of, against sums and rooms worked out another way."""
+"""One position and its parts, against sums and rooms that are computed in another way."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from livessl.core.correlate.spectra import whole_segment
 from livessl.core.geometry import Grid
 from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
-from livessl.lab.evaluate.campaign import read_clips
+from livessl.lab.evaluate.job import read_clips
 from livessl.lab.evaluate.maps import PairMatrices, PairTables, reach_samples
 from livessl.lab.evaluate.paper import BAND_HZ, C_M_S, EXPERIMENTS, Settings, pair, tetrahedron_in_cube
 from livessl.lab.evaluate.unit import Position, active_segment, recorded, t30_s
@@ -30,13 +30,13 @@ def array(edge_m: float) -> ArraySpec:
 
 
 def noise(seed: int = 0) -> Float32Array:
-    """Channels that share something, with no delay."""
+    """Four channels with a common part, without delay."""
     rng = np.random.default_rng(seed)
     return (rng.standard_normal((4, 6000)) + rng.standard_normal(6000)).astype(np.float32)
 
 
 def summed_directly(spec: ArraySpec, samples: Float32Array, *, band_limit: bool) -> FloatArray:
-    """The map as it is defined: Re sum over the bins kept of each pair's phase, turned to each node's delay."""
+    """The map by definition: Re sum over the kept bins of each pair's phase, turned by each grid point's delay."""
     pairs = microphone_pairs(4)
     reach = reach_samples(spec.aperture_m, RATE_HZ, C_M_S)
     spectra = whole_segment(samples, RATE_HZ, reach)
@@ -57,7 +57,7 @@ def summed_directly(spec: ArraySpec, samples: Float32Array, *, band_limit: bool)
 
 
 @pytest.mark.parametrize(("edge_m", "budget"), [(0.5, 0.02), (3.0, 0.10)])
-def test_matrices_give_the_sum_that_they_stand_for(edge_m: float, budget: float) -> None:
+def test_matrices_give_the_sum_of_the_definition(edge_m: float, budget: float) -> None:
     # Cut-offs are smoothed over 1/(20 ms) = 50 Hz: on this 1 m grid they are around 1600 Hz (0.5 m) and 270 Hz (3 m),
     # of which that is 3 % and 20 %. The bins in doubt count half: 2 % and 10 %.
     spec, samples = array(edge_m), noise()
@@ -71,7 +71,7 @@ def test_matrices_give_the_sum_that_they_stand_for(edge_m: float, budget: float)
         found[band_limit] = matrices.power(spec, pairs, lags)[:, 0]
         wanted = summed_directly(spec, samples, band_limit=band_limit)
         assert np.linalg.norm(found[band_limit] - wanted) < budget * np.linalg.norm(wanted)
-    assert np.linalg.norm(found[True] - found[False]) > 0.1 * np.linalg.norm(found[False])  # the limit does something
+    assert np.linalg.norm(found[True] - found[False]) > 0.1 * np.linalg.norm(found[False])  # the limit has an effect
     # tables look the nearest eighth of a sample up: 8 degrees at 6 kHz
     tables = PairTables(GRID, RATE_HZ, C_M_S, band_limit=False).power(spec, pairs, lags)[:, 0]
     assert np.linalg.norm(tables - found[False]) < 0.05 * np.linalg.norm(found[False])
@@ -88,12 +88,12 @@ def test_a_position_is_one_row_per_event_condition_and_method(tmp_path: Path) ->
         assert row["error_m"] == pytest.approx(np.linalg.norm(found - truth))
         assert row["error_m"] >= abs(row["radial_m"]) - 1e-9
         assert abs(row["azimuth_deg"]) <= 180.0
-        assert np.abs((found - 0.5) % 1.0).min() < 1e-9  # a node of the 1 m grid
+        assert np.abs((found - 0.5) % 1.0).min() < 1e-9  # a point of the 1 m grid
     assert position.rows(0) == rows
     assert position.rows(1)[0]["x_m"] != rows[0]["x_m"]
 
 
-def test_dry_and_small_it_finds_the_direction(tmp_path: Path) -> None:
+def test_a_small_array_in_a_dry_room_finds_the_direction(tmp_path: Path) -> None:
     job = small_job(tmp_path)
     position = job.unit()
     rows = [row for number in range(8) for row in position.rows(number)]
@@ -109,7 +109,7 @@ def test_sampling_faster_changes_hardly_anything(tmp_path: Path) -> None:
         position = Position(settings, read_clips(write_sounds(tmp_path), CLASSES, rate_hz))
         rows = [row for number in range(6) for row in position.rows(number) if row["method"] == "srp-phat"]
         found.append(np.array([[row[f"found_{axis}_m"] for axis in "xyz"] for row in rows]))
-    # the same nodes, but for places between two where rounding to another frame index of 50 ms decides
+    # the same grid points, except between two of them, where rounding to frames of 50 ms decides
     assert (found[0] == found[1]).all(axis=1).mean() > 0.8
     assert len(np.unique(found[0], axis=0)) > 3
 
@@ -134,7 +134,7 @@ KEY = np.random.SeedSequence(5, spawn_key=(3, 1))
 
 
 def noise_of(wet: Float32Array, snr_db: float, key: tuple[int, int] = (1, 0)) -> tuple[FloatArray, FloatArray]:
-    """What a recording holds besides the sound, (K, n), and the sound as it holds it: the least-squares share."""
+    """The noise of a recording, (K, n), and its sound, (K, n), separated by least squares."""
     samples = recorded(wet, snr_db, KEY, key).astype(np.float64)
     sound = wet.astype(np.float64)
     sound *= (samples * sound).sum() / (sound**2).sum()
@@ -160,7 +160,7 @@ def test_noise_is_added_at_the_ratio_stated(snr_db: float) -> None:
     assert halves[0].mean() / halves[1].mean() == pytest.approx(1.0, abs=0.1)
 
 
-def test_noise_is_the_keys_own() -> None:
+def test_noise_depends_on_the_key() -> None:
     first, _ = noise_of(noise(), 10.0)
     again, _ = noise_of(noise(), 10.0)
     other, _ = noise_of(noise(), 10.0, (2, 0))
@@ -171,7 +171,7 @@ def test_noise_is_the_keys_own() -> None:
     assert np.abs(without).max() < 0.51 / 32768
 
 
-def test_noise_moves_what_is_found(tmp_path: Path) -> None:
+def test_strong_noise_destroys_the_estimate(tmp_path: Path) -> None:
     clips = small_job(tmp_path).clips
     errors = []
     for snr_db in (None, 40.0, -20.0):
@@ -179,8 +179,8 @@ def test_noise_moves_what_is_found(tmp_path: Path) -> None:
         rows = [row for number in range(4) for row in position.rows(number)]
         errors.append([row["error_m"] for row in rows if (row["system"], row["method"]) == ("small", "srp-phat")])
     quiet, soft, loud = (np.array(each) for each in errors)
-    assert (soft == quiet).mean() >= 0.75  # of eight: the same nodes, but for a close call
-    # 20 dB of noise above the sound leave nothing of it: uniform in 8 x 10 x 4 m, the median distance is metres
+    assert (soft == quiet).mean() >= 0.75  # of eight: the same grid points, with at most two close calls
+    # with noise 20 dB above the sound the estimate is random: uniform in 8 x 10 x 4 m, the median distance is metres
     assert np.median(loud) > 2.0
     assert np.median(quiet) < 2.0
 

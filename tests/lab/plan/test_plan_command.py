@@ -1,4 +1,4 @@
-"""`livessl plan`: what it prints, what it writes, what it warns of and what it refuses."""
+"""`livessl plan`: its text, its files, its warnings and its errors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_json_is_one_object_that_agrees_with_itself(tmp_path: Path, capsys: pyte
     assert np.median(error_m) == pytest.approx(plan["predicted_error"]["p50_m"], abs=1e-5)
     for array in plan["arrays"].values():
         assert np.array(array["map_error_m"]).shape == error_m.shape
-        assert (np.array(array["map_error_m"]) >= error_m - 1e-5).all(), "two know more than one"
+        assert (np.array(array["map_error_m"]) >= error_m - 1e-5).all(), "two arrays are at least as good as one"
         assert len(array["pairs"]) == 6
         assert array["predicted_error"]["median_radial_m"] > 5 * array["predicted_error"]["median_tangential_m"]
 
@@ -55,12 +55,12 @@ def test_paper_at_half_a_metre(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert plan["arrays"]["north"]["diffuse_correlation"] == pytest.approx(0.013, abs=5e-4)
 
 
-def test_map_is_upright(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_map_has_x_as_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = object_of(tmp_path, capsys, CORNER)
     row, column = np.unravel_index(np.argmin(plan["arrays"]["south"]["map_error_m"]), np.shape(plan["map"]["error_m"]))
     best = [plan["map"]["x_m"][column], plan["map"]["y_m"][row]]
     assert np.linalg.norm(np.array(best) - [2.3, 1.9]) < 1.0
-    assert np.linalg.norm(np.array(best) - [1.9, 2.3]) > 0.3 or best[0] > best[1], "x are columns"
+    assert np.linalg.norm(np.array(best) - [1.9, 2.3]) > 0.3 or best[0] > best[1], "columns are x"
 
 
 def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,7 +69,7 @@ def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: py
     for advice in plan["advice"]:
         name = advice["array"]
         assert advice["kind"] == "move"
-        assert advice["text"].startswith(f"move {name} ")
+        assert advice["text"].startswith(f"move array {name!r} by ")
         assert advice["median_after_m"] < 0.95 * advice["median_before_m"]
         assert advice["median_before_m"] == pytest.approx(plan["predicted_error"]["p50_m"], rel=1e-9)
         moved = {
@@ -82,10 +82,12 @@ def test_advice_keeps_its_promise_for_the_site_itself(tmp_path: Path, capsys: py
         np.testing.assert_allclose(there["arrays"][name]["centre_m"], advice["position_m"], rtol=0, atol=1e-6)
 
 
-def test_one_array_is_told_where_a_second_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_site_with_one_array_gets_the_position_of_a_second(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     one: Changes = {**ROOM, "arrays.south": ..., "nodes": ...}
     [added] = [advice for advice in object_of(tmp_path, capsys, one)["advice"] if advice["kind"] == "add"]
-    assert added["text"].startswith("add an array like north, ")
+    assert added["text"].startswith("add an array like 'north', shifted by ")
     assert added["median_after_m"] < 0.5 * added["median_before_m"]
     position_m = [float(x) for x in np.add([1.9, 1.3, 1.4], added["offset_m"])]
     two = {**ROOM, "nodes": ..., "arrays.south.position_m": position_m}
@@ -97,20 +99,20 @@ def test_one_array_is_told_where_a_second_goes(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("offset_m", "text"),
     [
-        ((1.2, 0.0), "move south 1.2 m east: median predicted error 0.31 → 0.18 m"),
-        ((-0.5, 2.0), "move south 0.5 m west and 2.0 m north: median predicted error 0.31 → 0.18 m"),
-        ((0.0, -1.0), "move south 1.0 m south: median predicted error 0.31 → 0.18 m"),
+        ((1.2, 0.0), "move array 'south' by +1.2 m in x: median predicted error 0.31 → 0.18 m"),
+        ((-0.5, 2.0), "move array 'south' by -0.5 m in x and +2.0 m in y: median predicted error 0.31 → 0.18 m"),
+        ((0.0, -1.0), "move array 'south' by -1.0 m in y: median predicted error 0.31 → 0.18 m"),
     ],
 )
-def test_moves_in_words(offset_m: tuple[float, float], text: str) -> None:
+def test_text_of_a_move(offset_m: tuple[float, float], text: str) -> None:
     assert move_text(Move("south", offset_m, 0.31, 0.18)) == text
-    assert addition_text(Move("south", offset_m, 0.31, 0.18)).endswith(text.removeprefix("move south"))
+    assert addition_text(Move("south", offset_m, 0.31, 0.18)).endswith(text.removeprefix("move array 'south' by"))
 
 
 def test_text_is_readable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(planned(tmp_path, CORNER)) == 0
     said = capsys.readouterr().out
-    for part in ("critical distance 1.39 m", "north", "south", "all ", "advice", "m north", "predicted error"):
+    for part in ("critical distance 1.39 m", "north", "south", "all ", "advice", "m in y", "predicted error"):
         assert part in said
     assert "nan" not in said
 
@@ -226,7 +228,7 @@ def test_a_good_site_has_no_warning() -> None:
     assert warnings(make_plan(site_of(FINE), 0.5)) == []
 
 
-def test_flat_arrays_under_the_ceiling_are_fine() -> None:
+def test_flat_arrays_under_the_ceiling_cause_no_warning() -> None:
     under = {**FLAT, "position_m": [2.0, 2.5, 2.4]}
     site = site_of(
         {**FINE, "arrays.north": under, "arrays.south": ..., "nodes": ..., "grid.bounds_m": [[0, 4], [0, 5], [0, 2.4]]}
@@ -234,7 +236,7 @@ def test_flat_arrays_under_the_ceiling_are_fine() -> None:
     assert not any("one plane" in warning for warning in warnings(make_plan(site, 0.5)))
 
 
-def test_rate_that_no_node_tells_is_said_to_be_assumed() -> None:
+def test_sample_rate_without_a_node_is_reported_as_assumed() -> None:
     plan = as_json(make_plan(site_of({"nodes": ...}), 0.5))
     assert plan["arrays"]["north"]["sample_rate_hz"] == 44100
     assert plan["arrays"]["north"]["sample_rate_known"] is False

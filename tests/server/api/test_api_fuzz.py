@@ -1,4 +1,4 @@
-"""The API under requests that nobody would think of: what it answers is what its own description says, never a 500.
+"""The API under random requests: every answer is as the OpenAPI description says, and none is a 500.
 
 A small part of `schemathesis run`; docs/security.md has the whole command.
 """
@@ -20,8 +20,8 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.site.tokens import add_token
 from small_site import running_server, scene_recordings, site_of
 
-TOO_STRICT = [positive_data_acceptance]
-"""It does not know that a text is a time, nor that a volume has no picture."""
+TOO_STRICT = {"/api/v1/events": [positive_data_acceptance], "/api/v1/map": [positive_data_acceptance]}
+"""Checks left out by path: this one does not know which cursors exist, nor that a volume has no picture."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def headers(token: tuple[str, Path]) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def api(token: tuple[str, Path], headers: dict[str, str]) -> Iterator[Any]:
-    """What a server that has heard something says of itself."""
+    """The OpenAPI description of a server that has located something."""
     with running_server(site_of({"server.http.tokens": "tokens.yaml"}, token[1])) as server:
         send_session(
             site_of(), server.endpoint, scene_recordings(0), UnpacedClock(), SystemClock(), "run", lambda: False
@@ -55,12 +55,12 @@ def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:
         @settings(max_examples=15, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
         @given(case=operation.as_strategy())
         def answers_as_described(case: Any) -> None:
-            case.call_and_validate(headers=headers, excluded_checks=TOO_STRICT)
+            case.call_and_validate(headers=headers, excluded_checks=TOO_STRICT.get(case.operation.path, []))
 
         answers_as_described()
 
 
-def test_a_body_that_is_no_text_is_refused_as_described(api: Any, headers: dict[str, str]) -> None:
+def test_binary_body_is_refused_as_described(api: Any, headers: dict[str, str]) -> None:
     path = "/api/v1/arrays/{name}/enabled"
     answer = httpx.put(
         api.location.replace("/api/v1/openapi.json", path.format(name="north")),

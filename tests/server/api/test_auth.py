@@ -1,4 +1,4 @@
-"""The gate before the HTTP face: every route with every role, the WebSocket included, and what is too much."""
+"""The gate in front of the HTTP application: every route and WebSocket with every role, and limits of requests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
 from livessl.server.app import REFRESH_S, Server
 from livessl.server.http import MAX_HEAD_BYTES
 from livessl.site.tokens import Role, add_token, revoke_token
-from small_site import running_server, site_of, wait_until, write_site
+from small_site import HANG_S, running_server, site_of, wait_until, write_site
 
 TOKENED = {"server.http.tokens": "tokens.yaml"}
 ROLES: list[Role | None] = [None, *Role]
@@ -44,29 +44,29 @@ class Secured:
         return {} if role is None else {"Authorization": f"Bearer {self.tokens[role]}"}
 
     def live(self, path: str = "live", **more: Any) -> Any:
-        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=5, **more)
+        return connect(f"ws{self.server.url.removeprefix('http')}/api/v1/{path}", open_timeout=HANG_S, **more)
 
     def routes(self) -> set[str]:
-        """All that there is, from the server's own description, with examples for what is in braces."""
+        """Every path of the OpenAPI description, with examples in place of its parameters."""
         described = self.ask("/api/v1/openapi.json", Role.VIEWER).json()
         return {path.format(event_id="small-0", name="north") for path in described["paths"]}
 
 
 def listen(live: ClientConnection) -> None:
-    """Until the server closes it."""
+    """Receive messages until the server closes the WebSocket."""
     while True:
-        live.recv(timeout=5)
+        live.recv(timeout=HANG_S)
 
 
 def raw(url: str, data: bytes, until: bytes | None = None) -> bytes:
-    """What the server answers to bytes, until it hangs up or has said something."""
-    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=5) as connection:
+    """Send bytes; return the answer up to a text in it or to the end of the connection."""
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=HANG_S) as connection:
         answer = b""
         try:
             connection.sendall(data)
             while not (until and until in answer) and (part := connection.recv(65536)):
                 answer += part
-        except ConnectionError:  # it hung up before we had said everything
+        except ConnectionError:  # the server closed the connection before it had read everything
             pass
         return answer
 
@@ -99,15 +99,15 @@ def test_every_route_is_for_its_roles(secured: Secured, role: Role | None) -> No
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "TRACE", "INVENTED"])
-def test_whoever_changes_must_be_an_operator(secured: Secured, role: Role | None, method: str) -> None:
-    """Who may ask is told that nothing can be changed there, who may not is told so before."""
+def test_other_methods_need_an_operator(secured: Secured, role: Role | None, method: str) -> None:
+    """The role is checked first: only operators learn that the method does not exist."""
     expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 405, Role.ADMIN: 405}[role]
     assert secured.ask("/api/v1/site", role, method).status_code == expected
     assert secured.ask("/api/v1/health", role, method).status_code == expected
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_whoever_switches_an_array_must_be_an_operator(secured: Secured, role: Role | None) -> None:
+def test_disabling_an_array_needs_an_operator(secured: Secured, role: Role | None) -> None:
     expected = {None: 401, Role.VIEWER: 403, Role.OPERATOR: 200, Role.ADMIN: 200}[role]
     for enabled in (False, True):
         answer = secured.ask("/api/v1/arrays/north/enabled", role, "PUT", json={"enabled": enabled})
@@ -116,8 +116,8 @@ def test_whoever_switches_an_array_must_be_an_operator(secured: Secured, role: R
         assert arrays[0]["enabled"] is (enabled or expected != 200)
 
 
-def test_tokens_are_made_and_revoked_while_the_server_runs(tmp_path: Path) -> None:
-    """And a WebSocket that a revoked token has opened is closed, with the reason; the others stay."""
+def test_new_and_revoked_tokens_take_effect_without_a_restart(tmp_path: Path) -> None:
+    """A WebSocket that was opened with a revoked token is closed with a reason; the others stay open."""
     path = tmp_path / "tokens.yaml"
     tokens = {Role.VIEWER: add_token(path, "wall", "viewer"), Role.ADMIN: add_token(path, "boss", "admin")}
     with running_server(site_of(TOKENED, tmp_path)) as server:
@@ -132,9 +132,9 @@ def test_tokens_are_made_and_revoked_while_the_server_runs(tmp_path: Path) -> No
             with pytest.raises(ConnectionClosed) as caught:
                 listen(wall)
             assert caught.value.rcvd is not None
-            assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, "the token is not valid any more")
+            assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1008, "the token is no longer valid")
             assert secured.ask("/api/v1/site", Role.VIEWER).status_code == 401
-            path.chmod(0o644)  # then it is not read: who was let in stays in
+            path.chmod(0o644)  # a file that others can read is refused: the tokens of before stay valid
             path.touch()
             time.sleep(2 * REFRESH_S)
             assert secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200
@@ -144,7 +144,7 @@ def test_tokens_are_made_and_revoked_while_the_server_runs(tmp_path: Path) -> No
                 listen(boss)
 
 
-def test_routes_that_nobody_has_thought_of_are_guarded() -> None:
+def test_paths_without_a_route_are_guarded() -> None:
     assert needed_role("GET", "/api/v9/anything") is Role.VIEWER
     assert needed_role("DELETE", "/api/v9/anything") is Role.OPERATOR
     assert needed_role("GET", "/staticky") is Role.VIEWER
@@ -154,20 +154,20 @@ def test_routes_that_nobody_has_thought_of_are_guarded() -> None:
 
 @pytest.mark.parametrize("role", list(Role))
 def test_live_with_a_token(secured: Secured, role: Role) -> None:
-    """In a header, as programs send it; or among the protocols, as browsers can."""
+    """Programs send the token in a header; browsers offer it among the protocols."""
     with secured.live(additional_headers=secured.headers(role)) as live:
-        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         assert live.subprotocol is None
     offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{secured.tokens[role]}")]
     with secured.live(subprotocols=offered) as live:
-        assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         assert live.subprotocol == "livessl"  # and never the one with the token
 
 
 @pytest.mark.parametrize("role", list(Role))
 def test_map_with_a_token(secured: Secured, role: Role) -> None:
     with secured.live("map", additional_headers=secured.headers(role)) as watching:
-        assert watching.ping().wait(timeout=5)  # it is open, and stays so
+        assert watching.ping().wait(timeout=HANG_S)  # the connection is open and stays open
 
 
 @pytest.mark.parametrize(
@@ -209,23 +209,23 @@ def test_wrong_credentials_are_no_credentials(secured: Secured, header: str) -> 
     assert response.headers["X-Content-Type-Options"] == "nosniff"
 
 
-def test_token_in_the_address_is_not_taken(secured: Secured) -> None:
-    """Addresses end up in histories and logs."""
+def test_token_in_the_query_is_not_accepted(secured: Secured) -> None:
+    """Addresses are kept in histories and logs."""
     assert secured.ask(f"/api/v1/site?token={secured.tokens[Role.ADMIN]}", None).status_code == 401
 
 
-def test_scheme_is_bearer_however_it_is_written(secured: Secured) -> None:
+def test_case_of_the_scheme_does_not_matter(secured: Secured) -> None:
     for scheme in ("Bearer", "bearer", "BEARER"):
         headers = {"Authorization": f"{scheme} {secured.tokens[Role.VIEWER]}"}
         assert httpx.get(f"{secured.server.url}/api/v1/site", headers=headers).status_code == 200
 
 
-def test_health_without_a_token_tells_the_status_only(secured: Secured) -> None:
+def test_health_without_a_token_holds_the_status_only(secured: Secured) -> None:
     assert secured.ask("/api/v1/health", None).json() == {"v": 1, "status": "starting"}
     assert secured.ask("/api/v1/health", Role.VIEWER).json()["arrays"] == {"north": "starting", "south": "starting"}
 
 
-def test_health_tells_what_is_secured(secured: Secured) -> None:
+def test_health_reports_what_is_secured(secured: Secured) -> None:
     assert secured.ask("/api/v1/health", Role.VIEWER).json()["secured"] == {
         "nodes": False,
         "tokens": True,
@@ -233,7 +233,7 @@ def test_health_tells_what_is_secured(secured: Secured) -> None:
     }
 
 
-def test_description_tells_of_the_token(secured: Secured) -> None:
+def test_openapi_describes_the_token(secured: Secured) -> None:
     described = secured.ask("/api/v1/openapi.json", Role.VIEWER).json()
     assert described["security"] == [{"token": []}]
     assert described["components"]["securitySchemes"] == {"token": {"type": "http", "scheme": "bearer"}}
@@ -242,7 +242,7 @@ def test_description_tells_of_the_token(secured: Secured) -> None:
             assert {"401", "403"} <= set(described["responses"]), path
 
 
-def test_admins_see_who_may_and_who_was_refused(secured: Secured) -> None:
+def test_admins_see_clients_and_refusals(secured: Secured) -> None:
     secured.ask("/api/v1/site", None)
     seen = secured.ask("/api/v1/access", Role.ADMIN).json()
     assert seen["clients"] == [{"name": str(role), "role": str(role)} for role in Role]
@@ -259,13 +259,13 @@ def refused_count(secured: Secured, reason: str) -> float:
 
 
 def test_refusals_are_counted_and_logged_once(secured: Secured, caplog: pytest.LogCaptureFixture) -> None:
-    before = refused_count(secured, "role admin, this one is of a operator")
+    before = refused_count(secured, "role admin, got one of the role operator")
     with caplog.at_level(logging.WARNING):
         for _ in range(5):
             secured.ask("/api/v1/access", Role.OPERATOR)
-    assert refused_count(secured, "role admin, this one is of a operator") == before + 5
+    assert refused_count(secured, "role admin, got one of the role operator") == before + 5
     assert secured.ask("/api/v1/health", Role.VIEWER).json()["refused"]["http"] >= 5
-    assert len([r for r in caplog.records if "this one is of a operator" in r.getMessage()]) <= 1
+    assert len([r for r in caplog.records if "got one of the role operator" in r.getMessage()]) <= 1
 
 
 @pytest.mark.parametrize("length", [MAX_BODY_BYTES + 1, 10**12, 10**19])
@@ -292,17 +292,17 @@ def test_head_that_is_too_long_is_not_read(secured: Secured) -> None:
 
 @pytest.mark.processes
 def test_token_is_in_no_log(tmp_path: Path) -> None:
-    """Not even where the most is said, with right and wrong tokens, where one may stand and where none may."""
+    """The most verbose log holds no token, whether it was right or wrong and wherever the request had it."""
     tokens = {role: add_token(tmp_path / "tokens.yaml", str(role), str(role)) for role in Role}  # type: ignore[arg-type]
     site = write_site(tmp_path, TOKENED)
     command = [sys.executable, "-m", "livessl", "--verbose", "serve", "--site", str(site)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        said = [process.stderr.readline()]
-        while "dashboard on" not in said[-1]:
-            assert said[-1], said
-            said.append(process.stderr.readline())
-        url = said[-1].rpartition(" ")[2].strip()
+        lines = [process.stderr.readline()]
+        while "dashboard on" not in lines[-1]:
+            assert lines[-1], lines
+            lines.append(process.stderr.readline())
+        url = lines[-1].rpartition(" ")[2].strip()
         try:
             for token in tokens.values():
                 for header in (f"Bearer {token}", f"Basic {token}", f"Bearer {token}x"):
@@ -310,29 +310,29 @@ def test_token_is_in_no_log(tmp_path: Path) -> None:
                 httpx.get(f"{url}/api/v1/site?token={token}")
                 offered = [Subprotocol("livessl"), Subprotocol(f"livessl.token.{token}")]
                 with connect(f"ws{url.removeprefix('http')}/api/v1/live", subprotocols=offered) as live:
-                    live.recv(timeout=5)
+                    live.recv(timeout=HANG_S)
                 raw(url, f"GET / HTTP/1.1\r\nAuthorization: Bearer {token}\r\nbroken\r\n\r\n".encode())
         finally:
             process.terminate()
-            said.append(process.stderr.read())
-    log = "".join(said)
+            lines.append(process.stderr.read())
+    log = "".join(lines)
     assert "was refused" in log
     for role, token in tokens.items():
         assert token.removeprefix("livessl_") not in log, role
 
 
-def test_tokens_that_cannot_be_read_stop_the_start(tmp_path: Path) -> None:
+def test_server_does_not_start_without_its_file_of_tokens(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"tokens\.yaml: cannot be read: No such file"):
         Server(site_of(TOKENED, tmp_path), SystemClock())
 
 
-def test_behind_a_proxy_on_this_machine_any_name_will_do(secured: Secured) -> None:
-    """Tokens are sent by no page that does not know them, so there is nothing to rebind a name for."""
+def test_server_with_tokens_behind_a_proxy_answers_to_any_host_name(secured: Secured) -> None:
+    """DNS rebinding gains nothing there: a foreign page does not know a token."""
     headers = {**secured.headers(Role.VIEWER), "Host": "livessl.example.org"}
     assert httpx.get(f"{secured.server.url}/api/v1/site", headers=headers).status_code == 200
 
 
-def test_without_tokens_this_machine_may_do_everything() -> None:
+def test_without_tokens_every_local_client_is_an_admin() -> None:
     with running_server(site_of()) as server:
         assert httpx.get(f"{server.url}/api/v1/access").json()["clients"] == []
         assert httpx.post(f"{server.url}/api/v1/site").status_code == 405

@@ -14,7 +14,7 @@ from browser import faultless_page, running_browser
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.server.app import Server
-from small_site import running_server, scene_recordings, site_of
+from small_site import HANG_S, running_server, scene_recordings, site_of
 
 pytestmark = [pytest.mark.browser]
 
@@ -58,7 +58,7 @@ def test_page_draws_the_threshold_that_the_server_reports(browser: Browser, floo
         for array in arrays_of(server):
             threshold_dbfs = array["activity_threshold_dbfs"]
             line = page.get_by_test_id(f"threshold-{array['name']}")
-            expect(line).to_have_attribute("data-dbfs", str(threshold_dbfs), timeout=10_000)
+            expect(line).to_have_attribute("data-dbfs", str(threshold_dbfs), timeout=1000 * HANG_S)
             left_percent = float(line.evaluate("line => line.style.left").removesuffix("%"))
             assert left_percent == pytest.approx(100 * (1 - threshold_dbfs / LEVEL_BAR_DBFS), abs=0.01)
             expect(page.get_by_test_id(f"array-{array['name']}")).to_contain_text(f"threshold −{-threshold_dbfs:.0f}")
@@ -67,7 +67,7 @@ def test_page_draws_the_threshold_that_the_server_reports(browser: Browser, floo
 def test_page_draws_no_threshold_before_the_noise_is_known(browser: Browser) -> None:
     with running_server(site_of()) as server, faultless_page(browser) as page:
         page.goto(server.url)
-        expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "starting", timeout=10_000)
+        expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "starting", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("threshold-north")).to_be_hidden()
         expect(page.get_by_test_id("array-north")).to_contain_text("no data yet")
 
@@ -76,11 +76,11 @@ def test_page_shows_the_server_s_states_after_a_replay_has_ended(browser: Browse
     """The server keeps a replay's end for inspection, so the arrays do not age after it."""
     with running_server(site_of()) as server, faultless_page(browser) as page:
         page.goto(server.url)
-        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
+        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         replay_scene(server)
         cards = [page.get_by_test_id(f"array-{array['name']}") for array in arrays_of(server)]
         for card in cards:
-            expect(card).to_have_attribute("data-state", "healthy", timeout=10_000)
+            expect(card).to_have_attribute("data-state", "healthy", timeout=1000 * HANG_S)
         page.wait_for_timeout(2_500)  # longer than the silence of 1.5 s after which an array is lost
         assert [array["state"] for array in arrays_of(server)] == ["healthy", "healthy"]
         for card in cards:
@@ -94,8 +94,10 @@ def test_page_claims_no_state_while_the_server_is_unreachable(browser: Browser) 
     with faultless_page(browser) as page:
         with running_server(site_of()) as server:
             page.goto(server.url)
-            expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "starting", timeout=10_000)
-        expect(page.get_by_test_id("banner")).to_contain_text("Server unreachable; reconnecting", timeout=10_000)
+            expect(page.get_by_test_id("array-north")).to_have_attribute(
+                "data-state", "starting", timeout=1000 * HANG_S
+            )
+        expect(page.get_by_test_id("banner")).to_contain_text("Server unreachable; reconnecting", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("connection")).to_have_text("offline")
         expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "unknown")
         expect(page.get_by_test_id("array-north")).to_contain_text("was starting")
@@ -125,7 +127,7 @@ def test_page_reports_skipped_messages(browser: Browser, replayed: Server, misse
     with faultless_page(browser) as page:
         page.route_web_socket("**/api/v1/live*", pass_on_then_report)
         page.goto(replayed.url)
-        expect(page.get_by_test_id("gap")).to_contain_text(notice, timeout=10_000)
+        expect(page.get_by_test_id("gap")).to_contain_text(notice, timeout=1000 * HANG_S)
         expect(page.get_by_test_id("event")).to_have_count(2)
         page.get_by_role("button", name="Dismiss").click()
         expect(page.get_by_test_id("gap")).to_be_hidden()
@@ -135,7 +137,7 @@ def test_page_opens_an_event_s_details(browser: Browser, replayed: Server) -> No
     with faultless_page(browser) as page:
         page.goto(replayed.url)
         rows = page.get_by_test_id("event")
-        expect(rows).to_have_count(2, timeout=10_000)
+        expect(rows).to_have_count(2, timeout=1000 * HANG_S)
         expect(rows.first.locator(".details")).to_be_hidden()
         rows.first.get_by_role("button").click()
         details = rows.first.locator(".details")
@@ -151,5 +153,5 @@ def test_page_fits_its_window(browser: Browser, replayed: Server, width: int) ->
     with faultless_page(browser) as page:
         page.set_viewport_size({"width": width, "height": 800})
         page.goto(replayed.url)
-        expect(page.get_by_test_id("event")).to_have_count(2, timeout=10_000)
+        expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
         assert page.evaluate("document.documentElement.scrollWidth") <= width

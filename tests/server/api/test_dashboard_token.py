@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, expect
 
 from browser import faultless_page, running_browser
 from livessl.site.tokens import RoleName, add_token
-from small_site import Changes, running_server, site_of
+from small_site import HANG_S, Changes, running_server, site_of
 
 SECURED: Changes = {
     "server.http.tokens": "tokens.yaml",
@@ -41,17 +41,17 @@ def test_dashboard_asks_once_for_the_token(browser: Browser, tmp_path: Path) -> 
 
         field.fill("livessl_wrong")
         page.keyboard.press("Enter")
-        expect(dialog).to_contain_text("This token is not valid.", timeout=10_000)
+        expect(dialog).to_contain_text("This token is not valid.", timeout=1000 * HANG_S)
 
         field.fill(f" {token} ")
         page.get_by_role("button", name="Sign in").click()
-        expect(connection).to_have_attribute("data-state", "live", timeout=10_000)
+        expect(connection).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(dialog).to_be_hidden()
         expect(page.get_by_test_id("array-north")).to_be_visible()
         expect(page.get_by_test_id("privacy")).to_have_text("positions only · kept 7 d")
 
         page.reload()
-        expect(connection).to_have_attribute("data-state", "live", timeout=10_000)
+        expect(connection).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(dialog).to_be_hidden()
 
         with faultless_page(browser) as other_tab:  # each tab needs the token itself
@@ -62,7 +62,7 @@ def test_dashboard_asks_once_for_the_token(browser: Browser, tmp_path: Path) -> 
 def test_dashboard_of_an_open_server_asks_for_no_token(browser: Browser) -> None:
     with running_server(site_of()) as server, faultless_page(browser) as page:
         page.goto(server.url)
-        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
+        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("token-dialog")).to_be_hidden()
         expect(page.get_by_test_id("privacy")).to_be_hidden()
 
@@ -80,11 +80,11 @@ def test_only_operators_can_disable_an_array(browser: Browser, tmp_path: Path, r
             expect(switch).to_be_hidden()
             return
         switch.click()
-        expect(card).to_have_attribute("data-state", "disabled", timeout=10_000)
+        expect(card).to_have_attribute("data-state", "disabled", timeout=1000 * HANG_S)
         answer = httpx.get(f"{server.url}/api/v1/arrays", headers={"Authorization": f"Bearer {token}"}).json()
         [reason] = [array["reason"] for array in answer["arrays"] if array["name"] == "north"]
         assert "operator" in reason
         expect(card).to_contain_text(reason)
         expect(switch).to_have_text("Enable")
         switch.click()
-        expect(card).to_have_attribute("data-state", "starting", timeout=10_000)
+        expect(card).to_have_attribute("data-state", "starting", timeout=1000 * HANG_S)

@@ -1,4 +1,4 @@
-"""What subscribers read: the promised fields, of the promised types, as JSON that any parser takes."""
+"""Encoded messages have the promised fields and types, and are JSON that any parser accepts."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ PROMISED: dict[str, type | tuple[type, ...]] = {
     "status": str,
     "reason": (str, type(None)),
 }
-"""The contract's fields of an event."""
+"""The promised fields of an event, and their types."""
 
 
 def strict_json(message: JsonObject) -> Any:
-    """There and back, by the JSON that has no NaN."""
+    """Encode and parse a message by JSON without NaN."""
     return json.loads(json.dumps(message, allow_nan=False))
 
 
@@ -68,31 +68,31 @@ def messages(*, utc: bool = True) -> Messages:
 
 
 @pytest.mark.parametrize("status", list(Status))
-def test_event_has_what_is_promised(status: Status) -> None:
+def test_event_has_the_promised_fields(status: Status) -> None:
     event = replace(EVENT, status=status, reason=None if status is Status.LOCATED else "why")
-    told = messages().event(event)
+    encoded = messages().event(event)
     for name, kind in PROMISED.items():
-        assert isinstance(told[name], kind), name
-    assert list(told)[: len(PROMISED)] == list(PROMISED)
-    assert told["kind"] == "event"
-    assert told["status"] == status.value
-    assert 0 <= told["confidence"] <= 1
-    assert strict_json(told) == told
+        assert isinstance(encoded[name], kind), name
+    assert list(encoded)[: len(PROMISED)] == list(PROMISED)
+    assert encoded["kind"] == "event"
+    assert encoded["status"] == status.value
+    assert 0 <= encoded["confidence"] <= 1
+    assert strict_json(encoded) == encoded
 
 
-def test_event_says_when_and_where() -> None:
-    told = messages().event(EVENT)
-    assert told["time_utc"] == "2026-01-01T00:00:01.000000Z"
-    assert (told["start_s"], told["duration_s"]) == (1.0, 0.5)
-    assert told["position_m"] == [0.5123, 0.7, 1.1]
-    assert np.shape(told["covariance_m2"]) == (3, 3)
-    assert [told["covariance_m2"][k][k] for k in range(3)] == pytest.approx([0.01, 0.02, 0.03], rel=1e-5)
-    assert told["confidence"] == 0.6123
-    assert told["arrays"] == told["heard_by"] == ["north", "south"]
-    assert told["zones"] == ["door"]
-    assert told["level_dbfs"] == -20.0
-    assert (told["late_frames"], told["latency_s"]) == (2, 0.3123)
-    assert told["contributions"] == [
+def test_event_holds_time_and_place() -> None:
+    encoded = messages().event(EVENT)
+    assert encoded["time_utc"] == "2026-01-01T00:00:01.000000Z"
+    assert (encoded["start_s"], encoded["duration_s"]) == (1.0, 0.5)
+    assert encoded["position_m"] == [0.5123, 0.7, 1.1]
+    assert np.shape(encoded["covariance_m2"]) == (3, 3)
+    assert [encoded["covariance_m2"][k][k] for k in range(3)] == pytest.approx([0.01, 0.02, 0.03], rel=1e-5)
+    assert encoded["confidence"] == 0.6123
+    assert encoded["arrays"] == encoded["heard_by"] == ["north", "south"]
+    assert encoded["zones"] == ["door"]
+    assert encoded["level_dbfs"] == -20.0
+    assert (encoded["late_frames"], encoded["latency_s"]) == (2, 0.3123)
+    assert encoded["contributions"] == [
         {
             "array": "north",
             "active_s": 0.45,
@@ -108,55 +108,55 @@ def test_event_says_when_and_where() -> None:
 
 
 def test_time_is_null_where_it_is_not_utc() -> None:
-    for told in (messages(utc=False).event(EVENT), messages(utc=False).track(TRACK)):
-        assert told["time_utc"] is None
-        assert told["start_s"] == (1.0 if told["kind"] == "event" else 0.0)
+    for encoded in (messages(utc=False).event(EVENT), messages(utc=False).track(TRACK)):
+        assert encoded["time_utc"] is None
+        assert encoded["start_s"] == (1.0 if encoded["kind"] == "event" else 0.0)
 
 
-def test_refused_event_is_nowhere() -> None:
+def test_refused_event_has_no_position() -> None:
     refused = replace(EVENT, status=Status.REFUSED, reason="heard by 1 of at least 2 arrays", estimate=None)
-    told = messages().event(replace(refused, contributions=(), heard_by=("north",)))
-    assert told["position_m"] is None
-    assert told["covariance_m2"] is None
-    assert told["confidence"] == 0.0
-    assert told["arrays"] == []
-    assert told["zones"] == []
-    assert told["heard_by"] == ["north"]
-    assert told["reason"] == "heard by 1 of at least 2 arrays"
-    assert set(told) == set(messages().event(EVENT))
-    assert strict_json(told) == told
+    encoded = messages().event(replace(refused, contributions=(), heard_by=("north",)))
+    assert encoded["position_m"] is None
+    assert encoded["covariance_m2"] is None
+    assert encoded["confidence"] == 0.0
+    assert encoded["arrays"] == []
+    assert encoded["zones"] == []
+    assert encoded["heard_by"] == ["north"]
+    assert encoded["reason"] == "heard by 1 of at least 2 arrays"
+    assert set(encoded) == set(messages().event(EVENT))
+    assert strict_json(encoded) == encoded
 
 
 def test_update() -> None:
-    told = messages().update(UPDATE)
-    assert told["kind"] == "update"
-    assert told["event_id"] == "small-1"
-    assert told["status"] == "direction-only"
-    assert [contribution["array"] for contribution in told["contributions"]] == ["north"]
-    assert (told["time_utc"], told["start_s"]) == ("2026-01-01T00:00:01.250000Z", 1.25)
-    assert told["end_utc"] == "2026-01-01T00:00:01.350000Z"
-    assert told["position_m"] == [0.5123, 0.7, 1.1]
-    assert told["level_dbfs"] == -30.0
-    assert told["latency_s"] is told["latency_stages_s"] is None  # unknown, as in a replay
-    assert told["zones"] == ["door"]
-    assert strict_json(told) == told
+    encoded = messages().update(UPDATE)
+    assert encoded["kind"] == "update"
+    assert encoded["event_id"] == "small-1"
+    assert encoded["status"] == "direction-only"
+    assert [contribution["array"] for contribution in encoded["contributions"]] == ["north"]
+    assert (encoded["time_utc"], encoded["start_s"]) == ("2026-01-01T00:00:01.250000Z", 1.25)
+    assert encoded["end_utc"] == "2026-01-01T00:00:01.350000Z"
+    assert encoded["position_m"] == [0.5123, 0.7, 1.1]
+    assert encoded["level_dbfs"] == -30.0
+    assert encoded["latency_s"] is encoded["latency_stages_s"] is None  # unknown, as in a replay
+    assert encoded["zones"] == ["door"]
+    assert strict_json(encoded) == encoded
 
 
 def test_latency_by_stages() -> None:
     stages = Stages(waited=0.3, sent=0.0123, received=-0.0004, located=0.00567)
-    told = {"waited": 0.3, "sent": 0.0123, "received": -0.0004, "located": 0.0057}
+    encoded = {"waited": 0.3, "sent": 0.0123, "received": -0.0004, "located": 0.0057}
     for message in (messages().event(EVENT, stages), messages().update(UPDATE, stages)):
-        assert message["latency_stages_s"] == told
-        assert message["latency_s"] == 0.3176  # measured after all, not what the event says of itself
+        assert message["latency_stages_s"] == encoded
+        assert message["latency_s"] == 0.3176  # the sum of the stages replaces the estimate in the event
 
 
 @pytest.mark.parametrize("state", list(TrackState))
 def test_track(state: TrackState) -> None:
-    told = messages().track(replace(TRACK, state=state))
-    assert (told["kind"], told["id"], told["state"]) == ("track", 3, state.value)
-    assert told["position_m"] == [0.5, 0.5, 1.0]
-    assert told["velocity_m_s"] == [0.1, 0.0, -0.2]
-    assert strict_json(told) == told
+    encoded = messages().track(replace(TRACK, state=state))
+    assert (encoded["kind"], encoded["id"], encoded["state"]) == ("track", 3, state.value)
+    assert encoded["position_m"] == [0.5, 0.5, 1.0]
+    assert encoded["velocity_m_s"] == [0.1, 0.0, -0.2]
+    assert strict_json(encoded) == encoded
 
 
 def status_of(**changes: Any) -> ArrayStatus:
@@ -178,8 +178,8 @@ def status_of(**changes: Any) -> ArrayStatus:
 
 
 def test_array_status() -> None:
-    told = array_status(status_of(), "lab-pc", ActivityParameters())
-    assert told == {
+    encoded = array_status(status_of(), "lab-pc", ActivityParameters())
+    assert encoded == {
         "name": "north",
         "state": "healthy",
         "reason": None,
@@ -197,13 +197,13 @@ def test_array_status() -> None:
         "clock_offset": None,
         "counters": {"frames": 3},
     }
-    assert strict_json(told) == told
+    assert strict_json(encoded) == encoded
 
 
 def test_clock_offset_of_an_array() -> None:
     offset = ClockOffset(-0.13764, 0.00123, 7, "lab-pc")
-    told = array_status(status_of(clock_offset=offset, corrected_frames=-3), "door-pc", ActivityParameters())
-    assert told["clock_offset"] == {
+    encoded = array_status(status_of(clock_offset=offset, corrected_frames=-3), "door-pc", ActivityParameters())
+    assert encoded["clock_offset"] == {
         "offset_s": -0.1376,
         "std_s": 0.0012,
         "sounds": 7,
@@ -230,10 +230,12 @@ def test_activity_threshold_of_an_array(
     assert reported["activity_threshold_dbfs"] == threshold_dbfs
 
 
-def test_array_not_heard_from_has_nulls() -> None:
+def test_array_before_its_first_message_has_nulls() -> None:
     unknown = dict.fromkeys(("age_s", "power", "noise_power", "sample_rate_hz", "drift_ppm", "clock"))
-    told = array_status(status_of(state=ArrayState.STARTING, channel_power=(), **unknown), None, ActivityParameters())
-    assert told["channel_levels_dbfs"] == []
+    encoded = array_status(
+        status_of(state=ArrayState.STARTING, channel_power=(), **unknown), None, ActivityParameters()
+    )
+    assert encoded["channel_levels_dbfs"] == []
     unknown_fields = (
         "node",
         "age_s",
@@ -245,8 +247,8 @@ def test_array_not_heard_from_has_nulls() -> None:
         "clock",
     )
     for name in unknown_fields:
-        assert told[name] is None, name
-    assert strict_json(told) == told
+        assert encoded[name] is None, name
+    assert strict_json(encoded) == encoded
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pictures of maps: valid PNG, the right way up, dark where nothing is."""
+"""Pictures of maps are valid PNG, have the first row at the bottom, and are dark at low power."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_more_power_is_brighter() -> None:
     picture = brightness(image)[0]
     assert (np.diff(picture) >= 0).all()
     assert picture[-1] > 600 > 100 > picture[0]
-    assert (picture[:51] == picture[0]).all()  # up to the median all is dark
+    assert (picture[:51] == picture[0]).all()  # everything up to the median is dark
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -3e30])

@@ -1,4 +1,4 @@
-"""TLS from certificate files: requests and WebSockets are encrypted, and files that do not fit stop the start."""
+"""TLS from certificate files: requests and WebSockets are encrypted, and the server does not start on wrong files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from conftest import require
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.server.app import Server
-from small_site import running_server, site_of
+from small_site import HANG_S, running_server, site_of
 
 FILES = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}
 
@@ -41,8 +41,8 @@ def test_everything_is_encrypted(folder: Path) -> None:
         assert server.url.startswith("https://127.0.0.1:")
         health = httpx.get(f"{server.url}/api/v1/health", verify=trusted)
         assert health.json()["secured"]["tls"] is True
-        with connect(f"wss{server.url.removeprefix('https')}/api/v1/live", ssl=trusted, open_timeout=5) as live:
-            assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+        with connect(f"wss{server.url.removeprefix('https')}/api/v1/live", ssl=trusted, open_timeout=HANG_S) as live:
+            assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         with pytest.raises(httpx.HTTPError):
             httpx.get(server.url.replace("https", "http") + "/api/v1/health")
         with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
@@ -57,10 +57,8 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
         port = int(server.url.rpartition(":")[2])
         for offered in ("DEFAULT", "AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA256"):
             trusted.set_ciphers(offered)
-            with socket.create_connection(("127.0.0.1", port), timeout=5) as plain:
-                if (
-                    version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT"
-                ):  # no key exchange anew, or none authentic
+            with socket.create_connection(("127.0.0.1", port), timeout=HANG_S) as plain:
+                if version is ssl.TLSVersion.TLSv1_2 and offered != "DEFAULT":  # not forward secret, or without AEAD
                     with pytest.raises(ssl.SSLError):
                         trusted.wrap_socket(plain, server_hostname="127.0.0.1")
                     continue
@@ -71,7 +69,7 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
 
 
 @pytest.mark.parametrize(
-    ("certificate", "key", "said"),
+    ("certificate", "key", "fault"),
     [
         ("site.crt", "other.key", "KEY_VALUES_MISMATCH"),
         ("site.crt", "locked.key", "name a PEM certificate and its key without a passphrase"),
@@ -79,9 +77,9 @@ def test_ciphers_are_authenticated_and_forward_secret(folder: Path, version: ssl
         ("site.key", "site.key", "name a PEM certificate"),
     ],
 )
-def test_files_that_do_not_fit_stop_the_start(folder: Path, certificate: str, key: str, said: str) -> None:
+def test_server_does_not_start_on_files_that_do_not_match(folder: Path, certificate: str, key: str, fault: str) -> None:
     changes = {"server.http.certificate": certificate, "server.http.private_key": key}
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=fault) as caught:
         Server(site_of(changes, folder), SystemClock())
     assert str(caught.value).startswith("server.http.certificate: cannot use ")
 

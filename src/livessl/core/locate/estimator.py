@@ -17,7 +17,7 @@ from livessl.core.correlate.band import dead_channels
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.geometry import Grid
 from livessl.core.locate.confidence import ConfidenceFeatures
-from livessl.core.methods import METHODS, unknown_method
+from livessl.core.methods import METHODS, is_method, unknown_method
 from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray
 
 
@@ -201,19 +201,17 @@ def register(name: str, factory: Factory) -> None:
     if not name:
         raise ValueError("method: expected a name, got an empty text")
     if not callable(factory):
-        raise TypeError(
-            f"method {name!r}: expected a factory (arrays, grid, c_m_s) -> Estimator, got {type(factory).__name__}; "
-            "pass the class itself, not an instance"
-        )
+        raise TypeError(f"method {name!r}: {_no_factory(factory)}")
     METHODS[name] = factory
 
 
 def create(method: str, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> Estimator:
-    """Return a new estimator of a registered method.
+    """Return a new estimator of a method.
 
     Parameters
     ----------
     method : str
+        Registered name, or `MODULE:NAME`, the import path of a factory.
     arrays : sequence of ArraySpec
         All arrays that may take part.
     grid : Grid
@@ -224,14 +222,39 @@ def create(method: str, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -
     Raises
     ------
     ValueError
-        If no method of that name is registered.
+        If there is no method of that name, or its factory cannot be imported.
     """
-    if method not in METHODS:
-        raise ValueError(f"method: {unknown_method(method)}")
-    factory: Any = METHODS[method]
-    if isinstance(factory, str):
-        module, _, attribute = factory.partition(":")
-        factory = getattr(import_module(module), attribute)
-    estimator: Estimator = factory(arrays, grid, c_m_s)
+    if not is_method(method):
+        raise ValueError(unknown_method(method))
+    factory = METHODS.get(method, method)
+    make: Any = _imported(factory) if isinstance(factory, str) else factory
+    estimator: Estimator = make(arrays, grid, c_m_s)
     estimator.name = method
     return estimator
+
+
+def _imported(path: str) -> Factory:
+    """Import a factory by its path `MODULE:NAME`."""
+    module, _, attribute = path.partition(":")
+    try:
+        factory: Any = import_module(module)
+    except ImportError as error:
+        raise ValueError(
+            f"cannot import {module!r} for {path!r} ({error}); install it, or start in the folder that holds it"
+        ) from error
+    try:
+        for name in attribute.split("."):
+            factory = getattr(factory, name)
+    except AttributeError as error:
+        raise ValueError(f"{path!r}: {error}; correct the name after the colon") from error
+    if not callable(factory):
+        raise ValueError(f"{path!r}: {_no_factory(factory)}")
+    made: Factory = factory
+    return made
+
+
+def _no_factory(given: object) -> str:
+    return (
+        f"expected a factory (arrays, grid, c_m_s) -> Estimator, got {type(given).__name__}; "
+        "pass the class itself, not an instance"
+    )

@@ -1,4 +1,4 @@
-"""From frames as they arrive, late or out of order, to events and tracks: everything that keeps state over time.
+"""The streaming part of the core: frames that arrive late or out of order become events and tracks.
 
-Time is an argument; nothing here reads a clock.
+All state that is kept over time is here. Time is an argument; no module reads a clock.
 """

@@ -16,47 +16,48 @@ import numpy as np
 from livessl.core.types import FRAME_S, BoolArray, FloatArray
 
 THRESHOLD: Final = 0.1
-"""Active at or above this share of the reference power: the paper's 10 %."""
+"""Share of the reference power at and above which a frame is active: the paper's 10 %."""
 
 _FLOOR_SMOOTHING: Final = 5
-"""Frames averaged before the minimum is taken: a 50 ms frame of low-pitched noise alone scatters by several dB."""
+"""Number of frames averaged before the minimum is taken: the power of single frames of low-pitched noise scatters by
+several dB."""
 
 
 def is_active(power: FloatArray, reference: float | FloatArray, threshold: float = THRESHOLD) -> BoolArray:
-    """The rule: active where power >= threshold * reference, and there is any power at all."""
+    """Apply the rule: active where power >= threshold * reference and power > 0."""
     return np.asarray((power >= threshold * np.asarray(reference)) & (power > 0.0))
 
 
 def exact_mask(power: FloatArray, threshold: float = THRESHOLD) -> BoolArray:
-    """Which frames of a finished event are active: its own maximum is the reference. `power` (n,)."""
+    """Return which frames of a finished event are active; the reference is the maximum of its `power` (n,)."""
     return is_active(power, float(power.max()), threshold) if len(power) else np.zeros(0, dtype=np.bool_)
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Segments of consecutive active frames, as (start, stop) indices."""
+    """Return the segments of consecutive active frames as (start, stop) indices."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
 class ActivityParameters:
-    """Numbers of the causal form.
+    """Parameters of the causal form of the rule.
 
     Parameters
     ----------
     threshold : float
-        The rule's share of the reference.
+        Share of the reference power at and above which a frame is active.
     release_s : float
         Time constant of the decaying maximum. 1 s is 4 dB a second: slower than any room's decay, so that
         reverberation ends a sound instead of becoming one.
     floor_window_s : float
-        The background is the least smoothed power in this time.
+        Length of the window whose least smoothed power is the background.
     floor_factor : float
-        Sound is this much above the background.
+        Least ratio of an active frame's power to the background.
     min_power : float
-        Below this nothing is sound, full scale squared.
+        Least power of an active frame, full scale squared.
     pre_roll_s, hang_over_s : float
-        What is kept before the first and after the last active frame.
+        Length of the sound that is kept before the first and after the last active frame.
     """
 
     threshold: float = THRESHOLD
@@ -67,13 +68,23 @@ class ActivityParameters:
     pre_roll_s: float = 0.4
     hang_over_s: float = 0.3
 
+    @property
+    def pre_roll_frames(self) -> int:
+        """Number of frames kept before the first active one."""
+        return round(self.pre_roll_s / FRAME_S)
+
+    @property
+    def hang_over_frames(self) -> int:
+        """Number of quiet frames kept after the last active one."""
+        return round(self.hang_over_s / FRAME_S)
+
     def least_power(self, floor_power: float) -> float:
         """Return the least power, full scale squared, at which a frame can be active over a background."""
         return max(self.floor_factor * floor_power, self.min_power)
 
 
 class CausalActivity:
-    """The rule, frame by frame, knowing only the past."""
+    """The rule, applied frame by frame to a stream."""
 
     def __init__(self, parameters: ActivityParameters) -> None:
         self._parameters = parameters
@@ -84,15 +95,15 @@ class CausalActivity:
 
     @property
     def floor_power(self) -> float:
-        """The background, full scale squared; 0 before anything is known."""
+        """The background, full scale squared; 0 before the first frame."""
         return min(self._smoothed, default=0.0)
 
     def prime(self, floor_power: float) -> None:
-        """Start from a background already seen."""
+        """Start from a known background, full scale squared."""
         self._smoothed.append(floor_power)
 
     def push(self, power: float) -> bool:
-        """Whether the next frame, of this mean power, is active."""
+        """Return whether the next frame, of mean power `power`, is active."""
         parameters = self._parameters
         self._maximum = max(self._maximum * self._keep, power)
         reference = max(self._maximum, parameters.least_power(self.floor_power) / parameters.threshold)

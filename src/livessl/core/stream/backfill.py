@@ -1,69 +1,125 @@
-"""Arrays that did not find a sound active: which of them to ask for their frames of it, and what these say.
+"""Backfill: frames requested from arrays that did not detect an event, and whether its results are better with them.
 
-An array is asked where the answer of those that heard is not sure, for the very frames that its node would have sent
-with it. It takes part if the answer is better with it: evidence is not normalised, so that an array that heard nothing
-adds next to nothing.
+Frames are requested where the results of the arrays that detected the event are not sure: the very frames that a node
+would have sent with it. They are used if the results are then better. Evidence is not normalised, so that an array that
+received none of the sound adds next to nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Final
 
 import numpy as np
 
-from livessl.core.correlate.onset_gcc import OnsetGCC
 from livessl.core.locate.estimator import Estimator
+from livessl.core.stream.evidence import BackfilledSound
+from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
+from livessl.core.stream.site_state import SiteState
+from livessl.core.stream.verdict import Verdicts
 from livessl.core.types import FRAME_S, ArraySpec, Event, Frame, Status
 
 SURE: Final = 0.95
-"""With a confidence from here on nobody is asked."""
+"""Confidence from which on nothing is requested."""
 
 MOST_ARRAYS: Final = 4
-"""Asked about one event: the nearest to those that heard it."""
+"""Most arrays from which frames are requested for one event; the nearest to those that detected it come first."""
 
-MOST_ASKED_S: Final = 3.0
-"""Of an event, from its run-up on: what a longer one says besides, those that hear it say, too."""
+MOST_REQUESTED_S: Final = 3.0
+"""Longest stretch, in seconds, requested for one event, pre-roll included; arrays that detected the event already cover
+the rest of a longer one."""
 
 SHARE: Final = 0.25
-"""Of its sound that an array is asked for in the long run, beyond a first `RECENT_S`."""
+"""Share of an array's sound that may be requested in the long run, beyond the first `RECENT_S`."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
 
-def better(event: Event, than: Event) -> bool:
-    """Whether an answer is worth more than another of the same sound, or as much."""
-    return _worth(event) >= _worth(than)
+class Backfill:
+    """Chooses what to request for an event, and reconsiders its results with what has come.
 
+    Parameters
+    ----------
+    state : SiteState
+    """
 
-def is_sure(event: Event) -> bool:
-    """Whether nobody need be asked."""
-    return event.status is Status.LOCATED and event.estimate is not None and event.estimate.confidence >= SURE
+    def __init__(self, state: SiteState) -> None:
+        self._state = state
+        self._verdicts = Verdicts(state)
+        self._allowances: dict[str, Allowance] = {}
 
+    def choose(self, event: PendingEvent, span: range, present: Collection[str]) -> dict[str, RequestedFrames]:
+        """Choose the arrays that may improve the results of an event, and the frames to request from them.
 
-def _worth(event: Event) -> tuple[int, float]:
-    return _RANK[event.status], 0.0 if event.estimate is None else event.estimate.confidence
+        Parameters
+        ----------
+        event : PendingEvent
+            With the results of the arrays that detected it.
+        span : range
+            Frame indices of the event up to its last active frame, pre-roll included.
+        present : collection of str
+            Arrays whose nodes have not ended.
+        """
+        excerpt = event.excerpt
+        if excerpt is None or is_sure(event.results[0]) or not excerpt.sounds.has_onsets:
+            return {}  # without onsets the estimator gives every array the same weight, whatever it received
+        silent = [name for name in present if self._state.answers_requests(name) and name not in excerpt.sounds]
+        if not silent:
+            return {}
+        span = span[: round(MOST_REQUESTED_S / FRAME_S)]
+        nearest_ones = nearest(self._state.specs(silent), self._state.specs(list(excerpt.sounds)))
+        return {
+            spec.name: RequestedFrames(span)
+            for spec in nearest_ones
+            if self._allowances.setdefault(spec.name, Allowance()).take(len(span), event.closed)
+        }
 
+    def take(self, event: PendingEvent, frame: Frame) -> None:
+        """Take in a requested frame; it is dropped where the event has not requested it, or not that many channels."""
+        requested = event.requested.get(frame.array)
+        if requested is not None and len(frame.samples) == len(self._state.arrays[frame.array].microphones_m):
+            requested.take(frame)
 
-def nearest(silent: Sequence[ArraySpec], heard: Sequence[ArraySpec]) -> list[ArraySpec]:
-    """Those of the silent arrays that are worth asking, the nearest to one that heard first."""
-    apart_m = [min(float(np.linalg.norm(spec.centre_m - other.centre_m)) for other in heard) for spec in silent]
-    return [silent[k] for k in np.argsort(apart_m, kind="stable")[:MOST_ARRAYS]]
+    def is_over(self, event: PendingEvent, now_ns: int) -> bool:
+        """Return whether all requested frames have come that still can, or the time to wait for them is over."""
+        if now_ns - event.requested_ns >= self._state.parameters.backfill_wait_s * 1e9:
+            return True
+        can_backfill = self._state.can_backfill
+        return all(frames.is_complete or name not in can_backfill for name, frames in event.requested.items())
+
+    def reconsidered(self, event: PendingEvent, now_ns: int) -> Sequence[Event]:
+        """Return the best results of an event: without the requested frames, with all of them, or with one array's."""
+        estimator, best, excerpt = self._state.estimator, event.results, event.excerpt
+        if excerpt is None:
+            return best
+        sounds = {name: backfilled_sound(frames, estimator, event.start) for name, frames in event.requested.items()}
+        useful = {name: sound for name, sound in sounds.items() if sound is not None}
+        attempts = [useful, *({name: useful[name]} for name in useful if len(useful) > 1)] if useful else []
+        for backfilled in attempts:
+            verdict = self._verdicts.event(event, excerpt, now_ns, backfilled)
+            if is_better(verdict.events[0], best[0]):
+                best = verdict.events
+                self._verdicts.count_votes(event, excerpt, verdict)
+        return best
+
+    def start_over(self) -> None:
+        """Forget what was requested before."""
+        self._allowances.clear()
 
 
 @dataclass(slots=True)
 class Allowance:
-    """How much of one array's sound may still be asked for: it grows with time. In frame indices."""
+    """Number of frames that may still be requested from one array; it grows with time. Frame indices are joint ones."""
 
     left: float = RECENT_S / FRAME_S
     at: int | None = None
     refused: int = 0
 
     def take(self, frames: int, now: int) -> bool:
-        """Whether so many frames may be asked for; then they are taken off."""
+        """Return whether a number of frames may be requested at frame index `now`; if so, subtract them."""
         if self.at is not None:
             self.left = min(RECENT_S / FRAME_S, self.left + SHARE * (now - self.at))
         self.at = now
@@ -74,37 +130,40 @@ class Allowance:
         return True
 
 
-@dataclass(frozen=True, slots=True)
-class AskedSound:
-    """What an array that was asked heard: its frames from the event's start on, and what they and its run-up say."""
-
-    frames: list[Frame]
-    onsets: tuple[OnsetGCC, ...]
+def nearest(silent: Sequence[ArraySpec], detecting: Sequence[ArraySpec]) -> list[ArraySpec]:
+    """Return the `MOST_ARRAYS` silent arrays that are nearest to one that detected the event, the nearest first."""
+    apart_m = [min(float(np.linalg.norm(spec.centre_m - other.centre_m)) for other in detecting) for spec in silent]
+    return [silent[k] for k in np.argsort(apart_m, kind="stable")[:MOST_ARRAYS]]
 
 
-@dataclass(slots=True)
-class Asked:
-    """What one array was asked for, and has answered. In joint frame indices."""
+def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: int) -> BackfilledSound | None:
+    """Correlate the requested frames of an event that began at frame index `start`.
 
-    span: range
-    frames: dict[int, Frame] = field(default_factory=dict)
+    Only the last consecutive ones are used. None where there are none of the event itself, or where the estimator does
+    not correlate frames.
+    """
+    indices = list(takewhile(lambda frame_index: frame_index in requested.frames, reversed(requested.span)))[::-1]
+    frames = [requested.frames[frame_index] for frame_index in indices]
+    loud = [frame for frame_index, frame in zip(indices, frames, strict=True) if frame_index >= start]
+    if not loud or len({frame.sample_rate_hz for frame in frames}) > 1:
+        return None
+    front_end = estimator.onset_front_end(frames[0].array, frames[0].sample_rate_hz)
+    if front_end is None:
+        return None
+    pushed = zip(indices, frames, strict=True)
+    onsets = tuple(front_end.push(frame.samples, quiet=frame_index < start) for frame_index, frame in pushed)
+    return BackfilledSound(loud, onsets)
 
-    @property
-    def is_answered(self) -> bool:
-        """Whether all is there: frames come in order."""
-        return self.span[-1] in self.frames
 
-    def sound(self, estimator: Estimator, start: int) -> AskedSound | None:
-        """What it heard of an event that began at `start`; None where it has no frames of it, or no listener."""
-        last_ones = list(takewhile(lambda frame_index: frame_index in self.frames, reversed(self.span)))[::-1]
-        frames = [self.frames[frame_index] for frame_index in last_ones]
-        loud = [frame for frame_index, frame in zip(last_ones, frames, strict=True) if frame_index >= start]
-        if not loud or len({frame.sample_rate_hz for frame in frames}) > 1:
-            return None
-        listener = estimator.onset_front_end(frames[0].array, frames[0].sample_rate_hz)
-        if listener is None:
-            return None
-        heard = zip(last_ones, frames, strict=True)
-        return AskedSound(
-            loud, tuple(listener.push(frame.samples, quiet=frame_index < start) for frame_index, frame in heard)
-        )
+def is_sure(event: Event) -> bool:
+    """Return whether an event is located with a confidence of at least `SURE`."""
+    return event.status is Status.LOCATED and event.estimate is not None and event.estimate.confidence >= SURE
+
+
+def is_better(event: Event, than: Event) -> bool:
+    """Return whether an event is worth as much as another result of the same sound, or more."""
+    return _worth(event) >= _worth(than)
+
+
+def _worth(event: Event) -> tuple[int, float]:
+    return _RANK[event.status], 0.0 if event.estimate is None else event.estimate.confidence

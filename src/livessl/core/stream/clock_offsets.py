@@ -1,9 +1,9 @@
-"""How far the nodes' clocks differ, told by the sounds that their arrays hear. It reads no clock.
+"""Offsets of the nodes' clocks, estimated from located events. It reads no clock.
 
-A sound of known place should be heard at each array after its travel time; what is over is the clocks' difference. When
-it is heard is told by the rises of the power, correlated between arrays, so that reverberation, levels and what the
-sound is matter little. Each event gives one difference; a robust line through those of the last sounds gives each
-clock's offset and drift, relative to one of the clocks: nobody here knows which one is right.
+A sound at a known position arrives at each array after its travel time; any other difference of its arrival times is a
+difference of the clocks. Arrival times are compared by the rises of the power, correlated between arrays, so that
+reverberation, level and the kind of sound matter little. Each event gives one difference. A robust line through those
+of the last events gives each clock's offset and drift, relative to one of the clocks: which one is right is unknown.
 """
 
 from __future__ import annotations
@@ -19,76 +19,79 @@ import scipy.fft
 from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
 
 MOST_OFF_S: Final = 0.6
-"""Offsets beyond it are not looked for: such arrays' sounds do not meet in one event."""
+"""Greatest offset, in seconds, that is searched; with a greater one a sound is not one event of both arrays."""
 
 HOP_S: Final = 0.005
-"""Pieces that the power is taken of; the peak of the correlation is interpolated to a tenth of it."""
+"""Length, in seconds, of the pieces whose power is computed; the peak is interpolated to a tenth of it."""
 
-LISTENED_S: Final = 3.0
-"""From the run-up of a sound on: more of a long one tells little more."""
+MOST_USED_S: Final = 3.0
+"""Longest part of a sound, in seconds from its pre-roll on, that is used; the rest of a longer sound adds little."""
 
 LEAST_SOUNDS: Final = 3
-"""Before an offset is believed."""
+"""Least number of sounds from which an offset is believed."""
 
 KNOWN_S: Final = 0.01
-"""Standard deviation from which on it is."""
+"""Greatest standard deviation, in seconds, of an offset that is believed."""
 
 MOST_SOUNDS: Final = 32
-"""That an offset is made of: the last ones."""
+"""Number of last sounds that an offset is estimated from."""
 
 SMALL_S: Final = 0.01
-"""An offset below this is nothing to correct: events are told to 50 ms."""
+"""Offset, in seconds, below which nothing is corrected; frames are 50 ms long."""
 
-_MUCH: Final = 0.7
-"""Of a frame: what is left of an offset after its correction may grow so far, lest corrections come and go."""
+_HYSTERESIS: Final = 0.7
+"""Part of a frame that the rest of an offset may reach before the correction by whole frames changes; above a half, so
+that a correction does not come and go."""
 
 _DECAY_DB_S: Final = 40.0
-"""Power that falls slower than this is reverberation: what comes up under it is no rise."""
+"""Decay of reverberation, in dB a second; power that stays below such a decay from earlier power is no rise."""
 
 _STANDS_OUT: Final = 0.3
-"""Least height of the correlation's peak."""
+"""Least normalized height of the correlation's peak."""
 
 _RIVAL: Final = 0.8
-"""Highest other peak, of the first: a sound that repeats itself does not tell by how many periods it is late."""
+"""Greatest height of another peak, as a share of the first; the lag of a sound that repeats itself is ambiguous."""
 
 _MICROPHONES: Final = 2
-"""Listened to of each array: one may be dead."""
+"""Number of microphones of each array that are used; one may be dead."""
 
 _LEAST_POWER: Final = 2.0**-30 / 12.0
-"""Rounding to 16 bits, full scale squared: below it nothing is heard."""
+"""Least power, full scale squared: that of rounding to 16 bits."""
 
 _ABOVE_NOISE: Final = 4.0
-"""Power above so many times that of the run-up is no noise."""
+"""Ratio to the power of the pre-roll above which power is not noise."""
 
 _APART_S: Final = 0.03
-"""Further from the peak is another one."""
+"""Distance from the peak, in seconds, beyond which another maximum is a peak of its own."""
 
 _DRIFT: Final = 50e-6
-"""Standard deviation of crystals' rates, before sounds tell."""
+"""Standard deviation of the rates of crystals, in seconds per second: the prior of the drift."""
 
 _LEAST_SCATTER_S: Final = 1e-3
-"""Of a sound's difference: positions are not known better than this."""
+"""Least standard deviation, in seconds, of one sound's difference; positions are not known better than this."""
 
 _TUKEY: Final = 4.7
-"""Scatters beyond which a sound does not count."""
+"""Number of standard deviations beyond which a sound has no weight: the usual constant of Tukey's biweight."""
 
 _ITERATIONS: Final = 6
-"""Of the weights; more change less than a sound's own scatter."""
+"""Number of iterations of the weights; further ones change the line by less than the scatter of one sound."""
 
 _STEP_S: Final = 0.05
-"""So many last sounds as are needed to believe an offset, this far off and at one: the clock was set."""
+"""Deviation, in seconds, of the last `LEAST_SOUNDS` sounds from the line before them which shows that the clock was
+set, if these sounds agree with one another."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How far ahead of the reference a clock is.
+    """Offset of a clock from the reference clock.
 
     Parameters
     ----------
     offset_s, std_s : float
-        Positive is ahead: its times are later than the reference's for the same moment.
+        The offset and its standard deviation. A positive offset is ahead: the clock shows later times than the
+        reference.
     sounds : int
-        It was made of.
+        Number of sounds that it was estimated from.
     reference : str
         Name of the clock that it is relative to.
     """
@@ -100,7 +103,7 @@ class ClockOffset:
 
 
 class ClockOffsets:
-    """Running estimate of every clock's offset.
+    """Running estimate of the offsets of all clocks.
 
     Parameters
     ----------
@@ -113,96 +116,107 @@ class ClockOffsets:
     def __init__(self, clocks: Mapping[str, str], c_m_s: float) -> None:
         self._clock_of = dict(clocks)
         self._c_m_s = c_m_s
-        self._heard: dict[str, deque[tuple[int, float]]] = {
+        self._late: dict[str, deque[tuple[int, float]]] = {
             clock: deque(maxlen=MOST_SOUNDS) for clock in self._clock_of.values()
         }
         self._known: dict[str, ClockOffset] = {}
-        self._lines: dict[str, _Line] = {}  # of the clocks that have not been heard since
-        self._frames: dict[str, int] = dict.fromkeys(self._heard, 0)
+        self._lines: dict[str, _Line] = {}  # cached; removed when the sounds of a clock change
+        self._frames: dict[str, int] = dict.fromkeys(self._late, 0)
 
     def of(self, array: str) -> ClockOffset | None:
-        """How far off an array's clock was at the last sound; None where nobody knows yet."""
+        """Return the offset of an array's clock at the last sound; None where it is not known yet."""
         return self._known.get(self._clock_of[array])
 
     def frames_ahead(self, array: str) -> int:
-        """By how many whole frames an array's times are to be put back: it changes only with much, lest it flicker."""
+        """Return the correction of an array's frame indices, in whole frames; it has a hysteresis."""
         return self._frames[self._clock_of[array]]
 
     def rest_s(self, array: str) -> float:
-        """What is left of an array's offset then, seconds; 0 for what is too small to tell."""
+        """Return the rest of an array's offset in seconds; 0 where the offset is too small to correct."""
         offset, frames = self.of(array), self.frames_ahead(array)
         if offset is None or (frames == 0 and abs(offset.offset_s) < SMALL_S):
             return 0.0
         return offset.offset_s - frames * FRAME_S
 
-    def tell_apart(self, arrays: Iterable[str]) -> bool:
-        """Whether the arrays have different clocks."""
+    def differ(self, arrays: Iterable[str]) -> bool:
+        """Return whether the arrays have more than one clock."""
         return len({self._clock_of[array] for array in arrays}) > 1
 
-    def hear(self, time_ns: int, position_m: FloatArray, heard: Sequence[tuple[ArraySpec, Sequence[Frame]]]) -> None:
-        """Learn from a sound of known place: of each array the frames of it, without gaps, its run-up first."""
-        travel_s = {s.name: float(np.linalg.norm(s.centre_m - position_m)) / self._c_m_s for s, _ in heard}
-        late_s = lateness_s({spec.name: frames for spec, frames in heard}, travel_s)
-        if self.tell_apart(late_s):
-            self.learn(time_ns, late_s)
-
-    def learn(self, time_ns: int, late_s: Mapping[str, float]) -> None:
-        """Take in how late each array heard a sound, by its own clock and but for the travel time.
+    def learn_from(
+        self, time_ns: int, position_m: FloatArray, sounds: Sequence[tuple[ArraySpec, Sequence[Frame]]]
+    ) -> None:
+        """Learn from a sound at a known position.
 
         Parameters
         ----------
         time_ns : int
-            When that was.
+            Site time of the sound.
+        position_m : (3,) float64
+        sounds : sequence of (ArraySpec, frames)
+            Each array's frames of the sound, without gaps, the pre-roll first.
+        """
+        travel_s = {s.name: float(np.linalg.norm(s.centre_m - position_m)) / self._c_m_s for s, _ in sounds}
+        late_s = lateness_s({spec.name: frames for spec, frames in sounds}, travel_s)
+        if self.differ(late_s):
+            self.learn(time_ns, late_s)
+
+    def learn(self, time_ns: int, late_s: Mapping[str, float]) -> None:
+        """Learn from the arrival times of a sound.
+
+        Parameters
+        ----------
+        time_ns : int
+            Site time of the sound.
         late_s : mapping of array to float
-            Seconds against one moment, whichever.
+            Its arrival by each array's own clock less the travel time, in seconds from any common moment.
         """
         each: dict[str, list[float]] = {}
         for array, late in late_s.items():
             each.setdefault(self._clock_of[array], []).append(late)
         now = {clock: float(np.median(values)) for clock, values in each.items()}
-        expected = {clock: self._line(clock).at(time_ns)[0] for clock in now if self._heard[clock]}
+        expected = {clock: self._line(clock).at(time_ns)[0] for clock in now if self._late[clock]}
         moment = float(np.median([now[clock] - expected.get(clock, 0.0) for clock in expected or now]))
         for clock, late in now.items():
             self._forget_before_step(clock, time_ns, late - moment)
-            self._heard[clock].append((time_ns, late - moment))
+            self._late[clock].append((time_ns, late - moment))
             self._lines.pop(clock, None)
         self._know(time_ns)
 
     def state(self) -> dict[str, Any]:
-        """All that is known, as JSON can hold it."""
+        """Return all that is known, as values that JSON can hold."""
         return {
-            "heard": {clock: list(map(list, heard)) for clock, heard in self._heard.items()},
+            "heard": {clock: list(map(list, late)) for clock, late in self._late.items()},
             "frames": dict(self._frames),
             "known": {clock: astuple(offset) for clock, offset in self._known.items()},
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state`, as far as it is of clocks that there are."""
-        for clock, heard in self._heard.items():
-            heard.extend((int(time_ns), float(late_s)) for time_ns, late_s in state["heard"].get(clock, ()))
+        """Continue from an earlier `state`; clocks that do not exist any more are left out."""
+        for clock, late in self._late.items():
+            late.extend((int(time_ns), float(late_s)) for time_ns, late_s in state["heard"].get(clock, ()))
             self._frames[clock] = int(state["frames"].get(clock, 0))
             if clock in state["known"]:
                 self._known[clock] = ClockOffset(*state["known"][clock])
 
     def _line(self, clock: str) -> _Line:
         if clock not in self._lines:
-            self._lines[clock] = _line(*zip(*self._heard[clock], strict=True))
+            self._lines[clock] = _line(*zip(*self._late[clock], strict=True))
         return self._lines[clock]
 
     def _forget_before_step(self, clock: str, time_ns: int, late_s: float) -> None:
-        """Forget all but the last sounds where these and the new one agree, and are far off what was before."""
-        heard = self._heard[clock]
-        if len(heard) < 2 * LEAST_SOUNDS:
+        """Forget all but the last sounds where these and the new one show that the clock was set: see `_STEP_S`."""
+        kept = self._late[clock]
+        if len(kept) < 2 * LEAST_SOUNDS:
             return
         line = self._line(clock)
-        last = [*list(heard)[1 - LEAST_SOUNDS :], (time_ns, late_s)]
+        last = [*list(kept)[1 - LEAST_SOUNDS :], (time_ns, late_s)]
         off_s = np.array([late - line.at(at_ns)[0] for at_ns, late in last])
         if np.abs(off_s).min() > _STEP_S and np.ptp(off_s) < _STEP_S / 2.0:
-            while len(heard) >= LEAST_SOUNDS:
-                heard.popleft()
+            while len(kept) >= LEAST_SOUNDS:
+                kept.popleft()
 
     def _know(self, time_ns: int) -> None:
-        found = {c: self._line(c).at(time_ns) for c, heard in self._heard.items() if len(heard) >= LEAST_SOUNDS}
+        found = {c: self._line(c).at(time_ns) for c, late in self._late.items() if len(late) >= LEAST_SOUNDS}
         known = {clock: (offset_s, std_s) for clock, (offset_s, std_s) in found.items() if std_s < KNOWN_S}
         if len(known) < 2:
             return
@@ -214,22 +228,22 @@ class ClockOffsets:
             clock: ClockOffset(
                 offset_s - zero_s,
                 0.0 if clock == reference else std_s + zero_std_s,
-                len(self._heard[clock]),
+                len(self._late[clock]),
                 reference,
             )
             for clock, (offset_s, std_s) in known.items()
         }
         for clock, offset in self._known.items():
-            if abs(offset.offset_s - self._frames[clock] * FRAME_S) > _MUCH * FRAME_S:
+            if abs(offset.offset_s - self._frames[clock] * FRAME_S) > _HYSTERESIS * FRAME_S:
                 self._frames[clock] = round(offset.offset_s / FRAME_S)
 
 
 def clock_is_off(offset: ClockOffset) -> str:
-    """What to say of a clock that is off by more than a frame."""
+    """Return the reason why an array with this offset, of more than a frame, is degraded."""
     side = "ahead of" if offset.offset_s > 0 else "behind"
     return (
         f"its clock is {1e3 * abs(offset.offset_s):.0f} ms (±{1e3 * offset.std_s:.0f}) {side} that of "
-        f"{offset.reference!r}, by {offset.sounds} sounds; this is corrected for: set both by NTP"
+        f"{offset.reference!r}, estimated from {offset.sounds} sounds and corrected; set both by NTP"
     )
 
 
@@ -248,7 +262,7 @@ class _Line:
 
 
 def _line(times_ns: Sequence[int], offsets_s: Sequence[float]) -> _Line:
-    """Line through the offsets at some times by iterated weights (Tukey's); flat where too few tell its slope."""
+    """Fit a line to offsets by iterated weights (Tukey's biweight); the prior keeps it flat where there are few."""
     origin_ns, late_s = times_ns[-1], np.array(offsets_s)
     terms = np.stack([np.ones_like(late_s), (np.array(times_ns) - origin_ns) / 1e9], axis=1)
     found = np.array([np.median(late_s), 0.0])
@@ -262,14 +276,20 @@ def _line(times_ns: Sequence[int], offsets_s: Sequence[float]) -> _Line:
 
 
 def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, float]) -> dict[str, float]:
-    """How late each array heard a sound against one that did well, but for the travel time; none where it is not sure.
+    """Compare the arrival times of a sound at several arrays, less the travel times.
 
     Parameters
     ----------
     frames : mapping of array to its frames
-        Without gaps, from the run-up on.
+        Frames of the sound without gaps, the pre-roll first.
     travel_s : mapping of array to float
-        From the sound's place to the array.
+        Travel time from the sound's position to each array, in seconds.
+
+    Returns
+    -------
+    dict of array to float
+        Seconds by which the sound is later than at the array with the clearest rises, which has 0. Arrays without a
+        clear answer are missing; without any it is empty.
     """
     rises = {array: _rises(some) for array, some in frames.items() if len(some) > 1}
     if len(rises) < 2:
@@ -285,8 +305,8 @@ def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, flo
 
 
 def _rises(frames: Sequence[Frame]) -> FloatArray:
-    """By how much the power of each piece of `HOP_S` exceeds all before it, less the decay; log, (n,)."""
-    frames = frames[: round(LISTENED_S / FRAME_S)]
+    """Return by how much the log power of each piece of `HOP_S` exceeds the decay of all before it, (n,)."""
+    frames = frames[: round(MOST_USED_S / FRAME_S)]
     samples = np.concatenate([frame.samples[:_MICROPHONES] for frame in frames], axis=1)
     steps = np.diff(samples, axis=1, prepend=samples[:, :1])  # no rumble
     pieces = round(FRAME_S / HOP_S)
@@ -303,7 +323,7 @@ def _rises(frames: Sequence[Frame]) -> FloatArray:
 
 
 def _lag_s(first: FloatArray, other: FloatArray) -> float | None:
-    """By how much later the other's rises come, seconds; None where they do not fit, or as well at another lag."""
+    """Return by how much later the other's rises come, in seconds; None where they do not match, or match twice."""
     norm = float(np.sqrt(np.square(first).sum() * np.square(other).sum()))
     if norm == 0.0:
         return None

@@ -1,7 +1,8 @@
-"""What is made of the arrays' frames, in order, and kept for all fusions of the same messages: each is heard once.
+"""Caches the correlation of every frame, so that the early and the final pass compute it once.
 
-An array's frames from some first one on, none missing, are a chain; its number tells all that a listener went by. Who
-follows a chain that another one has followed already finds there what it is to find, and goes on where that one ends.
+A run is a stretch of an array's frames with consecutive frame indices. What a front end returns for a frame depends on
+the whole run up to it; a key made of the run's frames therefore identifies the correlation. A pass that follows a run
+which another pass has followed before finds its correlations in the cache, and continues where that one ended.
 """
 
 from __future__ import annotations
@@ -15,110 +16,112 @@ from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.locate.estimator import Estimator
 from livessl.core.types import Frame
 
-SHARED_FRAMES: Final = 4096
-"""Frames of which it is kept what listeners made of them: some seconds of many arrays."""
+CACHED_FRAMES: Final = 4096
+"""Number of frames whose correlations are cached: some seconds of 64 arrays."""
 
-LISTENERS: Final = 4
-"""Of each array, kept at the ends of the chains that were followed last: somebody may go on there."""
+CACHED_FRONT_ENDS: Final = 4
+"""Number of front ends cached for each array, at the ends of the runs that were followed last."""
 
-
-Each = Callable[[Callable[[Any], None], Iterable[Any]], None]
-"""Calls the first with each of the second, in any order, and returns when all is done."""
+ForEach = Callable[[Callable[[Any], None], Iterable[Any]], None]
+"""A parallel `for_each(function, items)`: applies `function` to every item, in any order; returns when all are done."""
 
 
 @dataclass(slots=True)
-class Ear:
-    """How far one array has been followed, and what was heard of it, by frame index."""
+class Correlations:
+    """Correlations of one array's frames, by frame index, and the run that they have followed so far."""
 
-    chain: int = 0
-    begin: int = 0
+    run: int | None = None  # key of the run; None where the last frame index had no frame
+    first: int = 0  # frame index at which the run begins
     onsets: dict[int, OnsetGCC] = field(default_factory=dict)
 
     def has(self, frame_indices: Iterable[int]) -> bool:
-        """Whether all of these were heard."""
+        """Return whether the correlations of all these frame indices are there."""
         return all(frame_index in self.onsets for frame_index in frame_indices)
 
     def at(self, frame_indices: Iterable[int]) -> tuple[OnsetGCC, ...]:
-        """What was heard at `rasters`."""
+        """Return the correlations of those of these frame indices that have one."""
         return tuple(self.onsets[frame_index] for frame_index in frame_indices if frame_index in self.onsets)
 
 
-Followed = tuple[str, Ear, Mapping[int, Frame]]
-"""An array, how far it has been followed, and its frames by frame index."""
+Followed = tuple[str, Correlations, Mapping[int, Frame]]
+"""An array's name, its correlations so far, and its frames by frame index."""
 
 
-class Listening:
-    """The listeners of an estimator.
+class CorrelationCache:
+    """The front ends of an estimator, and the correlations that they returned.
 
     Parameters
     ----------
     estimator : Estimator
-    each : callable or None
-        Does some work on each of some arrays, several at once perhaps; None does one after the other.
+    for_each : ForEach or None
+        Applies a function to several arrays, perhaps in parallel; None does one after the other.
     """
 
-    def __init__(self, estimator: Estimator, each: Each | None = None) -> None:
+    def __init__(self, estimator: Estimator, for_each: ForEach | None = None) -> None:
         self._estimator = estimator
-        self._each = _in_turn if each is None else each
+        self._for_each = _one_by_one if for_each is None else for_each
         self._onsets: dict[tuple[str, int], OnsetGCC] = {}
-        self._listeners: defaultdict[str, dict[int, OnsetFrontEnd]] = defaultdict(dict)
+        self._front_ends: defaultdict[str, dict[int, OnsetFrontEnd]] = defaultdict(dict)
 
-    def hear(self, followed: Iterable[Followed], frame_indices: Sequence[int]) -> None:
-        """Let ears follow their arrays through some frame indices; where a frame is missing another chain begins."""
-        self._each(lambda one: self._follow(one, frame_indices), followed)
-        _limit(self._onsets, SHARED_FRAMES)
+    def extend(self, followed: Iterable[Followed], frame_indices: Sequence[int]) -> None:
+        """Extend the correlations of some arrays by these frame indices; a missing frame ends the run."""
+        self._for_each(lambda one: self._extend(one, frame_indices), followed)
+        _limit(self._onsets, CACHED_FRAMES)
 
-    def _follow(self, followed: Followed, frame_indices: Sequence[int]) -> None:
-        array, ear, frames = followed
+    def clear(self) -> None:
+        """Empty the cache."""
+        self._onsets.clear()
+        self._front_ends.clear()
+
+    def _extend(self, followed: Followed, frame_indices: Sequence[int]) -> None:
+        array, correlations, frames = followed
         for frame_index in frame_indices:
-            if frame_index in ear.onsets:
+            if frame_index in correlations.onsets:
                 continue
             frame = frames.get(frame_index)
             if frame is None:
-                ear.chain = 0
+                correlations.run = None
                 continue
-            before = ear.chain
-            ear.begin = ear.begin if before else frame_index
-            ear.chain = hash((before, frame_index, frame.time_ns, frame.active, frame.sample_rate_hz))
-            onsets = self._onsets.get((array, ear.chain))
+            before = correlations.run
+            if before is None:
+                correlations.first = frame_index
+            run = hash((before, frame_index, frame.time_ns, frame.active, frame.sample_rate_hz))
+            correlations.run = run
+            onsets = self._onsets.get((array, run))
             if onsets is None:
-                listener = self._listeners[array].pop(before, None) if before else None
-                if listener is None or listener.sample_rate_hz != frame.sample_rate_hz:
-                    listener = self._caught_up(array, frame.sample_rate_hz, range(ear.begin, frame_index), frames)
-                if listener is None:
+                front_end = None if before is None else self._front_ends[array].pop(before, None)
+                if front_end is None or front_end.sample_rate_hz != frame.sample_rate_hz:
+                    span = range(correlations.first, frame_index)
+                    front_end = self._caught_up(array, frame.sample_rate_hz, span, frames)
+                if front_end is None:
                     continue
-                onsets = self._onsets[array, ear.chain] = _push(listener, frame)
-                self._listeners[array][ear.chain] = listener
-                _limit(self._listeners[array], LISTENERS)
-            ear.onsets[frame_index] = onsets
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._onsets.clear()
-        self._listeners.clear()
+                onsets = self._onsets[array, run] = _push(front_end, frame)
+                self._front_ends[array][run] = front_end
+                _limit(self._front_ends[array], CACHED_FRONT_ENDS)
+            correlations.onsets[frame_index] = onsets
 
     def _caught_up(
         self, array: str, sample_rate_hz: float, frame_indices: range, frames: Mapping[int, Frame]
     ) -> OnsetFrontEnd | None:
-        """A new listener that has heard what is still there of a chain; None where the estimator has none."""
-        listener = self._estimator.onset_front_end(array, sample_rate_hz)
-        if listener is not None:
+        """Make a front end and push what is left of a run; None where the estimator uses no front end."""
+        front_end = self._estimator.onset_front_end(array, sample_rate_hz)
+        if front_end is not None:
             for frame_index in frame_indices:
                 frame = frames.get(frame_index)
                 if frame is None or not frame.samples.size or frame.sample_rate_hz != sample_rate_hz:
-                    listener.reset()
+                    front_end.reset()
                 else:
-                    _push(listener, frame)
-        return listener
+                    _push(front_end, frame)
+        return front_end
 
 
-def _in_turn(work: Callable[[Any], None], items: Iterable[Any]) -> None:
+def _one_by_one(function: Callable[[Any], None], items: Iterable[Any]) -> None:
     for item in items:
-        work(item)
+        function(item)
 
 
-def _push(listener: OnsetFrontEnd, frame: Frame) -> OnsetGCC:
-    return listener.push(frame.samples, quiet=not frame.active)
+def _push(front_end: OnsetFrontEnd, frame: Frame) -> OnsetGCC:
+    return front_end.push(frame.samples, quiet=not frame.active)
 
 
 def _limit(kept: dict[int, OnsetFrontEnd] | dict[tuple[str, int], OnsetGCC], most: int) -> None:

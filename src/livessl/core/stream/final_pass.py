@@ -1,293 +1,295 @@
-"""Live answers now, settled ones when all sound is in: two fusions of the same messages, behind one door.
+"""Early results now, final ones when all sound is in: two passes over the same messages, behind one door.
 
-The live fusion closes a frame index at its deadline, whoever is missing. The settled one closes it when every array
-has told all that it has of it, however late and in whatever order that came; its events are those that stay. While
-nobody is late the two go in step, and only the settled one tells events. It reads no clock.
+The early pass closes a frame index at its deadline, whatever is missing. The final pass closes it when every array has
+sent all that it has of it, however late and in whatever order that came; its events replace the early ones. While
+nothing is late both keep in step, and only the final pass reports events. It reads no clock.
 """
 
 from __future__ import annotations
 
-import heapq
-from collections import deque
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Final
 
-from livessl.core.stream.array_health import LOST_NS, ArrayStatus
-from livessl.core.stream.fusion import EARLIEST_NS, LATEST_NS, Fusion
-from livessl.core.types import FRAME_NS, FRAME_S, BackfillRequest, Event, Frame, Mark, Message, Output
+from livessl.core.locate.estimator import PowerMaps
+from livessl.core.stream.alignment import EARLIEST_NS, LATEST_NS
+from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.stream.fusion import Fusion, Role
+from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
+from livessl.core.stream.reception import Reception, earlier, later
+from livessl.core.stream.site_state import SiteState
+from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Mark, Message, Output, Window
 
-HOLD_NS: Final = 600_000_000_000
-"""Sound waits so long for an array that is away: a restart, a cable, a switch. Meanwhile live events tell of it."""
+STRIDE: Final = 40
+"""Number of frame indices that the final pass closes at a time: two seconds. After a stride with events the early pass
+has its turn."""
 
-HOLD_BYTES: Final = 256 * 1024 * 1024
-"""Sound that waits, at most: five minutes of one array that never falls silent."""
-
-PIECE: Final = 40
-"""Intervals settled at a time: two seconds. After a piece with events live sound has its turn."""
-
-_NEVER: Final = -(2**62)
-_ALWAYS: Final = 2**62
+FINAL: Final = Role(updates=False, watches_health=False)
+"""Role of the final pass. It receives all frames in order, and so it is the one that learns the clocks' offsets."""
 
 
 @dataclass(frozen=True, slots=True)
 class FinalResults:
-    """Events that stay, and the frame index before which all sound has become such: in order of time."""
+    """Final events in order of time, and the frame index before which all sound has become such."""
 
     events: tuple[Event, ...]
     until: int
 
 
-@dataclass(slots=True)
-class _Source:
-    """How much of one array's sound is known, in frame indices of its own clock."""
-
-    live_until: int = _NEVER
-    backlog_at: int | None = None
-    live_from: int = _NEVER
-    heard_ns: int | None = None
-    left: bool = False
-    seen: set[int] = field(default_factory=set)
-
-    @property
-    def known_until(self) -> int:
-        return self.live_until if self.backlog_at is None else self.backlog_at
-
-    def is_there(self, now_ns: int) -> bool:
-        return self.heard_ns is not None and now_ns - self.heard_ns < LOST_NS
-
-    def is_backlog(self, frame_index: int) -> bool:
-        return self.backlog_at is not None and frame_index < self.live_from
-
-
 class TwoPassFusion:
-    """The live fusion and its settled twin.
+    """The early and the final pass.
 
     Parameters
     ----------
-    fusion : Fusion
-        The live one, at its beginning.
+    state : SiteState
+        What both share.
     arrays : iterable of str
-        Whose sound is waited for.
+        Arrays whose sound is awaited.
     settled : int or None
-        The frame index before which all is settled already; None begins anew.
+        Frame index before which all results are final already; None begins anew.
+    newest_only : bool
+        Whether the early pass keeps up with live sound: see `Role`.
+    hold_ns, hold_bytes : int
+        Limits on the frames that are held for an array that is away: see `HeldFrames`.
     """
 
-    def __init__(self, fusion: Fusion, arrays: Iterable[str], settled: int | None = None) -> None:
-        self.live = fusion
-        self._excluded: Collection[str] = ()
-        self._sources = {name: _Source() for name in arrays}
-        self.duplicates = dict.fromkeys(self._sources, 0)
-        self.backfilled = dict.fromkeys(self._sources, 0)
-        self.too_late = dict.fromkeys(self._sources, 0)
-        self.asked = dict.fromkeys(self._sources, 0)
-        self.helped = dict.fromkeys(self._sources, 0)
+    def __init__(
+        self,
+        state: SiteState,
+        arrays: Iterable[str],
+        settled: int | None = None,
+        *,
+        newest_only: bool = False,
+        hold_ns: int = HOLD_NS,
+        hold_bytes: int = HOLD_BYTES,
+    ) -> None:
+        self._state = state
+        self._limits = hold_ns, hold_bytes
+        self._early = Fusion(state, Role(newest_only=newest_only, learns_clocks=False))
+        self._receptions = {name: Reception() for name in arrays}
+        self.duplicates = dict.fromkeys(self._receptions, 0)
+        self.backfilled = dict.fromkeys(self._receptions, 0)
+        self.too_late = dict.fromkeys(self._receptions, 0)
+        self.asked = dict.fromkeys(self._receptions, 0)
+        """Number of backfill requests to each array."""
+        self.helped = dict.fromkeys(self._receptions, 0)
+        """Number of events with requested frames of each array."""
         self._begin(settled)
 
     @property
     def settled(self) -> int | None:
-        """Before this frame index no frame will be looked at again; None at the beginning."""
-        return self._slow.needed_from if self._slow.needed_from is not None else self._settled
+        """Frame index before which all results are final; None at the beginning."""
+        return self._settled if (needed_from := self._final.needed_from) is None else needed_from
 
     @property
     def settled_of(self) -> dict[str, int]:
-        """The same for each array, by its own clock: what its node calls that frame index."""
+        """The same for each array, by its own clock: as its node counts."""
         settled = self.settled
-        return {} if settled is None else {name: settled + self._ahead(name) for name in self._sources}
+        return {} if settled is None else {name: settled + self._ahead(name) for name in self._receptions}
 
-    def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int, *, answers: bool = False) -> None:
-        """An array's node has said what it kept: frame indices of its oldest frame and of the first live one.
+    @property
+    def updates_left_out(self) -> int:
+        """Number of windows that were not located, because newer ones were due."""
+        return self._early.updates_left_out
 
-        `answers` says whether it can be asked for what it did not send.
-        """
-        source = self._sources.get(array)
-        if source is None:
-            return
-        (self.live.can_backfill.add if answers else self.live.can_backfill.discard)(array)
-        source.heard_ns, source.left = now_ns, False
-        if backlog is not None:
-            if source.backlog_at is None or source.live_from != backlog[1]:
-                source.backlog_at, source.live_from = backlog[0] - 1, backlog[1]
-        elif source.backlog_at is not None:
-            source.live_until = max(source.live_until, source.live_from - 1)
-            source.backlog_at = None
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the samples that wait for the final pass, in bytes."""
+        return self._held.nbytes
 
-    def leave(self, array: str) -> None:
-        """The array's node said good-bye: nobody waits for it."""
-        self.live.leave(array)
-        self.live.can_backfill.discard(array)
-        if array in self._sources:
-            self._sources[array].left = True
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Compute what an array's sound will need, so that its first event does not wait for it."""
+        self._early.prepare(array, sample_rate_hz)
 
-    def exclude(self, arrays: Collection[str]) -> None:
-        """Wait for none of these arrays and ask none of them, from now on, and all others again."""
-        self._excluded = arrays
-        self.live.exclude(arrays)
-        self._slow.exclude(arrays)
+    def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
+        """Return the estimator's maps of a window that it located. Any thread may call it."""
+        return self._early.power_maps(window, separately)
 
     def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
-        """How every array is doing: see `Fusion.status`."""
-        return self.live.status(now_ns, levels=levels)
+        """Return the status of every array: see `Fusion.status`."""
+        return self._early.status(now_ns, levels=levels)
+
+    def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int, *, answers: bool = False) -> None:
+        """Take in the greeting of an array's node.
+
+        Parameters
+        ----------
+        array : str
+        backlog : (int, int) or None
+            The oldest frame that it kept, and the first live one; None where all that it kept has come.
+        now_ns : int
+        answers : bool
+            Whether the node answers backfill requests.
+        """
+        reception = self._receptions.get(array)
+        if reception is None:
+            return
+        (self._state.can_backfill.add if answers else self._state.can_backfill.discard)(array)
+        reception.greet(backlog, now_ns)
+
+    def leave(self, array: str) -> None:
+        """Wait no longer for an array whose node has ended on purpose."""
+        self._early.leave(array)
+        self._state.can_backfill.discard(array)
+        if array in self._receptions:
+            self._receptions[array].leave()
+
+    def exclude(self, arrays: Collection[str]) -> None:
+        """Exclude these arrays from now on, and include all others again: see `SiteState.exclude`."""
+        self._state.exclude(arrays)
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output | FinalResults]:
-        """Take in messages, in any order between arrays; return what there is to tell."""
-        if self.settled is not None and self.settled * FRAME_NS - now_ns > LATEST_NS:
+        """Take in messages, in any order between arrays; return what there is to report."""
+        settled = self.settled
+        if settled is not None and settled * FRAME_NS - now_ns > LATEST_NS:
             self._begin(None)  # the server's clock was set back: what was settled lies in the future now
-            self.live.leave_out(_NEVER, _NEVER)
+            self._early.skip_events(None, None)
         live: list[Message] = []
-        answers: list[Message] = []
-        for message in messages:
-            if isinstance(message, Frame) and message.sequence == 0:
-                answers.append(message)
+        requested: list[Message] = []
+        for message in map(self._state.without_excluded, messages):
+            if isinstance(message, Frame) and message.requested:
+                requested.append(message)
             elif self._take(message, now_ns):
                 live.append(message)
         frontier = self._frontier(now_ns)
-        settled = self._settle(frontier, now_ns, answers)
-        self.live.leave_out(_NEVER if self.settled is None else self.settled, frontier)
-        told = [*self.live.step(live + answers, now_ns), *settled]
-        for output in told:
+        final = self._settle(frontier, now_ns, requested)
+        self._early.skip_events(self.settled, frontier)
+        outputs = [*self._early.step(live + requested, now_ns), *final]
+        for output in outputs:
             if isinstance(output, BackfillRequest):
                 self.asked[output.array] += 1
-        return told
+        return outputs
 
     def flush(self, now_ns: int) -> list[Output | FinalResults]:
-        """End of the recording: settle everything without waiting for anyone."""
+        """Report everything without waiting for any array, at the end of a recording."""
         end = self._end()
-        self.live.can_backfill.clear()
-        self.live.leave_out(end, end)
-        outputs: list[Output | FinalResults] = [*self.live.flush(now_ns)]
-        while self._newest != _NEVER and (self._position is None or self._position < end):
+        self._state.can_backfill.clear()
+        self._early.skip_events(end, end)
+        outputs: list[Output | FinalResults] = [*self._early.flush(now_ns)]
+        while end is not None and (self._position is None or self._position < end):
             outputs += self._settle(end, now_ns)
         return outputs
 
     def _begin(self, settled: int | None) -> None:
-        self._slow = self.live.twin()
+        self._final = Fusion(self._state, FINAL)
         if settled is not None:
-            self._slow.begin(settled)
+            self._final.begin(settled)
         self._settled = settled
-        self._position: int | None = None
-        self._newest = _NEVER
-        self._overdue = self._forced = _NEVER
-        self._waiting: list[tuple[int, str, Frame]] = []
-        self._held: deque[tuple[int, int, int]] = deque()  # when it came, its frame index, its bytes
-        self._bytes = 0
-        self._late: set[int] = set()
-        self._forgotten: int | None = None
-        for source in self._sources.values():
-            source.seen.clear()
-            source.live_until = _NEVER
+        self._position: int | None = None  # frame index up to which the final pass has gone
+        self._newest: int | None = None  # the newest frame index that has come of any array
+        self._held = HeldFrames(*self._limits)
+        self._late: set[int] = set()  # active frame indices that the early pass could not use in time
+        self._forgotten_before: int | None = None
+        for reception in self._receptions.values():
+            reception.start_over()
+
+    # --- what comes in
 
     def _take(self, message: Message, now_ns: int) -> bool:
-        """Take in a message; whether the live fusion shall see it."""
-        source = self._sources.get(message.array)
-        if source is None:
+        """Take in a message for the final pass; return whether the early pass shall have it, too."""
+        reception = self._receptions.get(message.array)
+        if reception is None:
             return True
-        own, backlog = message.frame_index, source.is_backlog(message.frame_index)
-        frame_index = own - self._ahead(message.array)
+        own = message.frame_index
+        frame_index, is_backlog = own - self._ahead(message.array), reception.is_backlog(own)
         ahead_ns = frame_index * FRAME_NS - now_ns
-        if ahead_ns > LATEST_NS or (ahead_ns < EARLIEST_NS and not backlog):
-            return True  # it will be rejected there, and the reason told
-        source.heard_ns, source.left = now_ns, False
-        self._newest = max(self._newest, frame_index)
+        if ahead_ns > LATEST_NS or (ahead_ns < EARLIEST_NS and not is_backlog):
+            return True  # the early pass rejects it, and notes why
+        reception.touch(now_ns)
+        self._newest = frame_index if self._newest is None else max(self._newest, frame_index)
         if isinstance(message, Mark):
-            source.live_until = max(source.live_until, own)
+            reception.take_mark(own)
             return True
-        if backlog:
-            source.backlog_at = max(source.known_until, own)
-        if own in source.seen or (self.settled is not None and frame_index < self.settled):
-            too_late = own not in source.seen and _NEVER < source.live_until < own
-            (self.too_late if too_late else self.duplicates)[message.array] += 1
-        else:
-            self._keep(source, message, frame_index, now_ns)
-            self.backfilled[message.array] += backlog
-            closed = self.live.closed
-            in_time = -ahead_ns < self.live.parameters.deadline_s * 1e9 if backlog else True
-            if message.active and (not in_time or (closed is not None and frame_index <= closed)):
-                self._late.add(frame_index)
-            return in_time
-        return False
+        if is_backlog:
+            reception.take_backlog(own)
+        settled = self.settled
+        if own in reception.seen or (settled is not None and frame_index < settled):
+            (self.too_late if reception.is_passed(own) else self.duplicates)[message.array] += 1
+            return False
+        reception.add(own)
+        self._held.push(message, frame_index, now_ns)
+        self.backfilled[message.array] += is_backlog
+        closed = self._early.closed
+        is_in_time = not is_backlog or -ahead_ns < self._state.parameters.deadline_s * 1e9
+        if message.active and (not is_in_time or (closed is not None and frame_index <= closed)):
+            self._late.add(frame_index)
+        return is_in_time
 
     def _ahead(self, array: str) -> int:
-        """By how many frame indices its clock is taken to be ahead."""
-        return self._slow.frames_ahead(array)
+        """Return by how many frames an array's own frame indices are ahead of the joint ones."""
+        return self._final.frames_ahead(array)
 
-    def _keep(self, source: _Source, frame: Frame, frame_index: int, now_ns: int) -> None:
-        source.seen.add(frame.frame_index)
-        if source.backlog_at is None or frame.frame_index >= source.live_from:
-            source.live_until = max(source.live_until, frame.frame_index)
-        heapq.heappush(self._waiting, (frame_index, frame.array, frame))
-        self._held.append((now_ns, frame_index, frame.samples.nbytes))
-        self._bytes += frame.samples.nbytes
+    def _frontier(self, now_ns: int) -> int | None:
+        """Return the frame index up to which all awaited arrays have sent everything; None where one has sent nothing.
 
-    def _frontier(self, now_ns: int) -> int:
-        """The frame index up to which everyone who is waited for has told all."""
-        excess = self._bytes - HOLD_BYTES
-        while self._held:
-            came_ns, frame_index, size = self._held[0]
-            if excess > 0:
-                self._forced = max(self._forced, frame_index)
-            elif now_ns - came_ns > HOLD_NS:
-                self._overdue = max(self._overdue, frame_index)
-            elif self._position is None or frame_index > self._position:
-                break
-            excess -= size
-            self._held.popleft()
-        awaited = {
-            name: source for name, source in self._sources.items() if not source.left and name not in self._excluded
-        }
-        known_until = {name: source.known_until - self._ahead(name) for name, source in awaited.items()}
-        there = [known_until[name] for name, source in awaited.items() if source.is_there(now_ns)]
-        away = [known_until[name] for name, source in awaited.items() if not source.is_there(now_ns)]
-        known = min(min(there, default=_ALWAYS), max(min(away), self._overdue) if away else _ALWAYS)
-        return max(self._end() if known == _ALWAYS else known, self._forced)
+        Arrays that are away are awaited until the frames of the others are overdue.
+        """
+        self._held.expire(now_ns, self._position)
+        connected: list[int | None] = []
+        away: list[int | None] = []
+        for name, reception in self._receptions.items():
+            if not (reception.has_left or self._state.is_excluded(name)):
+                known = reception.known_until
+                known = None if known is None else known - self._ahead(name)
+                (connected if reception.is_connected(now_ns) else away).append(known)
+        if away:
+            connected.append(later(reduce(earlier, away), self._held.overdue_until))
+        return later(reduce(earlier, connected) if connected else self._end(), self._held.forced_until)
 
-    def _end(self) -> int:
-        """Where what has come so far has surely ended."""
-        return self._newest + round(self.live.parameters.hang_over_s / FRAME_S) + 1
+    def _end(self) -> int | None:
+        """Return the frame index at which all sound that has come has surely ended."""
+        return None if self._newest is None else self._newest + self._state.parameters.activity.hang_over_frames + 1
+
+    # --- the final pass
 
     def _settle(
-        self, frontier: int, now_ns: int, answers: Sequence[Message] = ()
+        self, frontier: int | None, now_ns: int, requested: Sequence[Message] = ()
     ) -> list[FinalResults | BackfillRequest]:
-        if self._newest == _NEVER or frontier <= _NEVER:
+        if self._newest is None or frontier is None:
             return []
         if self._position is None:
-            self._position = min(self._waiting[0][0] if self._waiting else frontier, frontier) - 1
-        outputs = self._slow.step(answers, (self._position + 1) * FRAME_NS) if answers else []
+            first = self._held.first
+            self._position = (frontier if first is None else min(first, frontier)) - 1
+        outputs = self._final.step(requested, (self._position + 1) * FRAME_NS) if requested else []
         while self._position < frontier and not any(isinstance(output, Event) for output in outputs):
-            end = min(frontier, self._piece_end(self._position))
-            batch: list[Message] = []
-            while self._waiting and self._waiting[0][0] <= end:
-                frame = heapq.heappop(self._waiting)[2]
-                self._bytes -= frame.samples.nbytes
-                batch.append(frame)
-            ahead = {name: self._ahead(name) for name in self._sources}
-            batch += [Mark(name, 0, end + frames, 0.0, 0.0, ()) for name, frames in ahead.items()]
-            outputs += self._slow.step(batch, (end + 1) * FRAME_NS)
-            if any(self._ahead(name) != frames for name, frames in ahead.items()):
-                self._waiting = [(f.frame_index - self._ahead(f.array), f.array, f) for _, _, f in self._waiting]
-                heapq.heapify(self._waiting)
+            end = self._stride_end(self._position, frontier)
+            outputs += self._close(end)
             self._position = end
-        events = tuple(self._dated(output, now_ns) for output in outputs if isinstance(output, Event))
+        events = tuple(_dated(output, now_ns, self._late) for output in outputs if isinstance(output, Event))
         self._forget()
-        for contribution in (c for event in events for c in event.contributions):
+        for contribution in (contribution for event in events for contribution in event.contributions):
             self.helped[contribution.array] += contribution.asked
-        asks = [output for output in outputs if isinstance(output, BackfillRequest)]
-        return [*asks, FinalResults(events, until)] if events and (until := self.settled) is not None else [*asks]
+        requests = [output for output in outputs if isinstance(output, BackfillRequest)]
+        settled = self.settled
+        return [*requests, FinalResults(events, settled)] if events and settled is not None else [*requests]
 
-    def _piece_end(self, position: int) -> int:
-        nearest = self._waiting[0][0] if self._waiting else _ALWAYS
-        return position + PIECE if self._slow.hears or nearest <= position + PIECE else nearest - 1
+    def _close(self, end: int) -> list[Output]:
+        """Let the final pass close everything up to a frame index."""
+        before = {name: self._ahead(name) for name in self._receptions}
+        outputs = self._final.step(self._held.pop_until(end), (end + 1) * FRAME_NS, complete_until=end)
+        if any(self._ahead(name) != frames for name, frames in before.items()):
+            self._held.reindex(self._ahead)
+        return outputs
 
-    def _dated(self, event: Event, now_ns: int) -> Event:
-        late = any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in self._late)
-        return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=late)
+    def _stride_end(self, position: int, frontier: int) -> int:
+        """Return up to which frame index the final pass closes at once: far, while there is no sound."""
+        stride, first = position + STRIDE, self._held.first
+        if not self._final.is_in_event and (first is None or first > stride):
+            stride = frontier if first is None else first - 1
+        return min(frontier, stride)
 
     def _forget(self) -> None:
         settled = self.settled
-        if settled is None or settled == self._forgotten:
+        if settled is None or settled == self._forgotten_before:
             return
-        self._forgotten = settled
+        self._forgotten_before = settled
         self._late = {frame_index for frame_index in self._late if frame_index >= settled}
-        for name, source in self._sources.items():
-            if source.seen:
-                source.seen = {own for own in source.seen if own >= settled + self._ahead(name)}
+        for name, reception in self._receptions.items():
+            reception.forget(settled + self._ahead(name))
+
+
+def _dated(event: Event, now_ns: int, late: Collection[int]) -> Event:
+    """Return an event as it is reported now; `late` holds the frame indices that the early pass could not use."""
+    is_late = any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in late)
+    return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=is_late)

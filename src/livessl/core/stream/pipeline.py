@@ -1,4 +1,4 @@
-"""From the blocks of one device to the messages of the arrays on its channels. It never waits."""
+"""Turns the blocks of one device into the messages of the arrays on its channels. It never waits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Pipeline:
     sample_rate_hz : float
         Nominal rate of the device.
     parameters : ActivityParameters
-        How sound is told from the background.
+        Parameters of the activity rule, which separates sound from the background.
     """
 
     def __init__(self, wirings: Sequence[Wiring], sample_rate_hz: float, parameters: ActivityParameters) -> None:
@@ -64,7 +64,7 @@ class Pipeline:
             message
             for segmenter in self._segmenters
             if segmenter.array == request.array
-            for message in segmenter.ask(request.first, request.last)
+            for message in segmenter.backfill(request.first, request.last)
         ]
 
     def flush(self) -> list[Message]:

@@ -13,17 +13,18 @@ from livessl.core.stream.timeline import Cut, Framer
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, Frame, IntArray, Mark, Message
 
 RECENT_S: Final = 12.0
-"""How long what was not sent is remembered: longer than the longest usual event, its run-up, and the asking."""
+"""Length, in seconds, of the sound that a node remembers whether or not it was sent: longer than the longest usual
+event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
-"""Frames held back at the start: the quietest of them is the first guess of the background."""
+"""Number of frames held back at the start; the quietest of them is the first estimate of the background."""
 
 
 class Segmenter:
     """Decides what is sound, and keeps what came just before it.
 
-    Every frame index yields one message in order, a `Mark` while it is quiet and a `Frame` around sound; intervals
-    of the pre-roll, already marked as quiet, are sent again as frames when sound begins.
+    Every frame index yields one message in order: a `Mark` while it is quiet, a `Frame` around sound. When sound
+    begins, the pre-roll, whose frame indices were marked as quiet before, is sent as frames.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ class Segmenter:
     sample_rate_hz : float
         Nominal rate of the device.
     parameters : ActivityParameters
-        The activity rule's numbers.
+        Parameters of the activity rule.
     """
 
     def __init__(
@@ -48,13 +49,13 @@ class Segmenter:
         self._channels = channels
         self._rate_hz = sample_rate_hz
         self._activity = CausalActivity(parameters)
-        self._hang_over = round(parameters.hang_over_s / FRAME_S)
+        self._hang_over = parameters.hang_over_frames
         self._warm_up: list[tuple[Cut, FloatArray]] | None = []
-        self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=round(parameters.pre_roll_s / FRAME_S))
+        self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=parameters.pre_roll_frames)
         self._recent: deque[tuple[Cut, float]] = deque(maxlen=round(RECENT_S / FRAME_S))
         self._quiet_frames = self._hang_over + 1
         self._sequence = 0
-        self._raster: int | None = None
+        self._frame_index: int | None = None
 
     @property
     def array(self) -> str:
@@ -62,12 +63,12 @@ class Segmenter:
         return self._spec.name
 
     def push(self, cut: Cut, framer: Framer) -> list[Message]:
-        """Take in the next frame index; `framer` tells how the device is doing."""
-        if self._raster is not None and cut.frame_index != self._raster + 1:
-            self._pre_roll.clear()  # what came before a gap is no run-up to what comes after it
+        """Take in the next frame of the device; `framer` holds the counters and the clock state that marks carry."""
+        if self._frame_index is not None and cut.frame_index != self._frame_index + 1:
+            self._pre_roll.clear()  # frames before a gap are no pre-roll of a sound after it
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
-        self._raster = cut.frame_index
+        self._frame_index = cut.frame_index
         power = band_power(self._selected(cut), self._rate_hz, self._spec.band_hz)
         if self._warm_up is None:
             return self._decide(cut, power, framer)
@@ -81,9 +82,9 @@ class Segmenter:
             self._activity.prime(min(float(power.mean()) for _, power in held))
         return [message for cut, power in held for message in self._decide(cut, power, framer)]
 
-    def ask(self, first: int, last: int) -> list[Message]:
-        """What is remembered of some frame indices, both ends included, whether or not it was sent."""
-        return [self._frame(cut, power, 0) for cut, power in self._recent if first <= cut.frame_index <= last]
+    def backfill(self, first: int, last: int) -> list[Message]:
+        """Return the remembered frames from `first` to `last`, both included, whether or not they were sent."""
+        return [self._requested_frame(cut, power) for cut, power in self._recent if first <= cut.frame_index <= last]
 
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
@@ -103,11 +104,12 @@ class Segmenter:
 
     def _next_frame(self, cut: Cut, power: float, active: bool) -> Frame:
         self._sequence += 1
-        return self._frame(cut, power, self._sequence, active)
+        samples, name = np.ascontiguousarray(self._selected(cut)), self._spec.name
+        return Frame(name, self._sequence, cut.frame_index, cut.time_ns, self._rate_hz, samples, power, active)
 
-    def _frame(self, cut: Cut, power: float, sequence: int, active: bool = False) -> Frame:
-        samples = np.ascontiguousarray(self._selected(cut))
-        return Frame(self._spec.name, sequence, cut.frame_index, cut.time_ns, self._rate_hz, samples, power, active)
+    def _requested_frame(self, cut: Cut, power: float) -> Frame:
+        samples, name = np.ascontiguousarray(self._selected(cut)), self._spec.name
+        return Frame(name, 0, cut.frame_index, cut.time_ns, self._rate_hz, samples, power, active=False, requested=True)
 
     def _mark(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> Mark:
         return Mark(

@@ -10,22 +10,22 @@ import numpy as np
 from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array
 
 MEMORY_S: Final = 60.0
-"""How far back the line fit looks: long against a block's jitter, short against a crystal's warming up."""
+"""Time constant of the line fit, in seconds: long against a block's jitter, short against a crystal's warming up."""
 
 STEP_NS: Final = 200_000_000
-"""A stamp this far off the line is no jitter: scheduling delays stay below it."""
+"""Deviation from the line, in nanoseconds, that is no jitter; scheduling delays stay below it."""
 
 STEP_BLOCKS: Final = 3
-"""So many such stamps in a row are a step of the clock; fewer are late callbacks."""
+"""Number of such stamps in a row that are a step of the clock; fewer are late callbacks."""
 
 LOCKED_S: Final = 2.0
-"""Sound needed before the fit is trusted."""
+"""Length of sound, in seconds, needed before the fit is trusted."""
 
 _SLOPE_RIDGE_S2: Final = 1e4
-"""Prior on the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
+"""Weight of the prior of the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
 
 _BOUNDARY: Final = 0.4
-"""Rounding of frame index boundaries to samples. Not a half: at 22.05 kHz every other boundary would be a tie."""
+"""Rounding of frame boundaries to samples. It is not a half: at 22.05 kHz every other boundary would be a tie."""
 
 
 class Timeline:
@@ -53,23 +53,23 @@ class Timeline:
 
     @property
     def started(self) -> bool:
-        """Whether there is a fit at all."""
+        """True once the first stamp has come."""
         return self._origin is not None
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster than nominal the device's clock runs, parts per million."""
+        """Excess of the device's clock rate over the nominal rate, in parts per million."""
         return -self._slope_ns_s / 1e3
 
     @property
     def state(self) -> ClockState:
-        """How far the fit can be trusted."""
+        """State of the fit: settling, locked, or stepped."""
         if self._last_x_s >= LOCKED_S:
             return ClockState.LOCKED
         return ClockState.STEPPED if self.steps else ClockState.SETTLING
 
     def update(self, index: int, stamp_ns: int) -> bool:
-        """Take in one block's stamp; returns True where the clock has stepped and the fit starts anew."""
+        """Take in one block's stamp; return True where the clock has stepped and the fit starts anew."""
         if self._origin is None:
             self._origin = (index, stamp_ns)
         stepped = False
@@ -94,13 +94,13 @@ class Timeline:
         return stepped
 
     def time_ns(self, index: int) -> int:
-        """Site time of a sample, nanoseconds since the epoch."""
+        """Return the site time of a sample, nanoseconds since the epoch."""
         first, start_ns = self._known_origin()
         x_s = (index - first) / self._rate_hz
         return start_ns + round(x_s * 1e9 + self._mean_y_ns + self._slope_ns_s * (x_s - self._mean_x_s))
 
     def index_at(self, time_ns: int) -> float:
-        """Sample index, with its fraction, at a site time: the inverse of `time_ns`."""
+        """Return the sample index, with its fraction, at a site time: the inverse of `time_ns`."""
         first, start_ns = self._known_origin()
         slope = self._slope_ns_s
         x_s = (time_ns - start_ns - self._mean_y_ns + slope * self._mean_x_s) / (1e9 + slope)
@@ -112,7 +112,7 @@ class Timeline:
 
     def _known_origin(self) -> tuple[int, int]:
         if self._origin is None:
-            raise RuntimeError("timeline: asked for a time before the first stamp")
+            raise RuntimeError("timeline: expected a stamp before the first query of a time; call update() first")
         return self._origin
 
     def _residual(self, index: int, stamp_ns: int) -> tuple[float, float]:
@@ -146,7 +146,7 @@ class Framer:
         self._frame_samples = sample_rate_hz * FRAME_NS / 1e9
         self._parts: list[Float32Array] = []
         self._begin = self._end = 0
-        self._raster: int | None = None
+        self._frame_index: int | None = None
 
     def push(self, block: Block) -> list[Cut]:
         """Take in a block; return the frames it completes. A gap drops the frame that it tears."""
@@ -162,23 +162,23 @@ class Framer:
                 self.timeline.restart()
         if self.timeline.update(block.first_index, block.stamp_ns):
             self._tear()
-        if self._raster is None:
+        if self._frame_index is None:
             self._begin = self._end = block.first_index
         self._parts.append(block.samples)
         self._end = block.first_index + count
         return self._cut()
 
     def _tear(self) -> None:
-        if self._raster is not None:
+        if self._frame_index is not None:
             self.lost_frames += 1
         self._parts.clear()
-        self._raster = None
+        self._frame_index = None
 
     def _boundary(self, frame_index: int) -> int:
         return int(np.floor(self.timeline.index_at(frame_index * FRAME_NS) + _BOUNDARY))
 
     def _cut(self) -> list[Cut]:
-        if self._raster is None:
+        if self._frame_index is None:
             frame_index = self.timeline.time_ns(self._begin) // FRAME_NS
             while self._boundary(frame_index) < self._begin:
                 frame_index += 1
@@ -187,15 +187,15 @@ class Framer:
                 self._parts.clear()
                 return []
             self._drop(start - self._begin)
-            self._raster = frame_index
+            self._frame_index = frame_index
         cuts: list[Cut] = []
-        while (stop := self._boundary(self._raster + 1)) <= self._end:
+        while (stop := self._boundary(self._frame_index + 1)) <= self._end:
             length = stop - self._begin
             if not 0.5 * self._frame_samples <= length <= 1.5 * self._frame_samples:
                 self._tear()  # the line moved by more than half a frame: start over on the new frame index
                 break
-            cuts.append(Cut(self._raster, self.timeline.time_ns(self._begin), self._take(length)))
-            self._raster += 1
+            cuts.append(Cut(self._frame_index, self.timeline.time_ns(self._begin), self._take(length)))
+            self._frame_index += 1
         return cuts
 
     def _joined(self) -> Float32Array:

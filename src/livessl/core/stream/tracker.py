@@ -1,8 +1,9 @@
-"""Tracks: a constant-velocity Kalman filter for each source, fed with estimates; time is passed in.
+"""Tracks: a constant-velocity Kalman filter for each source, updated with estimates; time is an argument.
 
-Estimates of one moment go to the tracks that make them likeliest together, so two that cross keep their names by where
-they were going; who turned round in a pause is looked for where he was heard last. An estimate moves its track as far
-as its covariance and its confidence let it, least along what the arrays cannot tell.
+The estimates of one moment are assigned to the tracks that make all of them most likely together, so that two sources
+which cross keep their tracks by their velocities. A source that turned round in a pause is also searched where it was
+last located. An estimate moves its track by its covariance and its confidence: least along the line of sight, where the
+arrays resolve least.
 """
 
 from __future__ import annotations
@@ -16,33 +17,34 @@ import numpy as np
 from livessl.core.types import Estimate, FloatArray, Track, TrackState
 
 ACCELERATION_M_S2: Final = 1.0
-"""Standard deviation of the acceleration that the motion model allows: a person setting off."""
+"""Standard deviation of the acceleration in the motion model, in m/s^2: a person who sets off."""
 
 START_SPEED_M_S: Final = 1.0
-"""Standard deviation of a new track's velocity: a walk."""
+"""Standard deviation of a new track's velocity, in m/s: a walking person."""
 
 GATE_M: Final = 1.0
-"""An estimate further than this from where every track should be by now, outside its uncertainty, and as far from where
-the track was heard last, starts a new one. One that is less sure than this starts none beside a track."""
+"""Distance, in metres, from a track's predicted position and from its last one beyond which an estimate that is also
+outside its uncertainty starts a new track. An estimate with a greater standard deviation starts none beside a track."""
 
 GATE_SIGMAS2: Final = 11.34
-"""99 % of a chi-square with three degrees of freedom."""
+"""Squared Mahalanobis distance of the gate: 99 % of a chi-square with three degrees of freedom."""
 
 SILENCE_S: Final = 3.0
-"""A track without estimates for so long has ended."""
+"""Time without estimates, in seconds, after which a track ends."""
 
-_NEVER: Final = 1e9
-"""Stands for what is outside every gate, where sums must stay finite."""
+_OUTSIDE: Final = 1e9
+"""Cost of an assignment outside every gate; finite, because the costs are summed."""
 
 CONFIRM_S: Final = 1.0
-"""While a source is followed, another is told of from its second estimate on, which must come within so long: a single
-one beside it is a reflection more often than somebody new."""
+"""Time, in seconds, within which a second estimate must confirm a new track while another source is followed: a single
+estimate beside it is a reflection more often than a new source."""
 
 MIN_STD_M: Final = 0.05
-"""The least believed of a single estimate's uncertainty: models of the room are not better than this."""
+"""Least standard deviation of an estimate, in metres; models of the room are not better than this."""
 
 WRONG_STD_M: Final = 0.5
-"""Standard deviation of an estimate that is wrong, along each axis; how likely it is wrong its confidence tells."""
+"""Standard deviation, in metres along each axis, of a wrong estimate; the confidence is the probability that an
+estimate is not wrong."""
 
 
 @dataclass(slots=True, eq=False)
@@ -52,18 +54,18 @@ class _Filter:
     state: FloatArray  # position and velocity (6,)
     covariance: FloatArray  # (6, 6)
     last: _Last
-    told: bool = False
+    confirmed: bool = False
 
     def predicted(self, time_ns: int) -> _Motion:
-        """Where it is if it goes on as it went."""
+        """Return its motion if it goes on at its velocity."""
         return _moved(self.state, self.covariance, time_ns - self.time_ns)
 
     def set_off_anew(self, time_ns: int) -> _Motion:
-        """Where it is if it went anywhere from where it was heard last."""
+        """Return its motion if it set off in any direction from its last position."""
         return _moved(*_at_rest(self.last.position_m, self.last.covariance_m2), time_ns - self.last.time_ns)
 
-    def update(self, motion: _Motion, estimate: _Found) -> None:
-        """Take in an estimate of it, having moved so."""
+    def update(self, motion: _Motion, estimate: _Measurement) -> None:
+        """Update it with an estimate, after a motion."""
         before = motion.covariance
         gain = before[:, :3] @ np.linalg.inv(before[:3, :3] + estimate.noise_m2)
         self.state = motion.state + gain @ (estimate.position_m - motion.state[:3])
@@ -71,8 +73,8 @@ class _Filter:
         keep[:, :3] -= gain
         self.covariance = keep @ before @ keep.T + gain @ estimate.noise_m2 @ gain.T  # Joseph form: stays symmetric
         self.time_ns = max(self.time_ns, estimate.time_ns)
-        if estimate.tells_place or not self.last.is_place:
-            self.last = _Last(self.time_ns, self.state[:3], self.covariance[:3, :3], estimate.tells_place)
+        if estimate.is_place or not self.last.is_place:
+            self.last = _Last(self.time_ns, self.state[:3], self.covariance[:3, :3], estimate.is_place)
 
     def track(self, state: TrackState) -> Track:
         return Track(
@@ -82,7 +84,7 @@ class _Filter:
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """Where a track was when an estimate last told its place; as long as none did, any estimate."""
+    """Position of a track at its last estimate that was a position; before the first of these, at its last estimate."""
 
     time_ns: int
     position_m: FloatArray
@@ -92,23 +94,23 @@ class _Last:
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """Where a track may have got to: position and velocity (6,), and their covariance (6, 6)."""
+    """Predicted position and velocity (6,) of a track, and their covariance (6, 6)."""
 
     state: FloatArray
     covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
-    """An estimate, with what is believed of its error: covariance (3, 3)."""
+class _Measurement:
+    """An estimate with the covariance (3, 3) of its error, its confidence included."""
 
     time_ns: int
     position_m: FloatArray
     noise_m2: FloatArray
-    tells_place: bool
+    is_place: bool
 
     @classmethod
-    def of(cls, estimate: Estimate, *, probable: bool) -> _Found:
+    def of(cls, estimate: Estimate, *, probable: bool) -> _Measurement:
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
         wrong = 1.0 - estimate.confidence if probable else 0.0
         least_m2 = MIN_STD_M**2 + wrong * WRONG_STD_M**2
@@ -134,26 +136,26 @@ class Tracker:
             Whether their confidence is the probability that they are right.
         """
         changed = self._end_silent(time_ns)
-        followed = any(track.told and time_ns - track.time_ns <= CONFIRM_S * 1e9 for track in self._filters)
-        found = [_Found.of(each, probable=probable) for each in estimates]
+        followed = any(track.confirmed and time_ns - track.time_ns <= CONFIRM_S * 1e9 for track in self._filters)
+        found = [_Measurement.of(each, probable=probable) for each in estimates]
         for estimate, known in zip(found, self._assigned(found), strict=True):
             if known is not None:
                 track, motion = known
                 track.update(motion, estimate)
-            elif estimate.tells_place or not followed:
+            elif estimate.is_place or not followed:
                 track = self._start(estimate)
             else:
                 continue
-            if track.told:
+            if track.confirmed:
                 changed.append(track.track(TrackState.UPDATE))
             elif known is not None or not followed:
-                track.id, track.told = self._next_id, True
+                track.id, track.confirmed = self._next_id, True
                 self._next_id += 1
                 changed.append(track.track(TrackState.NEW))
         return changed
 
-    def _assigned(self, found: Sequence[_Found]) -> list[tuple[_Filter, _Motion] | None]:
-        """The track of each estimate, no track twice: as many as can be, and of these the likeliest together."""
+    def _assigned(self, found: Sequence[_Measurement]) -> list[tuple[_Filter, _Motion] | None]:
+        """Assign to each estimate a track or None, no track twice: as many as possible, at the least total cost."""
         tracks = [*self._filters]
         if not tracks or not found:
             return [None] * len(found)
@@ -163,31 +165,31 @@ class Tracker:
         if len(found) == 1:
             pairs = [(0, int(cost[0].argmin()))]
         else:
-            from scipy.optimize import linear_sum_assignment  # most sites never get here, and it takes long to load
+            from scipy.optimize import linear_sum_assignment  # loaded late: most sites never need it, and it takes long
 
-            pairs = list(zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, _NEVER)), strict=True))
+            pairs = list(zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, _OUTSIDE)), strict=True))
         for row, column in pairs:
             if np.isfinite(cost[row, column]):
                 chosen[row] = tracks[column], expected[row][column][1]
         return chosen
 
-    def _start(self, estimate: _Found) -> _Filter:
-        last = _Last(estimate.time_ns, estimate.position_m, estimate.noise_m2, estimate.tells_place)
+    def _start(self, estimate: _Measurement) -> _Filter:
+        last = _Last(estimate.time_ns, estimate.position_m, estimate.noise_m2, estimate.is_place)
         started = _Filter(0, estimate.time_ns, *_at_rest(estimate.position_m, estimate.noise_m2), last)
         self._filters.append(started)
         return started
 
     def _end_silent(self, time_ns: int) -> list[Track]:
         def is_silent(track: _Filter) -> bool:
-            return time_ns - track.time_ns > (SILENCE_S if track.told else CONFIRM_S) * 1e9
+            return time_ns - track.time_ns > (SILENCE_S if track.confirmed else CONFIRM_S) * 1e9
 
-        ended = [track.track(TrackState.END) for track in self._filters if track.told and is_silent(track)]
+        ended = [track.track(TrackState.END) for track in self._filters if track.confirmed and is_silent(track)]
         self._filters = [track for track in self._filters if not is_silent(track)]
         return ended
 
 
 def _at_rest(position_m: FloatArray, covariance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """State and covariance of what may set off at once, in any direction."""
+    """Return the state and covariance of a source at rest that may set off at once, in any direction."""
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = covariance_m2
     covariance[3:, 3:] = START_SPEED_M_S**2 * np.eye(3)
@@ -202,13 +204,13 @@ def _moved(state: FloatArray, covariance: FloatArray, duration_ns: int) -> _Moti
     return _Motion(motion @ state, motion @ covariance @ motion.T + noise)
 
 
-def _expected(track: _Filter, estimate: _Found) -> tuple[float, _Motion]:
-    """How little an estimate was to be expected of a track, d^2 + ln det S, and how it moved; infinite out of its gate.
+def _expected(track: _Filter, estimate: _Measurement) -> tuple[float, _Motion]:
+    """Return the cost d^2 + ln det S of assigning an estimate to a track, and the track's motion.
 
-    What only tells a direction makes no source of a single estimate that nobody was told of.
+    The cost is infinite outside the gate, and where the estimate is only a direction and the track is not confirmed.
     """
     motion = track.predicted(estimate.time_ns)
-    if not (track.told or estimate.tells_place):
+    if not (track.confirmed or estimate.is_place):
         return np.inf, motion
     off_m, distance2, surprise = _off(motion, estimate)
     if distance2 <= GATE_SIGMAS2 or off_m <= GATE_M:
@@ -218,8 +220,8 @@ def _expected(track: _Filter, estimate: _Found) -> tuple[float, _Motion]:
     return (surprise if off_m <= GATE_M else np.inf), motion
 
 
-def _off(motion: _Motion, estimate: _Found) -> tuple[float, float, float]:
-    """How far an estimate is from where a track should be: metres, d^2, and d^2 + ln det S."""
+def _off(motion: _Motion, estimate: _Measurement) -> tuple[float, float, float]:
+    """Return the distance of an estimate from a predicted position: in metres, d^2, and d^2 + ln det S."""
     difference = estimate.position_m - motion.state[:3]
     spread = motion.covariance[:3, :3] + estimate.noise_m2
     distance2 = float(difference @ np.linalg.solve(spread, difference))

@@ -78,7 +78,7 @@ class Frame:
     array : str
         Name of the array.
     sequence : int
-        Number of the array's frame since its node started, from 1. A frame sent for a backfill request has 0.
+        Number of the array's frame since its node started, from 1; 0 where `requested`.
     frame_index : int
         Index on the grid of frames: site time of the interval's start divided by 50 ms.
     time_ns : int
@@ -91,6 +91,9 @@ class Frame:
         In-band mean power over the channels, full scale squared.
     active : bool
         Whether the causal activity detection found sound in it.
+    requested : bool
+        Whether it answers a `BackfillRequest`. It is then outside the numbering of the frames that the node sends by
+        itself.
 
     Raises
     ------
@@ -106,6 +109,7 @@ class Frame:
     samples: Float32Array
     power: float
     active: bool
+    requested: bool = False
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2 or self.samples.dtype != np.float32:

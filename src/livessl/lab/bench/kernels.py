@@ -1,8 +1,8 @@
-"""How fast this machine locates: correlation, search and maps, beside the rate at which it can look numbers up.
+"""The speed of this machine at correlation, search and maps, relative to its rate of bare table look-ups.
 
-Two arrays of four microphones and more, in the paper's room of 8 x 10 x 4 m at a reverberation time of 0.7 s, blocks of
-4096 samples. Every case is timed twice a round, round after round, so that what the machine does besides meets all
-alike: in turn, when the others have filled the caches with theirs, and again right after; medians are told.
+Two or more arrays of four microphones stand in the paper's room of 8 x 10 x 4 m with a reverberation time of 0.7 s; a
+block has 4096 samples. Every round times each case twice: in turn, when the other cases have filled the caches, and
+again right after. The rounds spread other load on the machine evenly over all cases; medians are reported.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ C_M_S: Final = 343.0
 BAND_HZ: Final = (100.0, 6000.0)
 RT60_S: Final = 0.7
 BLOCK: Final = 4096
-"""Samples, 93 ms: what is located at once."""
+"""Length, in samples, of the block that is located at once: 93 ms."""
 
 SEGMENT: Final = 44_100
 SNR_DB: Final = 20.0
@@ -41,29 +41,30 @@ PLACES_M: Final = (
     (4.0, 2.5, 2.0), (4.0, 7.5, 2.0), (1.0, 5.0, 2.0), (7.0, 5.0, 2.0),
     (1.0, 1.0, 1.5), (7.0, 9.0, 1.5), (7.0, 1.0, 2.5), (1.0, 9.0, 2.5),
 )  # fmt: skip
-"""Centres of the arrays, in the order in which they are taken."""
+"""Centres of the arrays, in the order in which they are used."""
 
 KINDS: Final = ("voice", "two voices", "noise")
-"""What is heard; noise alone is the slow case, for it has no peak that stands out."""
+"""Kinds of sound; noise alone is the slow case, because no peak stands out."""
 
 LOOKED_UP: Final = 1 << 20
+"""Look-ups of the reference case."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One case.
+    """The times of one case.
 
     Parameters
     ----------
     name : str
     median_ms, p99_ms, least_ms : float
-        In turn with all the others.
+        Times in turn with all other cases.
     again_median_ms, again_p99_ms : float
-        Right after, with the next block.
+        Times right after, with the next block.
     ratio : float or None
-        Of the median to the time that as many bare look-ups take on this machine.
+        Ratio of the median to the time of as many bare look-ups on this machine.
     least_ratio : float or None
-        The same of the least times: on a busy machine the steadier one.
+        The same ratio of the least times, which is steadier on a busy machine.
     """
 
     name: str
@@ -78,24 +79,24 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class KernelReport:
-    """What was measured: which kernels, nanoseconds a bare look-up takes, and the cases."""
+    """The measurement: name of the kernels, nanoseconds per bare look-up, and the cases."""
 
     kernels: str
     lookup_ns: float
     timings: tuple[Timing, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the report for `--json`."""
         return asdict(self)
 
     def of(self, name: str) -> Timing:
-        """One case by its name."""
+        """Return one case by its name."""
         return next(timing for timing in self.timings if timing.name == name)
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Something to be timed: its name, what to run with the round's number, and how many look-ups that takes."""
+    """A case to time: its name, the function to call with the round's number, and its number of look-ups."""
 
     name: str
     run: Callable[[int], object]
@@ -103,7 +104,7 @@ class Case:
 
 
 def table(report: KernelReport) -> str:
-    """The report, for people."""
+    """Return the report as a table."""
     lines = [
         f"kernels {report.kernels}; a bare look-up takes {report.lookup_ns:.2f} ns",
         f"{'':48}{'median ms':>10}{'p99 ms':>10}{'again':>10}{'p99 ms':>10}{'/ look-ups':>12}",
@@ -116,42 +117,42 @@ def table(report: KernelReport) -> str:
 
 
 def array_specs(count: int) -> list[ArraySpec]:
-    """The first `count` arrays."""
+    """Return the first `count` arrays."""
     shape = tetrahedron(0.5)
     return [ArraySpec(f"array{k + 1}", posed(shape, place), BAND_HZ) for k, place in enumerate(PLACES_M[:count])]
 
 
 class Blocks:
-    """What the arrays hear: blocks (K, `BLOCK`) of each kind, the same on every machine.
+    """Blocks (K, `BLOCK`) of each kind of sound at each array, the same on every machine.
 
     Parameters
     ----------
     arrays : sequence of ArraySpec
     sources : int
-        Places of the voice; each gives some blocks.
+        Number of positions of the voice; each gives several blocks.
     seed : int
     """
 
     def __init__(self, arrays: Sequence[ArraySpec], sources: int = 3, seed: int = 1) -> None:
         rng = np.random.default_rng(seed)
         self._arrays = arrays
-        self._heard = [_heard(arrays, rng) for _ in range(sources)]
+        self._voices = [_voice_at(arrays, rng) for _ in range(sources)]
         self._noise = rng.standard_normal((len(arrays), 4, SEGMENT), dtype=np.float32)
-        power = float(np.mean([np.square(one).mean() for one in self._heard]))
+        power = float(np.mean([np.square(one).mean() for one in self._voices]))
         self._noise *= np.float32(np.sqrt(power) * 10 ** (-SNR_DB / 20))
 
     def sound(self, kind: str, number: int, samples: int = BLOCK) -> list[Float32Array]:
-        """Block `number` of a kind, (K, samples) of each array; numbers beyond those there are begin again."""
+        """Return block `number` of a kind, (K, samples) for each array; after the last block the first follows."""
         first = (number * BLOCK) % (SEGMENT - samples + 1)
         cut = slice(first, first + samples)
-        one = self._heard[number % len(self._heard)]
-        two = self._heard[(number + 1) % len(self._heard)]
+        one = self._voices[number % len(self._voices)]
+        two = self._voices[(number + 1) % len(self._voices)]
         clean = {"voice": one, "two voices": one + two, "noise": np.float32(0.0) * one}[kind]
         return [np.ascontiguousarray(clean[a, :, cut] + self._noise[a, :, cut]) for a in range(len(self._arrays))]
 
 
-def _heard(arrays: Sequence[ArraySpec], rng: np.random.Generator) -> Float32Array:
-    """A second of a voice somewhere in the room: (A, 4, `SEGMENT`)."""
+def _voice_at(arrays: Sequence[ArraySpec], rng: np.random.Generator) -> Float32Array:
+    """Return a second of a voice at a random position in the room: (A, 4, `SEGMENT`)."""
     source_m = rng.uniform([0.5, 0.5, 0.5], np.array(ROOM_M) - 0.5)
     microphones_m = np.concatenate([spec.microphones_m for spec in arrays])
     (responses,) = impulse_responses(ROOM_M, source_m, microphones_m, [RT60_S], sample_rate_hz=RATE_HZ, c_m_s=C_M_S)
@@ -175,11 +176,11 @@ def measure(
     clock : Clock
     rounds : int
     arrays : sequence of int
-        How many take part, each at most `len(PLACES_M)`.
+        Numbers of arrays, each at most `len(PLACES_M)`.
     spacings_m : sequence of float
-        Of the grids that are searched.
+        Spacings of the grids that are searched.
     progress : callable or None
-        Gets the rounds done, and how many there are.
+        Called with (rounds done, rounds).
     """
     with threadpool_limits(limits=1):
         cases = list(_cases(arrays, spacings_m))
@@ -204,7 +205,7 @@ def timed_ms(
     progress: Callable[[int, int], None] | None = None,
     in_a_row: int = 1,
 ) -> FloatArray:
-    """Milliseconds (in_a_row, cases, rounds) that each case takes in each round, all in turn; warmed up before."""
+    """Time every case in every round, in turn, after a warm-up: milliseconds (in_a_row, cases, rounds)."""
     taken_ns = np.empty((in_a_row, len(cases), rounds))
     for case in cases:
         case.run(0)
@@ -221,7 +222,7 @@ def timed_ms(
 
 
 def bare_look_ups() -> Case:
-    """`LOOKED_UP` look-ups in tables of one array: what a map can at best be as fast as."""
+    """Return the case of `LOOKED_UP` look-ups in tables of one array, the lower bound for the time of a map."""
     rng = np.random.default_rng(0)
     table, places = rng.standard_normal(6 * 1063, dtype=np.float32), rng.integers(0, 6 * 1063, LOOKED_UP, np.uint16)
     out = np.empty(LOOKED_UP, dtype=np.float32)

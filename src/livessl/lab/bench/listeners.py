@@ -1,4 +1,4 @@
-"""Many clients of a server in one process, and how old what they are told is."""
+"""Many clients of a server in one process, and the age of the messages that they receive."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from websockets.exceptions import ConnectionClosed
 from livessl.clock import SystemClock, utc_ns
 
 STAGES: Final = ("sent", "received", "located")
+"""Stages of latency that an update reports."""
+
 GRACE_S: Final = 2.0
-"""After the end of the measured time: for answers on their way."""
+"""Time, in seconds, for messages still on their way after the end of the measured time."""
 
 
 @dataclass(slots=True)
-class Heard:
-    """What all clients of a process were told of windows that ended in the measured time.
+class Received:
+    """All that the clients of a process received about windows that ended in the measured time.
 
     Parameters
     ----------
     latencies_s : list of float
-        From the window's end to the client, for each update and client.
+        Time from the window's end to the client, for each update and client.
     stages_s : dict of str to list of float
-        What the first client's updates say of themselves; `delivered` is the rest of its latency.
+        Stages that the first client's updates report; `delivered` is the rest of the latency.
     updates, events, gaps, pictures : int
-        Of all clients: updates, events, messages missed, pictures of maps.
+        Sums over all clients: updates, events, missed messages, maps.
     """
 
     latencies_s: list[float] = field(default_factory=list)
@@ -43,58 +45,59 @@ class Heard:
 
 
 def listen(url: str, clients: int, watchers: int, parent: Connection) -> None:
-    """Subscribe so many times; runs in a process of its own.
+    """Run many clients, in a process of its own.
 
-    Says `None` when it could begin, is told from when until when to measure (site times), sends what it `Heard`.
+    It sends `None` when it is ready, receives the beginning and the end of the measured time (site times), and sends
+    what it `Received`.
     """
     parent.send(None)
     from_ns, until_ns = parent.recv()
     parent.send(asyncio.run(_listen(url, clients, watchers, from_ns, until_ns)))
 
 
-async def _listen(url: str, clients: int, watchers: int, from_ns: int, until_ns: int) -> Heard:
-    heard = Heard()
+async def _listen(url: str, clients: int, watchers: int, from_ns: int, until_ns: int) -> Received:
+    received = Received()
     address = f"ws{url.removeprefix('http')}/api/v1"
     async with AsyncExitStack() as open_, asyncio.TaskGroup() as tasks:
         for number in range(clients):
             socket = await open_.enter_async_context(connect(f"{address}/live?kinds=update,event", compression=None))
-            tasks.create_task(_follow(socket, heard, from_ns, until_ns, first=number == 0))
+            tasks.create_task(_follow(socket, received, from_ns, until_ns, first=number == 0))
         for _ in range(watchers):
             socket = await open_.enter_async_context(connect(f"{address}/map", compression=None))
-            tasks.create_task(_watch(socket, heard, until_ns))
-    return heard
+            tasks.create_task(_watch(socket, received, until_ns))
+    return received
 
 
-async def _follow(socket: Any, heard: Heard, from_ns: int, until_ns: int, *, first: bool) -> None:
+async def _follow(socket: Any, received: Received, from_ns: int, until_ns: int, *, first: bool) -> None:
     clock = SystemClock()
     async for data in _messages(socket, until_ns):
         now_ns = clock.now_ns()
         message = orjson.loads(data)
         if message["kind"] == "event":
-            heard.events += 1
+            received.events += 1
         elif message["kind"] == "gap":
-            heard.gaps += message["missed"]
+            received.gaps += message["missed"]
         elif message["kind"] == "update":
             end_ns = utc_ns(message["end_utc"])
             if not from_ns < end_ns <= until_ns:
                 continue
-            heard.updates += 1
+            received.updates += 1
             latency_s = (now_ns - end_ns) / 1e9
-            heard.latencies_s.append(latency_s)
+            received.latencies_s.append(latency_s)
             stages = message["latency_stages_s"]
             if first and stages is not None:
                 for name in STAGES:
-                    heard.stages_s[name].append(stages[name])
-                heard.stages_s["delivered"].append(latency_s - message["latency_s"])
+                    received.stages_s[name].append(stages[name])
+                received.stages_s["delivered"].append(latency_s - message["latency_s"])
 
 
-async def _watch(socket: Any, heard: Heard, until_ns: int) -> None:
+async def _watch(socket: Any, received: Received, until_ns: int) -> None:
     async for _ in _messages(socket, until_ns):
-        heard.pictures += 1
+        received.pictures += 1
 
 
 async def _messages(socket: Any, until_ns: int) -> AsyncIterator[bytes | str]:
-    """What comes until some time after the end."""
+    """Yield messages until a grace time after the end."""
     clock = SystemClock()
     while (left_s := (until_ns - clock.now_ns()) / 1e9 + GRACE_S) > 0:
         try:

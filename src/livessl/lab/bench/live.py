@@ -1,4 +1,4 @@
-"""A server under the load of many arrays and clients: what it drops, how late it is, what it takes."""
+"""A server under the load of many arrays and clients: its losses, its latency and its resources."""
 
 from __future__ import annotations
 
@@ -20,42 +20,44 @@ import numpy as np
 from livessl.clock import Clock
 from livessl.lab import processes
 from livessl.lab.bench import load
-from livessl.lab.bench.listeners import Heard, listen
+from livessl.lab.bench.listeners import Received, listen
 from livessl.lab.processes import NotStartedError
 from livessl.server.api.encode import JsonObject
 from livessl.site.load import parse_site
 
 READY_NS: Final = 120_000_000_000
-"""For a server to work out its tables and hear every array."""
+"""Longest time, in nanoseconds, until a server has computed its tables and receives every array."""
 
 SETTLE_NS: Final = 8_000_000_000
-"""From then on: until what has piled up while tables were worked out is worked off."""
+"""Time, in nanoseconds, from then on, in which the server works off the backlog of its start."""
 
 SAMPLE_NS: Final = 1_000_000_000
+"""Time, in nanoseconds, between two readings of processor time and memory."""
+
 PERCENTILES: Final = (50, 95, 99, 100)
 LOST: Final = ("late", "rejected", "lost_frames", "sequence_gaps")
-"""Counters of an array that tell of frames without use."""
+"""Counters of an array for frames that no result used."""
 
 Serve = Callable[[Path], Any]
-"""Starts a server on a site file, as a process."""
+"""Starts a server with a site file, as a process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What to load a server with.
+    """The load on a server.
 
     Parameters
     ----------
     arrays, clients, watchers : int
-        Arrays that sound; subscribers to events and updates; watchers of the fused map.
+        Numbers of arrays that send sound, of subscribers to events and updates, and of watchers of the fused map.
     seconds : float
-        How long to measure, after a warm-up.
+        Measured time, after a warm-up.
     spacing_m : float
-        Of the grid that is searched.
+        Spacing of the grid that is searched.
     rt60_s : float
-        Of the simulated room; 0 is anechoic.
+        Reverberation time of the simulated room; 0 is anechoic.
     spin : bool
-        Whether a foreign process spins on each core meanwhile.
+        Whether a foreign process keeps each core busy meanwhile.
     """
 
     arrays: int
@@ -69,33 +71,33 @@ class Demand:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of it.
+    """The measurement of a server under load.
 
     Parameters
     ----------
     demand : Demand
     cores : int
-        Of the machine, shared by server, load and clients.
+        Cores of the machine, shared by server, load and clients.
     frames_sent, frames_dropped : int
-        By the load from the beginning on, and those of them that never reached the server.
+        Frames that the load sent from the beginning on, and those of them that never reached the server.
     frames_received : int
-        As the server counts them.
+        Frames that the server counted.
     lost : dict of str to int
         In the measured time: the server's counters of frames without use, and messages that clients missed.
     updates_due, updates : int, float
-        Windows of sound in the measured time, and how many of them a client was told of in the mean.
+        Windows of sound in the measured time, and the mean number of updates that a client received for them.
     events : float
-        That a client was told of, in the mean, from the warm-up on.
+        Mean number of events that a client received, from the warm-up on.
     latency_ms : dict of str to float
-        From the end of a window to a client, percentiles over all updates and clients.
+        Time from the end of a window to a client, percentiles over all updates and clients.
     stages_ms : dict of str to dict of str to float
-        Percentiles of each stage, and `load`: how late the load itself was, which is in `sent`.
+        Percentiles of each stage, and `load`: the delay of the load itself, which is part of `sent`.
     pictures : int
-        Of maps, that all watchers got.
+        Number of maps that all watchers received.
     cpu_percent : float
-        Of one core, by the server, in the mean over the measured time.
+        Mean use of the server over the measured time, in percent of one core.
     rss_mb : tuple of float
-        Of the server, at the beginning of the measured time, at its end, and the greatest.
+        Resident memory of the server at the beginning of the measured time, at its end, and at most, in megabytes.
     """
 
     demand: Demand
@@ -115,28 +117,28 @@ class Outcome:
 
     @property
     def nothing_dropped(self) -> bool:
-        """Whether every frame was used and every client told everything."""
+        """True if every frame was used and every client received every message."""
         return not (self.frames_dropped or any(self.lost.values())) and self.updates >= self.updates_due
 
     def json(self) -> JsonObject:
-        """As an object."""
+        """Return the outcome as an object for JSON."""
         return {**asdict(self), "nothing_dropped": self.nothing_dropped}
 
 
 def serve(site_file: Path) -> Any:
-    """Start the server as anyone would."""
+    """Start the server by its command."""
     return processes.start("serve", "--site", str(site_file))
 
 
 def measure(
     demand: Demand, clock: Clock, *, start: Serve = serve, progress: Callable[[int, int], None] | None = None
 ) -> Outcome:
-    """Run a server, load it, listen to it.
+    """Run a server under load and measure what its clients receive.
 
     Raises
     ------
     NotStartedError
-        Where the server does not come up, or does not hear all arrays.
+        If the server does not start, or does not receive all arrays.
     """
     endpoint = f"tcp://127.0.0.1:{processes.free_port()}"
     text = load.site_text(demand.arrays, demand.spacing_m, endpoint, port := processes.free_port())
@@ -153,7 +155,7 @@ def measure(
             for _ in range(os.cpu_count() or 1):
                 running.enter_context(_child(_spin))
         sounding.send("begin")
-        _wait_until_all_are_heard(url, clock)
+        _wait_until_all_are_received(url, clock)
         listening = running.enter_context(_child(listen, url, demand.clients, demand.watchers))
         listening.recv()
         from_ns = clock.now_ns() + SETTLE_NS
@@ -163,17 +165,17 @@ def measure(
             pass
         before = _counters(url)
         usage = list(_sampled(server.pid, from_ns, until_ns, clock, progress))
-        heard: Heard = listening.recv()
+        received: Received = listening.recv()
         sounding.send("end")
         report: load.Report = sounding.recv()
         after = _counters(url)
     due = len(load.windows_ns(site, from_ns, until_ns))
     lost = {name: after[name] - before[name] for name in LOST}
-    return _outcome(demand, report, after["frames"], lost, heard, usage, due)
+    return _outcome(demand, report, after["frames"], lost, received, usage, due)
 
 
 def table(outcome: Outcome) -> str:
-    """The outcome, for people."""
+    """Return the outcome as a table."""
     demand, lost = outcome.demand, {name: count for name, count in outcome.lost.items() if count}
     names = [f"p{p}" if p < 100 else "max" for p in PERCENTILES]
     lines = [
@@ -182,15 +184,15 @@ def table(outcome: Outcome) -> str:
         + (", a foreign process spinning on each" if demand.spin else ""),
         f"frames     {outcome.frames_sent} sent, {outcome.frames_received} received, {outcome.frames_dropped} dropped"
         + "".join(f", {count} {name}" for name, count in lost.items()),
-        f"updates    {outcome.updates:.1f} of {outcome.updates_due} a client; {outcome.events:g} events",
+        f"updates    {outcome.updates:.1f} of {outcome.updates_due} per client; {outcome.events:g} events",
         f"server     {outcome.cpu_percent:.0f} % of a core; "
-        "{:.0f} MB resident at first, {:.0f} at last, {:.0f} at most".format(*outcome.rss_mb),
+        "{:.0f} MB resident at the beginning, {:.0f} at the end, {:.0f} at most".format(*outcome.rss_mb),
         f"latency from the end of a window, ms {''.join(f'{name:>9}' for name in names)}",
         *(
             f"  {stage:<35}{''.join(f'{values[name]:9.1f}' for name in names)}"
             for stage, values in {**outcome.stages_ms, "capture to client": outcome.latency_ms}.items()
         ),
-        "nothing was dropped" if outcome.nothing_dropped else "this is more than the machine carries",
+        "nothing was dropped" if outcome.nothing_dropped else "the load is more than the machine can carry",
     ]
     return "\n".join(lines)
 
@@ -198,27 +200,27 @@ def table(outcome: Outcome) -> str:
 def _outcome(
     demand: Demand,
     report: load.Report,
-    received: int,
+    frames_received: int,
     lost: dict[str, int],
-    heard: Heard,
+    received: Received,
     usage: Sequence[tuple[int, float, float]],
     due: int,
 ) -> Outcome:
     (first_ns, first_s, first_mb), *_, (last_ns, last_s, last_mb) = usage
-    stages = {"load": report.lateness_s, **heard.stages_s}
+    stages = {"load": report.lateness_s, **received.stages_s}
     return Outcome(
         demand=demand,
         cores=os.cpu_count() or 1,
         frames_sent=report.sent,
         frames_dropped=report.dropped,
-        frames_received=received,
-        lost={**lost, "missed": heard.gaps},
+        frames_received=frames_received,
+        lost={**lost, "missed": received.gaps},
         updates_due=due,
-        updates=heard.updates / max(1, demand.clients),
-        events=heard.events / max(1, demand.clients),
-        latency_ms=_percentiles_ms(heard.latencies_s),
+        updates=received.updates / max(1, demand.clients),
+        events=received.events / max(1, demand.clients),
+        latency_ms=_percentiles_ms(received.latencies_s),
         stages_ms={name: _percentiles_ms(values) for name, values in stages.items()},
-        pictures=heard.pictures,
+        pictures=received.pictures,
         cpu_percent=100.0 * (last_s - first_s) / ((last_ns - first_ns) / 1e9),
         rss_mb=(first_mb, last_mb, max(mb for _, _, mb in usage)),
     )
@@ -232,7 +234,7 @@ def _percentiles_ms(values_s: Sequence[float]) -> dict[str, float]:
 def _sampled(
     pid: int, from_ns: int, until_ns: int, clock: Clock, progress: Callable[[int, int], None] | None
 ) -> Iterator[tuple[int, float, float]]:
-    """From the beginning of the measured time to its end: when, seconds of processor time, resident megabytes."""
+    """Yield (time in ns, processor time in s, resident memory in MB) in regular steps over the measured time."""
     steps = max(1, round((until_ns - from_ns) / SAMPLE_NS))
     for step in range(steps + 1):
         while not clock.sleep_until_ns(from_ns + step * (until_ns - from_ns) // steps):
@@ -242,16 +244,16 @@ def _sampled(
             progress(step, steps)
 
 
-def _wait_until_all_are_heard(url: str, clock: Clock) -> None:
+def _wait_until_all_are_received(url: str, clock: Clock) -> None:
     deadline_ns = clock.monotonic_ns() + READY_NS
     while any(array["state"] != "healthy" for array in _arrays(url)):
         if clock.monotonic_ns() > deadline_ns:
-            raise NotStartedError(f"the server did not hear every array within {READY_NS / 1e9:.0f} s")
+            raise NotStartedError(f"the server did not receive every array within {READY_NS / 1e9:.0f} s")
         clock.sleep_until_ns(clock.now_ns() + processes.POLL_NS)
 
 
 def _usage(pid: int) -> tuple[float, float]:
-    """Processor time in seconds and resident memory in megabytes of a process, from /proc (see proc(5))."""
+    """Return a process's processor time in seconds and resident memory in megabytes, from /proc (see proc(5))."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     resident = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     ticks = int(fields[11]) + int(fields[12])
@@ -260,7 +262,7 @@ def _usage(pid: int) -> tuple[float, float]:
 
 @contextmanager
 def _child(work: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
-    """`work(*arguments, connection)` in a process that ends with the context; yields our end of the connection."""
+    """Run `work(*arguments, connection)` in a process that ends with the context; yield our end of the connection."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=work, args=(*arguments, theirs), daemon=True)
@@ -278,14 +280,14 @@ def _child(work: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
 
 
 def _spin(parent: Connection) -> None:
-    """Work on nothing until the parent ends."""
+    """Keep a core busy until the parent sends something or ends."""
     while not parent.poll():
         for _ in range(100_000):
             pass
 
 
 def _counters(url: str) -> dict[str, int]:
-    """The arrays' counters, summed."""
+    """Return the sums of the arrays' counters."""
     total: Counter[str] = Counter()
     for array in _arrays(url):
         total.update(array["counters"])
@@ -293,5 +295,5 @@ def _counters(url: str) -> dict[str, int]:
 
 
 def _arrays(url: str) -> list[JsonObject]:
-    with urllib.request.urlopen(f"{url}/api/v1/arrays", timeout=60.0) as response:  # noqa: S310 - our own http address
+    with urllib.request.urlopen(f"{url}/api/v1/arrays", timeout=60.0) as response:  # noqa: S310 - an http address of our own
         return list(json.load(response)["arrays"])

@@ -1,4 +1,4 @@
-"""The sound of many arrays, from one process over the real wire: all of them, all the time."""
+"""The load: one process sends the sound of many arrays over the real wire."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from livessl.site.load import parse_site
 from livessl.site.models import Site
 
 SOUND_FRAMES: Final = 40
-"""Two seconds of sound, then …"""
+"""Length of each sound, in frames: 2 s."""
 
 PAUSE_FRAMES: Final = 8
-"""… 0.4 s without, sent all the same: longer than the hang-over, so that each sound becomes an event."""
+"""Pause after each sound, in frames: 0.4 s, longer than the hang-over, so that each sound becomes an event."""
 
 PERIOD_FRAMES: Final = SOUND_FRAMES + PAUSE_FRAMES
 
 PLACES: Final = 2
-"""Places that the sound comes from, in turn."""
+"""Number of positions of the sound, used in turn."""
 
 RATE_HZ: Final = 44100.0
 ARRAYS_A_NODE: Final = 2
-"""As on an eight-channel interface."""
+"""Arrays of four microphones on an eight-channel interface."""
 
 ROOM_M: Final = (8.0, 10.0, 4.0)
 EDGE_M: Final = 0.5
 SETTLE_NS: Final = 2_000_000_000
-"""For the last acknowledgements."""
+"""Time, in nanoseconds, to wait for the last acknowledgements."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a load process did.
+    """The report of a load process.
 
     Parameters
     ----------
     sent : int
-        Frames.
+        Frames that were sent.
     dropped : int
-        Frames that fell out of a spool, or were never acknowledged.
+        Frames that a spool dropped, or that were never acknowledged.
     lateness_s : tuple of float
-        How long after its time the last array's frame of each interval had been sent: the load's own share.
+        Delay of the last array's frame for each frame index: the load's own share of the latency.
     """
 
     sent: int
@@ -60,7 +60,7 @@ class Report:
 
 
 def site_text(arrays: int, spacing_m: float, bind: str, http_port: int) -> str:
-    """A site file: tetrahedra of half a metre all over a room of 8 x 10 x 4 m."""
+    """Return a site file with tetrahedra of half a metre all over a room of 8 x 10 x 4 m."""
     columns = max(1, round(np.sqrt(arrays * ROOM_M[0] / ROOM_M[1])))
     rows = -(-arrays // columns)
     named: dict[str, Any] = {}
@@ -84,7 +84,7 @@ def site_text(arrays: int, spacing_m: float, bind: str, http_port: int) -> str:
 
 
 def windows_ns(site: Site, start_ns: int, end_ns: int) -> list[int]:
-    """Ends of the windows, within some time, that updates are due for: one every `update_s` of a sound."""
+    """Return the ends of the windows for which updates are due: one every `update_s` of a sound."""
     step = round(site.fusion.update_s / FRAME_S)
     ends = []
     for frame_index in range(start_ns // FRAME_NS, end_ns // FRAME_NS):
@@ -95,9 +95,9 @@ def windows_ns(site: Site, start_ns: int, end_ns: int) -> list[int]:
 
 
 def play(site_file_text: str, endpoint: str, rt60_s: float, parent: Connection) -> None:
-    """Load a server; runs in a process of its own.
+    """Load a server, in a process of its own.
 
-    Says `None` when the sound is ready, begins when told to, ends when told again, and sends its `Report`.
+    It sends `None` when the sound is ready, begins and ends at messages of the parent, and sends its `Report`.
     """
     site, clock = parse_site(site_file_text), SystemClock()
     scene = _scene(site, rt60_s)
@@ -116,11 +116,13 @@ def play(site_file_text: str, endpoint: str, rt60_s: float, parent: Connection) 
             link.close(bye=True)
 
 
-def _play(links: Sequence[Link], nodes: Sequence[Sequence[_Sound]], told: Callable[[], bool], clock: Clock) -> Report:
+def _play(
+    links: Sequence[Link], nodes: Sequence[Sequence[_Sound]], should_end: Callable[[], bool], clock: Clock
+) -> Report:
     lateness_s: list[float] = []
     sent = 0
     frame_index = clock.now_ns() // FRAME_NS + 1
-    while not told():
+    while not should_end():
         while not clock.sleep_until_ns((frame_index + 1) * FRAME_NS):
             pass
         for link, node in zip(links, nodes, strict=True):
@@ -138,7 +140,7 @@ def _play(links: Sequence[Link], nodes: Sequence[Sequence[_Sound]], told: Callab
 
 
 class _Sound:
-    """What one array hears, frame by frame, over and over."""
+    """The sound at one array, frame by frame, repeated."""
 
     def __init__(self, spec: ArraySpec, scene: Scene, seed: int) -> None:
         self.array = spec.name
@@ -146,7 +148,7 @@ class _Sound:
         self._power = [float(band_power(frame, RATE_HZ, spec.band_hz).mean()) for frame in self._frames]
 
     def frame(self, frame_index: int, sequence: int) -> Frame:
-        """The frame of an interval."""
+        """Return the frame of a frame index."""
         index = frame_index % len(self._frames)
         active = index % PERIOD_FRAMES < SOUND_FRAMES
         samples, power = self._frames[index], self._power[index]
@@ -154,7 +156,7 @@ class _Sound:
 
 
 def _scene(site: Site, rt60_s: float) -> Scene:
-    """A voice that lasts, at one place after the other, the same for all arrays."""
+    """Return the scene: a lasting voice at one position after the other, the same for all arrays."""
     rng = np.random.default_rng(5)
     voice = dict(synthesised_sounds(RATE_HZ, seed=5))["voice"]
     lasting = np.tile(voice, 1 + int(SOUND_FRAMES * FRAME_S * RATE_HZ) // len(voice))
@@ -166,8 +168,8 @@ def _scene(site: Site, rt60_s: float) -> Scene:
     return Scene(site.room.size_m, rt60_s, site.c_m_s, RATE_HZ, tuple(sources), duration_s, level_dbfs=-15.0)
 
 
-def _cut(heard: Float32Array) -> Iterator[Float32Array]:
-    """Frames (K, n); at this rate each has as many samples as any other."""
+def _cut(recorded: Float32Array) -> Iterator[Float32Array]:
+    """Yield frames (K, n); at this sample rate all have the same length."""
     samples = round(FRAME_S * RATE_HZ)
-    for first in range(0, heard.shape[1] - samples + 1, samples):
-        yield np.ascontiguousarray(heard[:, first : first + samples])
+    for first in range(0, recorded.shape[1] - samples + 1, samples):
+        yield np.ascontiguousarray(recorded[:, first : first + samples])

@@ -1,141 +1,37 @@
-"""Runs a campaign: hands out positions, keeps every finished one, resumes. It knows nothing of what a position is."""
+"""Runs a campaign: distributes positions, keeps every finished one and resumes. It does not know what a position is."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import resource
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import as_completed as completed
 from dataclasses import dataclass
 from io import BytesIO
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any, Final, Protocol
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.signal import butter, sosfilt
 from threadpoolctl import threadpool_limits
 
-from livessl.lab.evaluate.localizer import SCHEMA as LOCALIZER_SCHEMA
-from livessl.lab.evaluate.localizer import LocalizerPosition, LocalizerSettings
-from livessl.lab.evaluate.paper import Settings
-from livessl.lab.evaluate.sessions import SCHEMA as SESSIONS_SCHEMA
-from livessl.lab.evaluate.sessions import SessionPosition, SessionSettings
-from livessl.lab.evaluate.unit import Clips, Position, Row
-from livessl.simulation.scene import read_sounds
-
-HIGH_PASS_HZ: Final = 100.0
-"""As in Allen and Berkley's rooms; the correlations begin there, so only the activity sees it."""
-
-NAME: Final = pa.dictionary(pa.int32(), pa.string())
-
-SCHEMA: Final = pa.schema(
-    [
-        ("position", pa.int32()),
-        ("system", NAME),
-        ("method", NAME),
-        ("sound", NAME),
-        ("clip", NAME),
-        ("rt60_s", pa.float32()),
-        ("t30_s", pa.float32()),
-        ("active_s", pa.float32()),
-        *((f"{axis}_m", pa.float32()) for axis in "xyz"),
-        *((f"found_{axis}_m", pa.float32()) for axis in "xyz"),
-        *((name, pa.float32()) for name in ("error_m", "radial_m", "azimuth_deg", "elevation_deg")),
-    ]
-)
-"""One row per event, condition and method: truth, estimate, error and its parts, seen from the system's centre."""
-
-
-class Unit(Protocol):
-    """What turns the number of a position into its rows."""
-
-    def rows(self, number: int) -> list[Row]:
-        """All rows of a position."""
-        ...
-
-
-@dataclass(frozen=True)
-class Job:
-    """What a worker needs: small enough to be sent to each once."""
-
-    settings: Settings | LocalizerSettings | SessionSettings
-    clips: Clips
-
-    @property
-    def schema(self) -> pa.Schema:
-        """Of the rows that `unit` makes."""
-        match self.settings:
-            case Settings():
-                return SCHEMA
-            case LocalizerSettings():
-                return LOCALIZER_SCHEMA
-            case SessionSettings():
-                return SESSIONS_SCHEMA
-
-    def unit(self) -> Unit:
-        """Make what turns the number of a position into its rows."""
-        match self.settings:
-            case Settings() as settings:
-                return Position(settings, self.clips)
-            case LocalizerSettings() as settings:
-                return LocalizerPosition(settings, self.clips)
-            case SessionSettings() as settings:
-                return SessionPosition(settings, self.clips)
-
-    @property
-    def digest(self) -> str:
-        """Tells jobs apart: the same for the same settings (but for the number of positions) and sounds."""
-        known = self.settings.as_dict() | {"positions": None}
-        hashed = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
-        for name, clips in sorted(self.clips.items()):
-            for clip, samples in clips:
-                hashed.update(f"{name}/{clip}".encode())
-                hashed.update(samples.tobytes())
-        return hashed.hexdigest()
+from livessl.lab.evaluate.job import Job, Unit
+from livessl.lab.evaluate.parquet import write_smallest
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """A finished position: its rows as a Parquet file, and what it cost on one core."""
+    """A finished position: its rows as a Parquet file, and its cost on one core."""
 
     position: int
     parquet: bytes
     cpu_s: float
     peak_mib: float
-
-
-def read_clips(directory: Path, classes: Iterable[str], sample_rate_hz: float) -> Clips:
-    """Clips of each class wanted: the files of a folder, named by class and number, as in `doorslam001.wav`.
-
-    They are high-passed below the band: at 0 Hz all images of a room add, and rumble would else decide what is active.
-
-    Raises
-    ------
-    ValueError
-        Where there is no sound, or none of a class.
-    """
-    if not directory.is_dir():
-        raise ValueError(f"--events {directory}: expected a folder of sounds, got no such folder")
-    high_pass = butter(2, HIGH_PASS_HZ, "highpass", fs=sample_rate_hz, output="sos")
-    found: dict[str, list[Any]] = {}
-    for name, samples in read_sounds(directory, sample_rate_hz):
-        heard = np.asarray(sosfilt(high_pass, samples), dtype=np.float32)
-        found.setdefault(name.rstrip("0123456789_-"), []).append((name, heard))
-    missing = [name for name in classes if name not in found]
-    if missing:
-        raise ValueError(
-            f"--events {directory}: expected clips of {', '.join(missing)} (such as {missing[0]}001.wav), got the "
-            f"classes {', '.join(sorted(found))}; name others with --classes"
-        )
-    return {name: tuple(found[name]) for name in classes}
 
 
 def run_campaign(
@@ -148,9 +44,8 @@ def run_campaign(
 ) -> Path:
     """Compute the positions that `out` does not hold yet, then join all of them in `results.parquet`.
 
-    Positions are held in `parts/`; where that is gone, `results.parquet` with `campaign.json` is as good.
-
-    Whoever computes them, in whatever order, after however many interruptions: the bytes are the same.
+    Finished positions are files in `parts/`. If that folder is missing, they are taken from `results.parquet`. The
+    bytes of the result do not depend on the number of workers, the order of positions or interruptions.
 
     Parameters
     ----------
@@ -160,14 +55,14 @@ def run_campaign(
     jobs : int
         Processes on this machine, one core each.
     scheduler : str or None
-        Address of a Dask scheduler that is asked instead.
+        Address of a Dask scheduler to use instead of processes.
     progress : callable or None
         Called with (positions done, positions in all).
 
     Raises
     ------
     ValueError
-        Where `out` holds another campaign.
+        If `out` holds another campaign.
     """
     parts = out / "parts"
     _claim(out, job)
@@ -193,7 +88,7 @@ def run_campaign(
 
 
 def read_costs(out: Path) -> list[Mapping[str, float]]:
-    """What each position cost, as far as it is known."""
+    """Return the recorded cost of each position: `position`, `cpu_s`, `peak_mib`."""
     path = out / "cost.jsonl"
     if not path.exists():
         return []
@@ -220,7 +115,7 @@ _sent: list[Job] = []
 
 
 def _worker(job: Job) -> Unit:
-    """Give what this process has made for a job, or make it: matrices that every position needs."""
+    """Return this process's unit for a job; it is kept, because its matrices serve every position."""
     with _keeping:
         key = job.digest
         if key not in _kept:
@@ -233,7 +128,7 @@ def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
     pool = ProcessPoolExecutor(
         min(jobs, len(wanted)), mp_context=get_context("spawn"), initializer=_begin, initargs=(job,)
     )
-    try:  # not `with`: on Ctrl-C that would wait for every position still to come
+    try:  # a `with` would wait, on Ctrl-C, for every position not yet computed
         for future in completed([pool.submit(_compute_sent, number) for number in wanted]):
             yield future.result()
     finally:
@@ -241,14 +136,14 @@ def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
 
 
 def _begin(job: Job) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     _sent[:] = [job]
     parent = parent_process()
     assert parent is not None
 
     def end_with_parent() -> None:
         parent.join()
-        os._exit(1)  # a killed parent cannot tell its workers to stop
+        os._exit(1)  # a killed parent cannot stop its workers
 
     threading.Thread(target=end_with_parent, daemon=True).start()
 
@@ -286,7 +181,7 @@ def _claim(out: Path, job: Job) -> None:
 
 
 def _unpack(results: Path, parts: Path, schema: pa.Schema) -> None:
-    """Make the parts that results were joined from, where they are not there."""
+    """Write the parts that results were joined from, as far as they are missing."""
     if not results.exists():
         return
     table = pq.read_table(results, schema=schema)
@@ -302,9 +197,8 @@ def _unpack(results: Path, parts: Path, schema: pa.Schema) -> None:
 def _joined(out: Path, parts: list[Path], schema: pa.Schema) -> Path:
     path = out / "results.parquet"
     temporary = path.with_suffix(".tmp")
-    # one by one: a thousand positions fit no worker's memory as Python objects, and need not
     tables = [pq.read_table(part, schema=schema) for part in parts]
-    pq.write_table(pa.concat_tables(tables).unify_dictionaries().combine_chunks(), temporary, compression="zstd")
+    write_smallest(pa.concat_tables(tables).unify_dictionaries().combine_chunks(), temporary)
     temporary.replace(path)
     return path
 
@@ -314,7 +208,7 @@ def _part(parts: Path, number: int) -> Path:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file so that it is there as a whole or not at all, even if the machine goes down."""
+    """Write a file completely or not at all, even if the machine loses power."""
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:
         file.write(content)

@@ -1,4 +1,4 @@
-"""A room and arrays of one's own, to repeat the paper's experiments with: plain values, from a site file."""
+"""The room and arrays of a site file, as plain values, for the paper's experiments with other arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class LaidArray:
-    """An array: its name, its microphones (K, 3) in metres, and the band used in Hz."""
+    """An array: its name, its microphones (K, 3) in metres, and its band in Hz."""
 
     name: str
     microphones_m: tuple[tuple[float, ...], ...]
@@ -24,25 +24,27 @@ class LaidArray:
 
     @property
     def spec(self) -> ArraySpec:
-        """The same, as the core needs it."""
+        """The array as the core's type."""
         return ArraySpec(self.name, np.array(self.microphones_m), self.band_hz)
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a site file says of room, grid and arrays.
+    """Room, grid and arrays of a site.
 
     Parameters
     ----------
     site : str
+        Name of the site.
     room_m : (float, float, float)
     bounds_m : three (float, float)
         Search volume; sources are placed in it.
     spacing_m, c_m_s : float
+        Spacing of the search grid; speed of sound.
     arrays : tuple of LaidArray
-        As they stand, and then the joint ones.
+        The arrays of the site file, and then the joint ones.
     sums : tuple of (str, tuple of str)
-        Names of arrays whose maps are summed, and what to call the sum.
+        Name of each system whose maps are summed, and the names of its arrays.
     """
 
     site: str
@@ -55,12 +57,12 @@ class Layout:
 
 
 def layout_of(site: Site) -> Layout:
-    """Room, grid and arrays of a site; sources lie inside the room even where the search volume does not.
+    """Return room, grid and arrays of a site, with the search volume cut to the room.
 
     Raises
     ------
     ValueError
-        Where an array's band is so high that its envelope is used, which campaigns do not.
+        If an array's band is so high that `locate` correlates its envelope; campaigns do not.
     """
     joint = [spec for spec in site.processed if spec.name in site.joint]
     specs = [*site.specs, *joint]
@@ -68,8 +70,8 @@ def layout_of(site: Site) -> Layout:
         if uses_envelope(spec.band_hz):
             low, high = spec.band_hz
             raise ValueError(
-                f"--site: array {spec.name!r}: evaluate expects a band that begins low, got {low:g} to {high:g} Hz, of "
-                "which `locate` uses the envelope; lower its band_hz"
+                f"--site: array {spec.name!r}: evaluate expects a band that begins low, got {low:g} to {high:g} Hz, "
+                "whose envelope `locate` uses; lower its band_hz"
             )
     sums = [("all arrays", site.specs)] if len(site.specs) > 1 else []
     if joint and len(site.processed) > 1:

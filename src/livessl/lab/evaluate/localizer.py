@@ -1,8 +1,8 @@
 """The localizer's own campaign: `onset` against the paper's standard, on the same signals, scenario by scenario.
 
-The sounds of each class are divided, in order of their names: the first, third, … are for development, the others for
-tests. Positions differ by the seed. Responses, recordings and what was heard are shared by all cases of a position. It
-draws nothing and writes no report.
+The clips of each class are divided in the order of their names: the first, third, … are for development, the others for
+tests. Positions depend on the seed. All cases of a position share its responses and recordings. The module draws no
+figure and writes no report.
 """
 
 from __future__ import annotations
@@ -18,26 +18,30 @@ import pyarrow as pa
 from livessl.core.geometry import angle_deg
 from livessl.core.locate.estimator import Estimator, Sound, create
 from livessl.core.stream.activity import exact_mask, runs
-from livessl.core.stream.fusion import judged
+from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
 from livessl.lab.evaluate.paper import C_M_S, EXPERIMENTS, ROOM_M
+from livessl.lab.evaluate.parquet import NAME
 from livessl.lab.evaluate.scenarios import ARRAYS, HALVES, LOCALIZER, ROOMS, SCENARIOS, TWO, Case
 from livessl.lab.evaluate.unit import PEAK, Clips, Row, convolved
 from livessl.simulation.room import impulse_responses
 
 METHODS: Final = ("srp-phat", "onset")
+"""The paper's standard, and the default."""
+
 RT60S_S: Final = (0.0, 0.4, 1.0, 2.0)
 SNRS_DB: Final = (float("inf"), 20.0, 10.0)
 SPACING_M: Final = 0.1
+"""Spacing, in metres, of the grid that `srp-phat` searches before it refines."""
+
 POSITIONS: Final = 200
+"""Number of positions by default."""
 
 LEAD_S: Final = 0.5
-"""Noise alone before the sound, from which a node would send its pre-roll."""
+"""Noise, in seconds, before the sound: the material of the pre-roll."""
 
 PRE_ROLL_FRAMES: Final = 8
-"""As a node sends it: 0.4 s."""
-
-NAME: Final = pa.dictionary(pa.int32(), pa.string())
+"""Frames before the first active one that a node sends by default: 0.4 s."""
 
 SCHEMA: Final = pa.schema(
     [
@@ -53,31 +57,31 @@ SCHEMA: Final = pa.schema(
     ]
 )
 """One row per event, condition, case and method. `bearing_deg` is the error of the direction from the nearest array,
-`mahalanobis2` the error's square in units of the covariance; `margin` and `standing` are features of `onset`'s
-confidence, so that another fit of it needs no other run. `outvoted` names the arrays that the others outvoted."""
+`mahalanobis2` the squared error in units of the covariance. `margin` and `standing` are the features of `onset`'s
+confidence, so that its constants can be fitted again without another run. `outvoted` names the outlier arrays."""
 
 _NOISE, _POSE = 1, 2
-"""What random numbers are for, besides a position's place and clips: each case sees the same whatever else is run."""
+"""Keys of the random streams of noise and of poses, so that a case gets the same draws whatever other cases are run."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocalizerSettings:
-    """All that the results depend on, besides the sounds.
+    """All settings that the results depend on, besides the sounds.
 
     Parameters
     ----------
     positions : int
-        Places of the source, anywhere in the paper's room; each plays one random clip of every class.
+        Number of positions of the source, anywhere in the paper's room; each plays one random clip of every class.
     rt60s_s : tuple of float
     snrs_db : tuple of float
-        White sensor noise below the mean power of the event at the microphones of the two arrays 5 m apart; infinity
-        for none.
+        Level of the event's mean power at the microphones of the two arrays 5 m apart above the white sensor noise;
+        infinity for no noise.
     seed : int
     sample_rate_hz : float
     spacing_m : float
-        Of the grid that `srp-phat` searches before it refines.
+        Spacing of the grid that `srp-phat` searches before it refines.
     half : str
-        Of the sounds: one of `HALVES`.
+        Half of the clips to use: one of `HALVES`.
     scenarios : tuple of str
         Names of `SCENARIOS`.
     """
@@ -93,29 +97,28 @@ class LocalizerSettings:
     experiment: str = LOCALIZER
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values by name."""
+        """Return the settings as plain values by name."""
         return asdict(self)
 
     @property
     def cases(self) -> tuple[Case, ...]:
-        """Of all scenarios, each once."""
+        """The cases of all scenarios, each once."""
         return tuple(dict.fromkeys(case for name in self.scenarios for case in SCENARIOS[name].cases))
 
 
 class LocalizerPosition:
-    """Everything that turns the number of a position into its rows. Made once a worker.
+    """Turns the number of a position into its rows. Made once in each worker.
 
     Parameters
     ----------
     settings : LocalizerSettings
     clips : Clips
-        All; the settings say which half counts.
+        All clips; the settings choose the half that is used.
     """
 
     def __init__(self, settings: LocalizerSettings, clips: Clips) -> None:
         self._settings = settings
-        first = HALVES.index(settings.half)
-        self._clips = {name: ours[first :: len(HALVES)] for name, ours in clips.items()}
+        self._clips = half_of(clips, settings.half)
         self._arrays = sorted(set(TWO.arrays).union(*(case.arrays for case in settings.cases)))
         self._grid = EXPERIMENTS["diversity"].grid(settings.spacing_m)
         specs = [ARRAYS[name] for name in self._arrays]
@@ -146,12 +149,12 @@ class LocalizerPosition:
                 wet = dict(zip(self._arrays, np.split(convolved(sound, response), len(self._arrays)), strict=True))
                 for snr_db in settings.snrs_db:
                     noise = _seed(settings.seed, number, _NOISE, f"{name} {rt60_s:g} {snr_db:g}")
-                    ear = _Ear(_recorded(wet, lead, snr_db, noise), settings.sample_rate_hz)
+                    event = _Event(_recorded(wet, lead, snr_db, noise), settings.sample_rate_hz)
                     head = {"position": number, "sound": name, "clip": clip, "rt60_s": rt60_s, "snr_db": snr_db}
                     for case, specs, estimators in installed:
                         dead = case.faulty(number) if case.dead else ""
                         for method, estimator in estimators.items():
-                            sounds = {spec.name: ear.sound(estimator, spec, case.c_m_s, dead) for spec in specs}
+                            sounds = {spec.name: event.sound(estimator, spec, case.c_m_s, dead) for spec in specs}
                             row = head | {"case": case.name, "method": method}
                             rows.append(row | _found(estimator, sounds, specs, source_m))
         return rows
@@ -166,8 +169,8 @@ class LocalizerPosition:
         return {method: create(method, specs, self._grid, c_m_s) for method in METHODS}
 
 
-class _Ear:
-    """What arrays hear of one event: each listened to once for all cases that hear the same."""
+class _Event:
+    """The recordings of one event, with each array's sound prepared once for all cases in which it is the same."""
 
     def __init__(self, recorded: Mapping[str, Float32Array], sample_rate_hz: float) -> None:
         self._recorded = recorded
@@ -181,16 +184,22 @@ class _Ear:
             if spec.name in dead:
                 samples = samples.copy()
                 samples[1] = 0.0
-            self._sounds[key] = heard(estimator, spec, samples, _active(samples, self._rate_hz), self._rate_hz)
+            self._sounds[key] = sound_of(estimator, spec, samples, _active(samples, self._rate_hz), self._rate_hz)
         return self._sounds[key]
 
 
-def heard(
+def half_of(clips: Clips, half: str) -> Clips:
+    """Return one of the `HALVES` of the clips of each class: every other clip, in the order of their names."""
+    first = HALVES.index(half)
+    return {name: each[first :: len(HALVES)] for name, each in clips.items()}
+
+
+def sound_of(
     estimator: Estimator, spec: ArraySpec, samples: Float32Array, active: BoolArray, sample_rate_hz: float
 ) -> Sound:
-    """What one array hears of an event, as the fusion would tell an estimator: (K, n) cut into frames of 50 ms.
+    """Prepare an array's recording (K, n) of an event for an estimator, in frames of 50 ms, as the fusion does.
 
-    The frames run from the pre-roll to the last active one.
+    The frames run from the pre-roll to the last active one; `active` (F,) says which frames are active.
     """
     frame = round(FRAME_S * sample_rate_hz)
     segments = tuple(samples[:, start * frame : stop * frame] for start, stop in runs(active))
@@ -204,19 +213,19 @@ def heard(
 
 
 def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float, float]:
-    """Intercept and weights of margin and standing that make a right place most likely: logistic regression.
+    """Fit the confidence by logistic regression: return the intercept and the weights of margin and standing.
 
     Parameters
     ----------
     columns : mapping of name to (n,)
         `error_m`, `margin` and `standing` of the events of `onset`.
     near_m : float
-        What is right.
+        Largest error, in metres, that counts as right.
     """
     features = np.stack([np.ones(len(columns["margin"])), columns["margin"], columns["standing"]], axis=1)
     right = np.asarray(columns["error_m"]) <= near_m
     weights = np.zeros(3)
-    for _ in range(50):  # Newton; the least ridge keeps it finite where all is right
+    for _ in range(50):  # Newton's method; a small ridge keeps it finite if every event is right
         likely = 1.0 / (1.0 + np.exp(-features @ weights))
         gradient = features.T @ (right - likely) - 1e-3 * weights
         hessian = (features.T * (likely * (1.0 - likely))) @ features + 1e-3 * np.eye(3)
@@ -226,7 +235,7 @@ def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, f
 
 
 def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
-    """What an estimator makes of an event, and how far that is from the truth."""
+    """Locate an event and compare the result with the truth."""
     found = estimator.locate(sounds)
     outliers = found.outliers or {}
     error = found.position_m - source_m
@@ -255,12 +264,12 @@ def _seed(seed: int, number: int, purpose: int, name: str) -> np.random.SeedSequ
 def _recorded(
     wet: Mapping[str, Float32Array], lead: int, snr_db: float, noise: np.random.SeedSequence
 ) -> dict[str, Float32Array]:
-    """Put noise before and under the sound at each array, set its level, round to 16 bits."""
+    """Add noise before and during the sound at each array, set its level, round to 16 bits."""
     power = np.mean([np.square(wet[name]).mean(dtype=np.float64) for name in TWO.arrays])
     rms = np.float32(np.sqrt(power * 10.0 ** (-snr_db / 10.0)))
     recorded = {}
-    for name, heard_there in wet.items():
-        samples = np.pad(heard_there, ((0, 0), (lead, 0)))
+    for name, clean in wet.items():
+        samples = np.pad(clean, ((0, 0), (lead, 0)))
         if rms > 0.0:
             own = np.random.SeedSequence(noise.entropy, spawn_key=(*noise.spawn_key, ord(name)))
             samples += rms * np.random.default_rng(own).standard_normal(samples.shape, dtype=np.float32)
@@ -270,7 +279,7 @@ def _recorded(
 
 
 def _active(samples: Float32Array, sample_rate_hz: float) -> BoolArray:
-    """Which whole frames of 50 ms of an array's recording are active."""
+    """Return which whole frames of 50 ms of an array's recording (K, n) are active: (F,)."""
     frame = round(FRAME_S * sample_rate_hz)
     count = samples.shape[1] // frame
     squares = np.square(samples[:, : count * frame]).mean(axis=0, dtype=np.float64)

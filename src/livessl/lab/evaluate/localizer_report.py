@@ -1,4 +1,4 @@
-"""What the localizer's campaign found: tables against the paper's standard, honesty. It simulates and draws nothing."""
+"""The report on the localizer's campaign: tables against the paper's standard, and how far its confidence is right."""
 
 from __future__ import annotations
 
@@ -13,28 +13,25 @@ import pyarrow.parquet as pq
 
 from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M
 from livessl.core.types import BoolArray, FloatArray, Status
-from livessl.lab.evaluate.figures import LocalizerCurve, ScenarioPoint, draw_localizer, draw_scenario
+from livessl.lab.evaluate.figures.localizer import LocalizerCurve, ScenarioPoint, draw_localizer, draw_scenario
 from livessl.lab.evaluate.localizer import METHODS, development_fit
-from livessl.lab.evaluate.report import Block, Heading, Picture, Table, as_markdown
+from livessl.lab.evaluate.markdown import Block, Heading, Picture, Table, as_markdown
 from livessl.lab.evaluate.scenarios import HALVES, ROOMS, SCENARIOS, Case
-from livessl.lab.evaluate.statistics import INTERVAL, RESAMPLES, write_csv
-
-NINETY_PERCENT: Final = 6.251
-"""Quantile of chi-square with three degrees of freedom: the square of the 90 % ellipsoid."""
+from livessl.lab.evaluate.statistics import NINETY_PERCENT, RESAMPLES, area_under_roc, with_interval, write_csv
 
 STANDARD, OURS = METHODS
 
 EDGES: Final = (0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 1.0)
-"""Of the classes of confidence that are held against what was right."""
+"""Limits of the classes of confidence whose events are compared with the truth."""
 
 Columns = Mapping[str, Any]
-"""Name -> (n,) values of the results' rows, with `located`."""
+"""Columns of the results by name, (n,) each, and `located` (n,) bool."""
 
 SummaryRow = dict[str, Any]
 
 
 def write_localizer_report(out: Path) -> list[Path]:
-    """Write `summary.csv`, `report.md` and the figures of the campaign in a folder, beside its results."""
+    """Write `summary.csv`, `report.md` and the figures into the folder of a campaign; return the two texts."""
     settings = json.loads((out / "campaign.json").read_text(encoding="utf-8"))["settings"]
     columns = read_columns(out / "results.parquet")
     rows = [row for name in settings["scenarios"] for row in summary(columns, name)]
@@ -49,20 +46,20 @@ def write_localizer_report(out: Path) -> list[Path]:
 
 
 def read_columns(path: Path) -> Columns:
-    """Read results."""
+    """Read the columns of `results.parquet`."""
     table = pq.read_table(path)
     columns = {name: np.asarray(table.column(name).to_pylist()) for name in table.column_names}
-    for name in ("confidence", "margin", "standing"):  # of ours alone
+    for name in ("confidence", "margin", "standing"):  # null for the standard
         columns[name] = columns[name].astype(np.float64)
     return columns | {"located": columns["status"] == Status.LOCATED.value}
 
 
 def summary(columns: Columns, scenario: str) -> list[SummaryRow]:
-    """One row per condition, case and method of a scenario; of `ROOMS` also per class of sound.
+    """Summarize each condition, case and method of a scenario, and for `ROOMS` each class of sound: one row each.
 
-    `lost` counts what is over `NEAR_M` off and what is not located; `more_lost` is that share minus the standard's on
-    the same events. `grown` is the median error over that of the scenario's first case, by the same method. Intervals
-    are 99 % ones by bootstrap over positions.
+    `lost` is the share of events that are not located, or located more than `NEAR_M` off. `more_lost` is that share
+    minus the standard's share on the same events. `grown` is the ratio of the median error to that of the scenario's
+    first case, by the same method. Intervals are 99 % intervals by bootstrap over positions.
     """
     cases = {case.name: case for case in SCENARIOS[scenario].cases}
     first_case = next(iter(cases))
@@ -88,23 +85,13 @@ def summary(columns: Columns, scenario: str) -> list[SummaryRow]:
     return rows
 
 
-def area_under_roc(score: FloatArray, good: BoolArray) -> float:
-    """Probability that a good event's score exceeds a bad one's; ties count half. NaN without one of either."""
-    good_scores, bad_scores = np.sort(score[good]), score[~good]
-    if len(good_scores) == 0 or len(bad_scores) == 0:
-        return float("nan")
-    below = np.searchsorted(good_scores, bad_scores, side="left")
-    not_above = np.searchsorted(good_scores, bad_scores, side="right")
-    return float(1.0 - (below + not_above).mean() / (2.0 * len(good_scores)))
-
-
 def _conditions(columns: Columns) -> list[tuple[float, float]]:
     found = sorted(set(zip(columns["snr_db"].tolist(), columns["rt60_s"].tolist(), strict=True)))
     return [(rt60_s, snr_db) for snr_db, rt60_s in sorted(found, key=lambda each: (-each[0], each[1]))]
 
 
 def _measured(columns: Columns, chosen: Any, standard: Any, first: Any) -> SummaryRow:
-    """What a summary says of the rows chosen; those of the standard and of the first case are of the same events."""
+    """Summarize the chosen rows; the rows of the standard and of the first case are of the same events."""
     located = columns["located"][chosen]
     error_m, confidence = columns["error_m"][chosen], columns["confidence"][chosen]
     inside = columns["mahalanobis2"][chosen][located] <= NINETY_PERCENT
@@ -117,7 +104,7 @@ def _measured(columns: Columns, chosen: Any, standard: Any, first: Any) -> Summa
         "events": len(chosen),
         "located": located.mean(),
         "direction_only": (columns["status"][chosen] == Status.DIRECTION_ONLY.value).mean(),
-        **_with_interval("median_m", medians_m[0], medians_m[1:]),
+        **with_interval("median_m", medians_m),
         "p95_m": np.percentile(error_m[located], 95) if located.any() else np.nan,
         "over_0.5_m": (error_m[located] > NEAR_M).mean() if located.any() else np.nan,
         "bearing_deg": np.median(columns["bearing_deg"][chosen]),
@@ -125,14 +112,14 @@ def _measured(columns: Columns, chosen: Any, standard: Any, first: Any) -> Summa
         "confidence": confidence.mean(),
         "right": (error_m <= NEAR_M).mean(),
         "lost": lost.mean(),
-        **_with_interval("more_lost", more_lost.mean(), more_lost[drawn].mean(axis=1)),
-        **_with_interval("grown", grown[0], grown[1:]),
+        **with_interval("more_lost", np.concatenate([[more_lost.mean()], more_lost[drawn].mean(axis=1)])),
+        **with_interval("grown", grown),
     }
     return {name: value if name == "events" else round(float(value), 4) for name, value in row.items()}
 
 
 def _outvoted(columns: Columns, chosen: Any, case: Case) -> SummaryRow:
-    """In what share of events the array that has a fault was outvoted, and in what share another was."""
+    """Return the shares of events in which the faulty array was an outlier, and in which another array was."""
     bad = [case.faulty(number) if case.spoilt else "" for number in columns["position"][chosen].tolist()]
     named = [set(each or "") for each in columns["outvoted"][chosen].tolist()]
     it = np.mean([bool(of & set(which)) for which, of in zip(bad, named, strict=True)]) if case.spoilt else np.nan
@@ -145,19 +132,19 @@ def _lost(columns: Columns, chosen: Any) -> BoolArray:
 
 
 def _by_position(columns: Columns, chosen: Any, values: Any) -> FloatArray:
-    """Values of the rows chosen, one line for each position: (positions, events), in the order of both."""
+    """Arrange values of the chosen rows by position and class of sound: (positions, events)."""
     order = np.lexsort((columns["sound"][chosen], columns["position"][chosen]))
     positions = len(set(columns["position"][chosen].tolist()))
     return np.asarray(values[order].reshape(positions, -1), dtype=np.float64)
 
 
 def _drawn(positions: int) -> Any:
-    """Resamples of positions: (B, positions), the same for all conditions, so that differences are paired."""
+    """Draw resamples of positions, (B, positions): the same for all conditions, so that differences are paired."""
     return np.random.default_rng(0).integers(positions, size=(RESAMPLES, positions))
 
 
 def _medians_m(columns: Columns, chosen: Any, drawn: Any) -> FloatArray:
-    """Median error of what was located, followed by those of the resamples: (1 + B,); NaN where nothing was."""
+    """Return the median error of the located events, followed by its resamples: (1 + B,); NaN without such events."""
     error_m = np.where(columns["located"][chosen], columns["error_m"][chosen], np.inf)
     lines = _by_position(columns, chosen, error_m)
     resampled = np.sort(np.concatenate([lines.reshape(1, -1), lines[drawn].reshape(len(drawn), -1)]), axis=1)
@@ -167,27 +154,23 @@ def _medians_m(columns: Columns, chosen: Any, drawn: Any) -> FloatArray:
     return np.where(count > 0, medians, np.nan)
 
 
-def _with_interval(name: str, value: float, resampled: FloatArray) -> dict[str, float]:
-    known = resampled[np.isfinite(resampled)]
-    low, high = np.percentile(known, INTERVAL) if len(known) else (np.nan, np.nan)
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
-
-
 def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Block]:
     named = "" if settings["scenarios"] == [ROOMS] else f"--scenario {','.join(settings['scenarios'])} "
     listed = {"rt": settings["rt60s_s"], "snr": settings["snrs_db"]}
     conditions = " ".join(f"--{name} {','.join(f'{value:g}' for value in values)}" for name, values in listed.items())
     blocks: list[Block] = [
-        Heading(1, "The localizer against the paper's standard"),
-        f"{settings['positions']} positions anywhere in the paper's room, one clip of each class at each; sounds of "
-        f"the {settings['half']} half, seed {settings['seed']}; white sensor noise below the event's mean power at the "
-        "two arrays 5 m apart, over its whole recording with its reverberation. Both methods see the same samples and "
-        f"refine below a grid of {settings['spacing_m']:g} m. Refused: confidence below {LEAST_CONFIDENCE:g}.",
+        Heading(1, "The default localizer against the paper's standard"),
+        f"{settings['positions']} positions anywhere in the paper's room, with one clip of each class at each "
+        f"position; sounds of the {settings['half']} half, seed {settings['seed']}. White sensor noise is added below "
+        "the event's mean power at the two arrays 5 m apart, over its whole recording including its reverberation. "
+        f"Both methods get the same samples and refine below a grid of {settings['spacing_m']:g} m. An event is "
+        f"refused if its confidence is below {LEAST_CONFIDENCE:g}.",
         f"Command: `livessl evaluate localizer {named}--events DIR --positions {settings['positions']} {conditions} "
         f"--seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 task 2.",
-        "Median, 95 %, over 0.5 m and 90 % ellipsoid are of what was located; direction off is the median angle at "
-        "the nearest array, of all events. Lost: more than 0.5 m off, or not located. More lost than the standard: "
-        "difference on the same events; below 0 is better. All intervals are 99 % ones (bootstrap over positions).",
+        "*Median*, *95 %*, *over 0.5 m* and *in the 90 % ellipsoid* are over the located events; *direction error* is "
+        "the median angle at the nearest array, over all events. *Lost* events are not located, or located more than "
+        "0.5 m off; *more lost than the standard* is the difference on the same events, and below 0 is better. All "
+        "intervals are 99 % intervals (bootstrap over positions).",
     ]
     for name in settings["scenarios"]:
         here = [row for row in rows if row["scenario"] == name]
@@ -206,41 +189,41 @@ def _rooms(columns: Columns, rows: Sequence[SummaryRow]) -> list[Block]:
         Table(_TITLES, [_cells(row) for row in rows if row["sound"] == "all"]),
         Picture(
             "localizer",
-            "Left: share of events within a distance, refused ones counted as never. Right: of the "
-            "events kept when the least confident are refused, the share over 0.5 m off",
+            "Left: share of events within a distance; refused events are never within it. Right: share over 0.5 m off "
+            "among the events that are kept when the least confident ones are refused",
         ),
         Heading(3, "By class of sound"),
         Table(("sound", *_TITLES), [(row["sound"], *_cells(row)) for row in rows if row["sound"] != "all"]),
-        Heading(3, "Honesty"),
-        *_honesty(columns, [SCENARIOS[ROOMS].cases[0].name]),
-        f"The logistic fit to these events would be {intercept:.2f} + {of_margin:.2f} margin + {of_standing:.2f} "
-        f"standing (the constants come from the {HALVES[0]} half).",
+        Heading(3, "Confidence"),
+        *_confidence(columns, [SCENARIOS[ROOMS].cases[0].name]),
+        f"A logistic fit to these events would be {intercept:.2f} + {of_margin:.2f} margin + {of_standing:.2f} "
+        f"peak-to-RMS ratio (the constants in use come from the {HALVES[0]} half).",
     ]
 
 
 def _scenario(columns: Columns, name: str, rows: Sequence[SummaryRow]) -> list[Block]:
     scenario = SCENARIOS[name]
     first = scenario.cases[0].name
-    titles = ["case", *_TITLES, f"median over that of {first}"]
+    titles = ["case", *_TITLES, f"ratio of the median to that of {first}"]
     cells = [[row["case"], *_cells(row), _grown(row) if row["case"] != first else ""] for row in rows]
     if any(case.spoilt for case in scenario.cases):
-        titles += ["outvotes it", "outvotes another"]
-        cells = [[*cell, *_votes(row)] for cell, row in zip(cells, rows, strict=True)]
+        titles += ["faulty array is an outlier", "another array is an outlier"]
+        cells = [[*cell, *_outlier_cells(row)] for cell, row in zip(cells, rows, strict=True)]
     return [
         Heading(2, scenario.title),
         scenario.about,
         Table(titles, cells),
         Picture(
             name,
-            "Above: median error of what was located, with its 99 % interval. Below: share of events lost. Filled: "
+            "Above: median error of the located events, with its 99 % interval. Below: share of lost events. Filled: "
             f"{OURS}; hollow: {STANDARD}",
         ),
-        *_honesty(columns, [case.name for case in scenario.cases]),
+        *_confidence(columns, [case.name for case in scenario.cases]),
     ]
 
 
-def _honesty(columns: Columns, cases: Sequence[str]) -> list[Block]:
-    """How good the confidence is, over all conditions of each case."""
+def _confidence(columns: Columns, cases: Sequence[str]) -> list[Block]:
+    """Compare the confidence with the truth, over all conditions of each case."""
     classes = [f"{low:g} to {high:g}" for low, high in pairwise(EDGES)]
     rows = []
     for case in cases:
@@ -251,21 +234,19 @@ def _honesty(columns: Columns, cases: Sequence[str]) -> list[Block]:
         cells.append("" if np.isnan(area) else f"{area:.3f}")
         for low, high in pairwise(EDGES):
             within = (confidence >= low) & ((confidence < high) | (high == EDGES[-1]))
-            said = (
-                f"{confidence[within].mean():.2f}: {right[within].mean():.2f} of {within.sum()}" if within.any() else ""
-            )
-            cells.append(said)
+            mean, share = (f"{each[within].mean():.2f}" if within.any() else "" for each in (confidence, right))
+            cells.append(f"{mean}: {share} of {within.sum()}" if within.any() else "")
         rows.append(cells)
     return [
-        "The confidence, of all events whether located or not: its mean, the share that was right to within 0.5 m, the "
-        "area under the ROC of the one against the other; and by classes of confidence its mean, the share right, and "
-        "of how many.",
-        Table(("case", "events", "confidence", "right", "area under ROC", *classes), rows),
+        "The confidence of all events, located or not: its mean, the share of events that are right to within 0.5 m, "
+        "and the area under the ROC curve of the one against the other. For each class of confidence: its mean, the "
+        "share of events that are right, and the number of events.",
+        Table(("case", "events", "mean confidence", "right", "area under ROC", *classes), rows),
     ]
 
 
 _TITLES: Final = ("RT60", "SNR", "method", "located", "median", "95 %", "over 0.5 m", "in the 90 % ellipsoid",
-                  "direction off", "lost", "more lost than the standard")  # fmt: skip
+                  "direction error", "lost", "more lost than the standard")  # fmt: skip
 
 
 def _cells(row: SummaryRow) -> tuple[str, ...]:
@@ -287,7 +268,7 @@ def _cells(row: SummaryRow) -> tuple[str, ...]:
     )
 
 
-def _votes(row: SummaryRow) -> tuple[str, str]:
+def _outlier_cells(row: SummaryRow) -> tuple[str, str]:
     if row["method"] == STANDARD:
         return "", ""
     it = f"{100 * row['outvotes_it']:.1f} %" if np.isfinite(row["outvotes_it"]) else ""
@@ -312,13 +293,13 @@ def _curves(columns: Columns) -> list[LocalizerCurve]:
         here = (columns["rt60_s"] == rt60_s) & (columns["snr_db"] == snr_db)
         here &= columns["case"] == SCENARIOS[ROOMS].cases[0].name
         ours = here & (columns["method"] == OURS)
-        surest = np.argsort(-columns["confidence"][ours], kind="stable")
+        by_confidence = np.argsort(-columns["confidence"][ours], kind="stable")
         error_m = np.where(columns["located"], columns["error_m"], np.inf)
         curves.append(
             LocalizerCurve(
                 f"RT {rt60_s:g} s, " + (f"{snr_db:g} dB" if np.isfinite(snr_db) else "clean"),
                 {method: np.sort(error_m[here & (columns["method"] == method)]) for method in METHODS},
-                columns["error_m"][ours][surest] > NEAR_M,
+                columns["error_m"][ours][by_confidence] > NEAR_M,
             )
         )
     return curves

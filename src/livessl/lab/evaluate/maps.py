@@ -1,6 +1,6 @@
 """Power maps of many recordings at once: a matrix per pair of microphones, made once, times their correlations.
 
-Quick for coarse grids; its memory grows with the grid, so fine grids go by the look-ups of `livessl.core.locate.srp`.
+This is fast on coarse grids. Its memory grows with the grid, so fine grids use look-ups (`livessl.core.locate.srp`).
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import GCC, ArraySpec, Float32Array, FloatArray, IntArray
 
 MARGIN_S: Final = 0.02
-"""Correlation kept beyond the largest delay: the low-pass of a node's cut-off reaches so far.
+"""Correlation, in seconds, that is kept beyond the largest delay for the low-pass of a grid point's cut-off.
 
-Maps of 0.5 m arrays then err by 0.5 %, those of 3 m, which are cut off at some hundred hertz, by 2.5 %.
+The error of the maps is then 0.5 % for 0.5 m arrays and 2.5 % for 3 m arrays, which are cut off at a few hundred hertz.
 """
 
-_SLAB_NODES: Final = 4096
+_SLAB_POINTS: Final = 4096
+"""Grid points whose matrix rows are made at once, to bound the memory."""
 
 
 def reach_samples(aperture_m: float, sample_rate_hz: float, c_m_s: float) -> int:
-    """Whole-sample lags to keep on each side of zero."""
+    """Return the number of whole-sample lags to keep on each side of zero."""
     return int(np.ceil((aperture_m / c_m_s + MARGIN_S) * sample_rate_hz)) + 1
 
 
 class PairMatrices:
     """Interpolation matrices W of pairs of microphones: map = 2/K sum of W r, with r a pair's GCC at whole-sample lags.
 
-    W[g, n] = (2 f/fs) sinc(2 f (tau_g - n/fs)) with f the node's cut-off, or fs/2 where nothing is cut: low-pass and
+    W[g, n] = (2 f/fs) sinc(2 f (tau_g - n/fs)) with f the grid point's cut-off, or fs/2 without one: low-pass and
     fractional delay in one (Dietzen et al. 2021 for the sampling; the cut-off as in `alias_free_hz`).
 
     Parameters
@@ -41,7 +42,7 @@ class PairMatrices:
     grid : Grid
     sample_rate_hz, c_m_s : float
     band_limit : bool
-        Whether nodes cut off at all.
+        Whether grid points have a cut-off, against spatial aliasing.
     """
 
     def __init__(self, grid: Grid, sample_rate_hz: float, c_m_s: float, *, band_limit: bool) -> None:
@@ -53,14 +54,14 @@ class PairMatrices:
         self._made: dict[bytes, Float32Array] = {}
 
     def power(self, spec: ArraySpec, pairs: IntArray, lags: Float32Array) -> Float32Array:
-        """Map recordings of one array.
+        """Map C recordings of one array.
 
         Parameters
         ----------
         spec : ArraySpec
         pairs : (P, 2) int64
         lags : (C, P, 2 reach + 1) float32
-            Of C recordings, `reach` from the array's aperture.
+            Correlations at whole-sample lags; `reach` follows from the array's aperture.
 
         Returns
         -------
@@ -86,8 +87,8 @@ class PairMatrices:
         reach = reach_samples(spacing_m, self._rate_hz, self._c_m_s)
         lags_s = np.arange(-reach, reach + 1) / self._rate_hz
         matrix = np.empty((len(self._nodes_m), len(lags_s)), dtype=np.float32)
-        for first in range(0, len(matrix), _SLAB_NODES):
-            nodes_m = self._nodes_m[first : first + _SLAB_NODES]
+        for first in range(0, len(matrix), _SLAB_POINTS):
+            nodes_m = self._nodes_m[first : first + _SLAB_POINTS]
             delay_s = steering_delays_s(nodes_m, microphones_m, pairs, self._c_m_s)[0]
             cut_hz = np.full(len(nodes_m), self._rate_hz / 2.0)
             if self._band_limit:
@@ -100,7 +101,7 @@ class PairMatrices:
 
 
 class PairTables:
-    """The same for fine grids: look-ups in tables of finely interpolated correlations, one for each cut-off.
+    """Maps fine grids by look-ups in tables of finely interpolated correlations, one table for each cut-off.
 
     The cut-offs are third octaves, rounded down.
 
@@ -115,7 +116,7 @@ class PairTables:
         self._made: dict[bytes, SRPMapper] = {}
 
     def power(self, spec: ArraySpec, pairs: IntArray, lags: Float32Array) -> Float32Array:
-        """Map recordings of one array, as `PairMatrices.power`."""
+        """Map C recordings of one array, as `PairMatrices.power` does."""
         cut_offs_hz = third_octaves_below_hz(spec.band_hz) if self._band_limit else ()
         count = lags.shape[2]
         reach = int(np.ceil(spec.aperture_m / self._c_m_s * self._rate_hz)) * OVERSAMPLING + OVERSAMPLING
@@ -142,5 +143,5 @@ class PairTables:
 
 
 def _taper(offset_s: FloatArray) -> FloatArray:
-    """Flat for the first half of the margin, then a cosine to nothing: no step where the lags end."""
+    """Return weights that are 1 over half of the margin and then fall to 0 as a cosine: the lags end without a step."""
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(2.0 * np.abs(offset_s) / MARGIN_S - 1.0, 0.0, 1.0)))

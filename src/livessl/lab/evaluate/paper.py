@@ -1,4 +1,4 @@
-"""The paper's experiments as data: rooms, arrays, places, methods; the same elsewhere. It simulates nothing."""
+"""The paper's experiments as data: rooms, arrays, positions, methods; and the same with a site file's arrays."""
 
 from __future__ import annotations
 
@@ -19,23 +19,29 @@ ROOM_M: Final = (8.0, 10.0, 4.0)
 OFFICE_M: Final = (7.05, 5.64, 2.84)
 OFFICE_RT60_S: Final = 0.7
 OFFICE_SPAN_M: Final = (4.0, 4.0, 2.0)
+"""Size, in metres, of the box of sources about the office's centre."""
+
 RT60S_S: Final = tuple(round(0.2 * step, 1) for step in range(11))
 SMALL_M: Final = 0.5
 LARGE_M: Final = 3.0
+"""Edges, in metres, of the small and of the large tetrahedron."""
+
 METHODS: Final = ("srp-phat", "cepstral", "averaged")
 CLASSES: Final = ("doorslam", "keysDrop", "phone", "speech")
+"""Classes of sound, as the clips of DCASE 2016 task 2 are named."""
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """What answers as one: arrays whose maps are summed, and how each is correlated.
+    """Arrays whose maps are summed to one estimate.
 
     Parameters
     ----------
     name : str
-        As it stands in the results.
+        Name in the results.
     arrays : tuple of ArraySpec
     methods : tuple of str
+        Methods by which the arrays are correlated.
     """
 
     name: str
@@ -44,42 +50,43 @@ class System:
 
     @property
     def microphones_m(self) -> FloatArray:
-        """All microphones (K, 3), array by array."""
+        """Positions of all microphones (K, 3), array by array."""
         return np.vstack([spec.microphones_m for spec in self.arrays])
 
     @property
     def centre_m(self) -> FloatArray:
-        """Mean position (3,): radial, azimuth and elevation errors are seen from here."""
+        """Mean position of the microphones (3,), the origin of radial, azimuth and elevation errors."""
         return np.asarray(self.microphones_m.mean(axis=0))
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """All that a campaign's results depend on, besides the sounds.
+    """All settings that a campaign's results depend on, besides the sounds.
 
     Parameters
     ----------
     experiment : str
         One of `EXPERIMENTS`.
     positions : int
-        Places of the source; each plays one random clip of every class.
+        Number of positions of the source; each plays one random clip of every class.
     rt60s_s : tuple of float
-        Nominal reverberation times, seconds, by Sabine.
+        Nominal reverberation times, in seconds, by Sabine's formula.
     seed : int
-        Position n draws from its own stream, so results do not depend on how many follow, or on who computes them.
+        Every position has its own random stream, so its results do not depend on the other positions.
     sample_rate_hz : float
-        16 kHz is enough: the band ends at 6 kHz.
+        Sample rate of the simulation; 16 kHz is enough for a band up to 6 kHz.
     spacing_m : float
-        Of the search grid: cell-centred.
+        Spacing of the cell-centred search grid.
     snr_db : float or None
-        White sensor noise, independent at each microphone, so far below the mean power of the whole recording, over the
-        system's microphones; None is the paper's: none.
+        Level of the mean power of the whole recording, over the system's microphones, above white sensor noise that is
+        independent at each microphone; None, as in the paper, adds no noise.
     segment : str
-        Which of an event's segments is localized: "longest", or "peak" for the one that holds the loudest frame.
+        The segment of an event that is localized: "longest", or "peak" for the one with the loudest frame.
     band_limit : bool
-        Against spatial aliasing, per pair and node; see `livessl.core.steering.alias_free_hz`.
+        Whether the band is limited against spatial aliasing, per pair and grid point; see
+        `livessl.core.steering.alias_free_hz`.
     layout : Layout or None
-        Room, search volume and arrays; None are the paper's.
+        Room, search volume and arrays; None takes the paper's.
     """
 
     experiment: str
@@ -94,7 +101,7 @@ class Settings:
     layout: Layout | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values by name. The paper's layout is not among them: campaigns from before there were others go on."""
+        """Return the settings as plain values by name; without a layout there is no such key, as in older campaigns."""
         known = asdict(self)
         if self.layout is None:
             del known["layout"]
@@ -103,7 +110,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A room, what listens in it, and where sources are.
+    """A room, the systems in it, and the positions of its sources.
 
     Parameters
     ----------
@@ -112,14 +119,15 @@ class Experiment:
     place : callable
         Draws a source position (3,) in metres: (generator, number of the position) -> position.
     rt60s_s : tuple of float
-        The paper's.
+        Default reverberation times, in seconds.
     spacing_m : float
-        The paper's grid.
+        Default spacing of the search grid.
     positions : int
-        The paper's number.
+        Default number of positions.
     c_m_s : float
+        Speed of sound.
     band_hz : (float, float)
-        From the lowest to the highest frequency used.
+        Lowest and highest frequency of all arrays.
     bounds_m : three (float, float), or None
         Search volume; None is the room.
     """
@@ -136,26 +144,26 @@ class Experiment:
 
     @property
     def lag_rate_hz(self) -> float:
-        """Least rate of the lags kept: twice the band's end and a sixth, however fast the sound was sampled."""
+        """Least rate, in hertz, of the lags that are kept: a sixth more than twice the upper end of the band."""
         return 7.0 * self.band_hz[1] / 3.0
 
     def grid(self, spacing_m: float) -> Grid:
-        """The search grid."""
+        """Make the search grid."""
         x, y, z = self.room_m
         return Grid(self.bounds_m or ((0.0, x), (0.0, y), (0.0, z)), spacing_m)
 
 
 def tetrahedron_in_cube(edge_m: float) -> FloatArray:
-    """Regular tetrahedron of every other vertex of a cube, around the origin: (4, 3).
+    """Return a regular tetrahedron (4, 3) of every other vertex of a cube, centred at the origin.
 
-    Mirrored in any axis it takes the other vertices, so that two at 0 m are the cube's eight.
+    Its mirror image in any axis consists of the other vertices, so that two arrays at 0 m are the cube's eight.
     """
     vertices = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
     return np.asarray(vertices * (edge_m / np.sqrt(8.0)))
 
 
 def pair(centre_m: FloatArray, axis: int, separation_m: float) -> tuple[ArraySpec, ArraySpec]:
-    """Two 0.5 m tetrahedra, mirror images of one another, so far apart along an axis."""
+    """Return two 0.5 m tetrahedra, mirror images of each other, at a distance along an axis."""
     shift = np.zeros(3)
     shift[axis] = separation_m / 2.0
     mirror = np.ones(3)
@@ -169,7 +177,7 @@ def _single(name: str, centre_m: FloatArray, edge_m: float, methods: tuple[str, 
 
 
 def _joint(centre_m: FloatArray, axis: int) -> System:
-    """The eight microphones of the pair at 0 m, on one clock, as one array."""
+    """Return the eight microphones of the pair at 0 m, on one clock, as one array."""
     return System("joint-8", (joined(pair(centre_m, axis, 0.0), {"a": "one", "b": "one"}, "joint-8"),))
 
 
@@ -177,12 +185,12 @@ def _apart(centre_m: FloatArray, axis: int, separations_m: tuple[int, ...]) -> t
     return tuple(System(f"pair-{metres}m", pair(centre_m, axis, metres)) for metres in separations_m)
 
 
-def _anywhere(rng: np.random.Generator, number: int) -> FloatArray:  # noqa: ARG001 - a place
+def _anywhere(rng: np.random.Generator, number: int) -> FloatArray:  # noqa: ARG001 - the signature of `Experiment.place`
     return np.asarray(rng.uniform(0.0, 1.0, 3) * ROOM_M)
 
 
 def _over_the_office(rng: np.random.Generator, number: int) -> FloatArray:
-    """Two heights in turn, anywhere in the middle of the floor."""
+    """Draw a position at one of two heights in turn, anywhere in the middle of the floor."""
     x, y, height = OFFICE_SPAN_M
     level = 0.5 if number % 2 else -0.5
     offset = np.array([rng.uniform(-0.5, 0.5) * x, rng.uniform(-0.5, 0.5) * y, level * height])
@@ -226,19 +234,19 @@ EXPERIMENTS: Final[dict[str, Experiment]] = {
         80,
     ),
 }
-"""By their names on the command line."""
+"""The paper's experiments by their names on the command line."""
 
 
 def experiment_of(name: str, layout: Layout | None = None) -> Experiment:
-    """An experiment of the paper, or the same with another room and other arrays.
+    """Return an experiment of the paper, or the same with another room and other arrays.
 
-    `one-array` hears each array alone, by every method; `diversity` each alone, and their sums. Sources are anywhere in
-    the search volume.
+    With a layout, `one-array` locates with each array alone, by every method, and `diversity` with each alone and with
+    their sums. Sources are anywhere in the search volume.
 
     Raises
     ------
     ValueError
-        Where the layout does not allow it.
+        If the layout does not allow the experiment.
     """
     paper = EXPERIMENTS[name]
     if layout is None:
@@ -257,7 +265,7 @@ def experiment_of(name: str, layout: Layout | None = None) -> Experiment:
     return Experiment(
         layout.room_m,
         tuple(systems),
-        lambda rng, number: np.asarray(rng.uniform(lower_m, upper_m)),  # noqa: ARG005 - a place
+        lambda rng, number: np.asarray(rng.uniform(lower_m, upper_m)),  # noqa: ARG005 - the signature of `Experiment.place`
         paper.rt60s_s,
         layout.spacing_m,
         paper.positions,

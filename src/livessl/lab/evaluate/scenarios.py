@@ -1,7 +1,7 @@
-"""The localizer's scenarios: which arrays listen, and what is wrong with them or with what is known of them.
+"""The localizer's scenarios: which arrays take part, and which faults they or their descriptions have.
 
-Plain values. Everything is in the paper's room. A case is simulated from what stands there and localized by what is
-believed.
+They are plain values. Everything is in the paper's room. A case is simulated with the true arrays and localized with
+the believed ones, as a faulty site file describes them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LOCALIZER: Final = "localizer"
 """Name of the experiment that compares `onset` with the paper's standard."""
 
 ROOMS: Final = "rooms"
-"""What is run where no scenario is named."""
+"""The scenario that is run by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,19 +33,19 @@ class Case:
     Parameters
     ----------
     name : str
-        As it stands in the results: there is none other of it.
+        Name in the results, unique among all cases.
     arrays : str
-        Their names, a letter each.
+        Names of the arrays, one letter each.
     moved_m, turned_deg : float
-        How far an array's centre, and its pose about a random axis, are from what is believed.
+        Distance of an array's believed centre from the true one, and angle about a random axis between the poses.
     warmer_c : float
-        How much warmer than it is the air is believed to be, degrees.
+        Believed minus true temperature of the air, in degrees Celsius.
     dead : bool
         Whether an array's second microphone gives only zeros.
     of_one : bool
-        Whether one array alone has the fault: each in turn, by the number of the position.
+        Whether only one array has the fault: each in turn, by the number of the position.
     without_it : bool
-        Whether that array is left out.
+        Whether the faulty array is excluded.
     """
 
     name: str
@@ -59,36 +59,36 @@ class Case:
 
     @property
     def c_m_s(self) -> float:
-        """Speed of sound that is believed: the true one is the paper's."""
+        """Believed speed of sound, in m/s; the true one is the paper's."""
         return C_M_S + speed_of_sound_m_s(ROOM_C + self.warmer_c) - speed_of_sound_m_s(ROOM_C)
 
     @property
     def misplaced(self) -> bool:
-        """Whether poses are drawn anew at every position."""
+        """True if poses are drawn anew at every position."""
         return self.moved_m > 0.0 or self.turned_deg > 0.0
 
     @property
     def spoilt(self) -> bool:
-        """Whether one array that is listened to has a fault."""
+        """True if exactly one of the arrays that take part has a fault."""
         return self.of_one and not self.without_it
 
     def faulty(self, number: int) -> str:
-        """Names of the arrays that have the fault at a position."""
+        """Return the names of the arrays that have the fault at a position."""
         return self.arrays[number % len(self.arrays)] if self.of_one else self.arrays
 
-    def listening(self, number: int) -> str:
-        """Names of the arrays that are listened to at a position."""
+    def used(self, number: int) -> str:
+        """Return the names of the arrays that take part at a position."""
         return self.arrays.replace(self.faulty(number), "") if self.without_it else self.arrays
 
     def believed(self, number: int, rng: np.random.Generator) -> list[ArraySpec]:
-        """The arrays as the site file has them."""
+        """Return the arrays as the site file describes them."""
         specs = []
-        for name in self.listening(number):
+        for name in self.used(number):
             spec = ARRAYS[name]
             if self.misplaced and name in self.faulty(number):
-                turn = _rotation(_direction(rng), np.radians(self.turned_deg))
+                rotation = _rotation(_direction(rng), np.radians(self.turned_deg))
                 shift_m = self.moved_m * _direction(rng)
-                moved_m = spec.centre_m + (spec.microphones_m - spec.centre_m) @ turn.T + shift_m
+                moved_m = spec.centre_m + (spec.microphones_m - spec.centre_m) @ rotation.T + shift_m
                 spec = ArraySpec(name, moved_m, spec.band_hz)
             specs.append(spec)
         return specs
@@ -96,13 +96,13 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Cases that are compared with one of them, on the same sounds.
+    """Cases on the same sounds; the first is the reference of all others.
 
     Parameters
     ----------
     title, about : str
+        Heading and description in the report.
     cases : tuple of Case
-        The first is what the others are compared with.
     """
 
     title: str
@@ -111,7 +111,7 @@ class Scenario:
 
 
 ROOM_C: Final = 20.0
-"""Temperature at which the speed of sound is about the paper's."""
+"""Temperature, in degrees Celsius, at which the speed of sound is about the paper's."""
 
 
 def _named(*pairs: tuple[str, tuple[ArraySpec, ArraySpec]]) -> dict[str, ArraySpec]:
@@ -130,7 +130,7 @@ ARRAYS: Final[Mapping[str, ArraySpec]] = _named(
     ("ef", pair(_CENTRE_M, 1, 3.0)),
     ("gh", pair(_CENTRE_M, 1, 1.0)),
 )
-"""All that stand anywhere: tetrahedra of 0.5 m, in pairs about the room's centre."""
+"""All arrays of the scenarios: tetrahedra of 0.5 m, in pairs about the room's centre."""
 
 TWO: Final = Case("two arrays", "ab")
 _FOUR: Final = Case("four arrays", "abcd")
@@ -141,7 +141,7 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
     "arrays": Scenario(
         "One to four arrays",
         "Tetrahedra of 0.5 m around the room's centre: two 5 m apart along the room, one and then two more 5 m apart "
-        "across it. One alone can tell little but the direction.",
+        "across it. One array alone measures little but the direction.",
         (TWO, Case("one array", "a"), _THREE, _FOUR),
     ),
     "removed": Scenario(
@@ -172,8 +172,9 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
     ),
     "bad-array": Scenario(
         "One bad array of three",
-        "Each in turn, by the number of the position: its pose in the site file is turned by 30 degrees about a random "
-        "axis, or one of its microphones gives only zeros. The two others alone are what can be had without it.",
+        "Each array has the fault in turn, by the number of the position: its pose in the site file is turned by 30 "
+        "degrees about a random axis, or one of its microphones gives only zeros. The case of the two others alone "
+        "shows what can be reached without the faulty array.",
         (
             _THREE,
             Case("the two others", "abc", of_one=True, without_it=True),
@@ -182,28 +183,28 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
         ),
     ),
 }
-"""By their names on the command line."""
+"""Scenarios by their names on the command line."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionCase:
-    """A session with two arrays: what sounds in it, and what is wrong with the second array's clock.
+    """A session with two arrays: its sounds, and the fault of the second array's clock.
 
     Parameters
     ----------
     name : str
-        As it stands in the results.
+        Name in the results.
     rounds : int
-        How often each class of sound is played, from a new place each time.
+        Number of times that each class of sound is played, from a new position each time.
     pairs : bool
         Whether sounds are played two at once.
     alone : bool
-        Whether of such two the second is left out.
+        Whether the second sound of each such pair is omitted.
     walks : bool or None
-        Whether a talker, the only sound, walks or stands; None for none.
+        Whether a talker, the only sound, walks (True) or stands (False); None for no talker.
     late_s, drift_ppm : float
-        How far its clock is ahead, which is what its stamps are too late by; how much faster than nominal its device
-        samples.
+        Time by which the second array's clock is ahead, so that its stamps are too late; deviation of its device's
+        sample rate from the nominal one.
     """
 
     name: str
@@ -217,13 +218,14 @@ class SessionCase:
 
 @dataclass(frozen=True, slots=True)
 class SessionScenario:
-    """Sessions that are compared with the first one's case, on the same sounds.
+    """Sessions on the same sounds; the first case is the reference of all others.
 
     Parameters
     ----------
     title, about : str
+        Heading and description in the report.
     rt60_s : float
-        Where none is given.
+        Default reverberation time, in seconds.
     cases : tuple of SessionCase
     """
 
@@ -234,13 +236,13 @@ class SessionScenario:
 
 
 SESSION_SNR_DB: Final = 20.0
-"""Where none is given."""
+"""Default level of the sounds above the sensor noise, in dB."""
 
 SESSIONS: Final[Mapping[str, SessionScenario]] = {
     "clocks": SessionScenario(
         "Clocks that disagree",
-        "Eight sounds, two of each class, each from a place of its own, one after the other; the clock of the second "
-        "array's node is ahead of the first's, or its device samples faster than it says.",
+        "Eight sounds, two of each class, follow one another, each from its own position. The clock of the second "
+        "array's node is ahead of the first's, or its device samples faster than its nominal rate.",
         0.4,
         (
             SessionCase("clocks agree", rounds=2),
@@ -252,20 +254,21 @@ SESSIONS: Final[Mapping[str, SessionScenario]] = {
     ),
     "two-sources": SessionScenario(
         "Two sources at once",
-        "Two sounds of different classes, of the same mean power, that begin within 0.1 s of one another, at least "
-        "1.5 m apart; two such pairs, one after the other. Alone: the first of each.",
+        "Two sounds of different classes and of the same mean power begin within 0.1 s of one another, at least 1.5 m "
+        "apart. A session has two such pairs, one after the other. In the case *alone* only the first sound of each "
+        "pair is played.",
         0.4,
         (SessionCase("alone", pairs=True, alone=True), SessionCase("two at once", pairs=True)),
     ),
     "walking": SessionScenario(
         "A talker who walks",
-        "Someone talks for some 9 s, with short pauses, and walks at 1 m/s from place to place, 1.5 m high and at "
-        "least 1 m from the walls; or stands where the walk began.",
+        "A person talks for about 9 s, with short pauses, and walks at 1 m/s from place to place, 1.5 m high and at "
+        "least 1 m from the walls, or stands where the walk began.",
         0.6,
         (SessionCase("stands", walks=False), SessionCase("walks", walks=True)),
     ),
 }
-"""By their names on the command line; each is a campaign of its own, through the whole fusion."""
+"""Scenarios through the whole fusion, by their names on the command line; each is a campaign of its own."""
 
 
 def _direction(rng: np.random.Generator) -> FloatArray:
@@ -274,6 +277,6 @@ def _direction(rng: np.random.Generator) -> FloatArray:
 
 
 def _rotation(axis: FloatArray, angle: float) -> FloatArray:
-    """Matrix (3, 3) of a turn about a unit axis (3,), by Rodrigues' formula."""
+    """Return the matrix (3, 3) of a rotation about a unit axis (3,), by Rodrigues' formula; the angle is in radians."""
     cross = np.cross(np.eye(3), axis)
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)

@@ -1,4 +1,4 @@
-"""A campaign's results as numbers: errors by condition, medians with bootstrap intervals. It judges nothing."""
+"""A campaign's results as numbers: errors by condition, medians with bootstrap intervals. It gives no verdicts."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from typing import Any, Final
 import numpy as np
 import pyarrow.parquet as pq
 
-from livessl.core.types import FloatArray
+from livessl.core.types import BoolArray, FloatArray
 
 RESAMPLES: Final = 1000
-"""Bootstrap resamples: the ends of a 99 % interval are then the 5th from either side."""
+"""Number of bootstrap resamples: the ends of a 99 % interval are then the 5th from either side."""
 
 INTERVAL: Final = (0.5, 99.5)
 """Percentiles of a 99 % interval."""
 
+NINETY_PERCENT: Final = 6.251
+"""Quantile of chi-square with three degrees of freedom: the squared Mahalanobis radius of the 90 % ellipsoid."""
+
 ERRORS: Final = ("error_m", "radial_m", "azimuth_deg", "elevation_deg")
+"""Columns of the error and of its components."""
 
 Condition = tuple[str, str, float]
 """System, method, nominal reverberation time in seconds."""
@@ -35,7 +39,7 @@ class Interval:
 
     @classmethod
     def of(cls, resampled: FloatArray) -> Interval:
-        """From the value itself, followed by its resamples: (1 + B,)."""
+        """Make an interval of a value that is followed by its resamples: (1 + B,)."""
         low, high = np.percentile(resampled[1:], INTERVAL)
         return cls(float(resampled[0]), float(low), float(high))
 
@@ -49,7 +53,9 @@ class Results:
     experiment : str
     values : mapping of Condition to error name to (positions, classes) float64
     classes : tuple of str
+        Classes of sound.
     t30_s : mapping of nominal reverberation time to (positions,) float64
+        Measured reverberation time, in seconds.
     """
 
     experiment: str
@@ -60,23 +66,23 @@ class Results:
 
     @property
     def positions(self) -> int:
-        """How many places the source was at."""
+        """Number of positions of the source."""
         return len(next(iter(self.t30_s.values())))
 
     @property
     def rt60s_s(self) -> tuple[float, ...]:
-        """Nominal reverberation times, seconds, ascending."""
+        """Nominal reverberation times, in seconds, in ascending order."""
         return tuple(sorted(self.t30_s))
 
     def has(self, system: str, method: str = "srp-phat") -> bool:
-        """Whether a system was heard by a method."""
+        """Return whether there are results of a system by a method."""
         return any(known[:2] == (system, method) for known in self.values)
 
     def medians(self, system: str, method: str, rt60_s: float, sound: str | None = None) -> FloatArray:
-        """Median error, metres, followed by those of resamples: (1 + B,).
+        """Return the median error, in metres, followed by the medians of resamples: (1 + B,).
 
-        Positions are resampled, not events: the four of a position share its place. Every condition sees the same
-        resamples, so that differences are paired.
+        Positions are resampled, not events, because the four events of a position share its place. Every condition gets
+        the same resamples, so that differences are paired.
         """
         condition = (system, method, rt60_s)
         key = (condition, sound)
@@ -92,12 +98,12 @@ class Results:
 
 
 def read_results(path: Path, experiment: str) -> Results:
-    """Read `results.parquet`, of which every position has the same rows.
+    """Read the `results.parquet` of one of the paper's campaigns.
 
     Raises
     ------
     ValueError
-        Where it is not such a file.
+        If its positions do not all have the same rows.
     """
     table = pq.read_table(path)
     text = {name: _codes(table, name) for name in ("system", "method", "sound")}
@@ -124,7 +130,7 @@ def read_results(path: Path, experiment: str) -> Results:
 
 
 def summary(results: Results) -> list[dict[str, Any]]:
-    """One row per condition, for all sounds and for each class."""
+    """Summarize each condition, for all sounds and for each class: one row each."""
     rows = []
     for (system, method, rt60_s), errors in results.values.items():
         for sound in (None, *results.classes):
@@ -159,14 +165,31 @@ def summary(results: Results) -> list[dict[str, Any]]:
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows of the same keys."""
+    """Write rows that have the same keys."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
+def with_interval(name: str, resampled: FloatArray) -> dict[str, float]:
+    """Return a value, (1 + B,) with its resamples, and its 99 % interval as columns `NAME`, `NAME_low`, `NAME_high`."""
+    known = resampled[1:][np.isfinite(resampled[1:])]
+    low, high = np.percentile(known, INTERVAL) if len(known) else (np.nan, np.nan)
+    return {name: float(resampled[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
+
+
+def area_under_roc(score: FloatArray, good: BoolArray) -> float:
+    """Return the probability that a good event's score exceeds a bad one's; ties count half, NaN if one is missing."""
+    good_scores, bad_scores = np.sort(score[good]), score[~good]
+    if len(good_scores) == 0 or len(bad_scores) == 0:
+        return float("nan")
+    below = np.searchsorted(good_scores, bad_scores, side="left")
+    not_above = np.searchsorted(good_scores, bad_scores, side="right")
+    return float(1.0 - (below + not_above).mean() / (2.0 * len(good_scores)))
+
+
 def _codes(table: Any, name: str) -> tuple[Any, list[str]]:
-    """A column of names as numbers, and the names in alphabetical order."""
+    """Return a column of names as numbers (n,), and the names in alphabetical order."""
     names, codes = np.unique(np.asarray(table.column(name).to_pylist()), return_inverse=True)
     return codes, [str(each) for each in names]

@@ -1,7 +1,7 @@
-"""How well several sources, and tracks of them, were found: OSPA, and the measures of the LOCATA challenge.
+"""Measures of localization and tracking of several sources: OSPA, and the measures of the LOCATA challenge.
 
 OSPA: Schuhmacher, Vo and Vo, IEEE Trans. Signal Process. 56(8), 2008. LOCATA: Evers et al., IEEE/ACM Trans. Audio
-Speech Lang. Process. 28, 2020; there of directions, here of places.
+Speech Lang. Process. 28, 2020; the challenge measures directions, this module positions.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from scipy.optimize import linear_sum_assignment
 from livessl.core.types import FloatArray
 
 CUT_OFF_M: Final = 1.0
-"""What is further off counts as missed, and as false."""
+"""Distance, in metres, from which an estimate counts as false and its source as missed."""
 
 HOLD_S: Final = 0.5
-"""A track's place is known between two of its states at most so far apart."""
+"""Longest time, in seconds, between two states of a track over which its position is interpolated."""
 
 
 def assigned(truth_m: FloatArray, found_m: FloatArray, cut_off_m: float = CUT_OFF_M) -> FloatArray:
-    """Distance of what was found for each source, infinite where nothing was.
+    """Assign estimates to sources, and return each source's distance to its estimate, infinite without one.
 
-    Each thing found is for one source at most; the sum of distances, none counted above the cut-off, is least.
+    Each estimate belongs to one source at most. The assignment minimizes the sum of distances, each counted up to the
+    cut-off.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ def assigned(truth_m: FloatArray, found_m: FloatArray, cut_off_m: float = CUT_OF
     Returns
     -------
     (N,) float64
-        In metres.
+        Distances in metres.
     """
     distance_m = np.linalg.norm(truth_m[:, None] - found_m[None], axis=2)
     rows, columns = linear_sum_assignment(np.minimum(distance_m, cut_off_m))
@@ -47,7 +48,9 @@ def assigned(truth_m: FloatArray, found_m: FloatArray, cut_off_m: float = CUT_OF
 
 
 def ospa_m(truth_m: FloatArray, found_m: FloatArray, cut_off_m: float = CUT_OFF_M) -> float:
-    """Optimal sub-pattern assignment of order 1: mean error of the larger set, what has no match counting the cut-off.
+    """Return the optimal sub-pattern assignment metric (OSPA) of order 1, in metres.
+
+    It is the mean error over the larger set; an element without a match counts as the cut-off.
 
     Parameters
     ----------
@@ -64,25 +67,24 @@ def ospa_m(truth_m: FloatArray, found_m: FloatArray, cut_off_m: float = CUT_OFF_
 
 @dataclass(frozen=True, slots=True)
 class TrackScore:
-    """How one source was tracked.
+    """Measures of the tracking of one source.
 
     Parameters
     ----------
     rmse_m : float
-        Of the track that is with it; NaN where none ever was.
+        Root mean square error of the source's track; NaN if it never had one.
     detected : float
-        Share of the time in which one was (LOCATA's probability of detection).
+        Share of the time in which the source has a track (LOCATA's probability of detection).
     ids : int
-        How many tracks were with it at some time.
+        Number of tracks that the source had at some time.
     swaps, breaks : int
-        How often another track took over, and how often it was lost and found again.
+        Number of times that another track took over, and that the source lost its track and got one again.
     false_per_s : float
-        Tracks that are with no source, at a mean moment, over a second: what LOCATA calls the false alarm rate, here
-        at one estimate a track and moment.
+        Mean number of tracks without a source, over time; LOCATA calls it the false alarm rate.
     latency_s : float
-        From the beginning to the first moment with a track; NaN where there was none.
+        Time from the beginning to the first moment with a track; NaN if there was none.
     ospa_m : float
-        Mean over time.
+        Mean of the OSPA over time.
     """
 
     rmse_m: float
@@ -96,18 +98,18 @@ class TrackScore:
 
 
 def score(times_s: FloatArray, truth_m: FloatArray, tracks: Mapping[int, tuple[FloatArray, FloatArray]]) -> TrackScore:
-    """Hold tracks against where a source was.
+    """Compare tracks with the true positions of a source.
 
-    A track that was with the source stays with it while it is within the cut-off; else the nearest takes over.
+    The source keeps its track while that is within the cut-off; otherwise the nearest track takes over.
 
     Parameters
     ----------
     times_s : (T,) float64
-        When the source sounded, ascending.
+        Times at which the source sounded, ascending.
     truth_m : (T, 3) float64
-        Where it was then.
+        Its positions at these times.
     tracks : mapping of id to ((S,), (S, 3)) float64
-        Times and places of each track's states, ascending in time.
+        Times and positions of each track's states, ascending in time.
     """
     places_m = {number: _places_m(times_s, *states) for number, states in tracks.items()}
     errors_m, with_it, ospas_m = [], [], []
@@ -140,7 +142,7 @@ def score(times_s: FloatArray, truth_m: FloatArray, tracks: Mapping[int, tuple[F
 
 
 def _places_m(at_s: FloatArray, times_s: FloatArray, places_m: FloatArray) -> FloatArray:
-    """Where a track was at some times: (T, 3); NaN where its states do not tell."""
+    """Interpolate a track's positions at given times: (T, 3); NaN where its states are too far apart."""
     after = np.searchsorted(times_s, at_s, side="left")
     inside = (after > 0) & (after < len(times_s))
     gap_s = np.full(len(at_s), np.inf)

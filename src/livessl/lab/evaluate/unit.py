@@ -1,4 +1,7 @@
-"""One position of a campaign: simulated, heard by every system, localized by every method. It stores nothing."""
+"""One position of a campaign of the paper: simulated, recorded by every system, localized by every method.
+
+It stores nothing.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 import numpy as np
+import pyarrow as pa
 import scipy.fft
 from scipy.signal import butter, sosfilt
 
@@ -17,16 +21,36 @@ from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, IntArray
 from livessl.lab.evaluate.maps import PairMatrices, PairTables, reach_samples
 from livessl.lab.evaluate.paper import Experiment, Settings, System, experiment_of
+from livessl.lab.evaluate.parquet import NAME
 from livessl.simulation.room import impulse_responses
 
 Row = dict[str, Any]
+"""One row of a campaign's results, by column."""
+
+SCHEMA: Final = pa.schema(
+    [
+        ("position", pa.int32()),
+        ("system", NAME),
+        ("method", NAME),
+        ("sound", NAME),
+        ("clip", NAME),
+        ("rt60_s", pa.float32()),
+        ("t30_s", pa.float32()),
+        ("active_s", pa.float32()),
+        *((f"{axis}_m", pa.float32()) for axis in "xyz"),
+        *((f"found_{axis}_m", pa.float32()) for axis in "xyz"),
+        *((name, pa.float32()) for name in ("error_m", "radial_m", "azimuth_deg", "elevation_deg")),
+    ]
+)
+"""One row per event, condition, system and method: truth, estimate, error and its components seen from the system's
+centre."""
 
 FRONT_ENDS: Final[Mapping[str, FrontEnd]] = {
     "srp-phat": whole_segment,
     "cepstral": cepstral,
     "averaged": averaged,
 }
-"""What each method correlates."""
+"""Front end of each method: it makes the spectra that are correlated."""
 
 PEAK: Final = 0.5
 """Largest sample of a system's recording before it is rounded to 16 bits: 6 dB of headroom."""
@@ -34,22 +58,21 @@ PEAK: Final = 0.5
 Clips = Mapping[str, tuple[tuple[str, Float32Array], ...]]
 """Class of sound -> its clips: name and samples (n,), at the campaign's sample rate."""
 
-
-MATRIX_NODES: Final = 8192
-"""Larger grids go by tables: the matrices of a hundred pairs would fill gigabytes."""
+MATRIX_POINTS: Final = 8192
+"""Most grid points that are mapped by matrices; with more, the matrices of a hundred pairs would fill gigabytes."""
 
 
 class Mapper(Protocol):
     """Maps whole-sample correlations of one array's C recordings onto the grid."""
 
     def power(self, spec: ArraySpec, pairs: IntArray, lags: Float32Array) -> Float32Array:
-        """Power (G, C) from (C, P, 2 reach + 1)."""
+        """Return power (G, C) from correlations (C, P, 2 reach + 1)."""
         ...
 
 
 @dataclass
 class Position:
-    """Everything that turns the number of a position into its rows. Made once a worker: the matrices are dear.
+    """Turns the number of a position into its rows. Made once in each worker, because its matrices are expensive.
 
     Parameters
     ----------
@@ -71,7 +94,7 @@ class Position:
         self.grid = experiment.grid(self.settings.spacing_m)
         self._every = max(1, int(self.settings.sample_rate_hz // experiment.lag_rate_hz))
         lag_rate_hz, band_limit = self.settings.sample_rate_hz / self._every, self.settings.band_limit
-        make = PairMatrices if self.grid.size <= MATRIX_NODES else PairTables
+        make = PairMatrices if self.grid.size <= MATRIX_POINTS else PairTables
         self._mapper = make(self.grid, lag_rate_hz, experiment.c_m_s, band_limit=band_limit)
         every = np.round(np.vstack([system.microphones_m for system in experiment.systems]), 9)
         self._microphones_m, inverse = np.unique(every, axis=0, return_inverse=True)
@@ -97,7 +120,7 @@ class Position:
         )
         decay_s = [t30_s(response[0], settings.sample_rate_hz, experiment.band_hz) for response in responses]
         heads: list[Row] = []
-        found: list[list[tuple[_Heard, ...]]] = [[] for _ in experiment.systems]
+        found: list[list[tuple[_Correlations, ...]]] = [[] for _ in experiment.systems]
         for name, (clip, sound) in chosen.items():
             for r, rt60_s in enumerate(settings.rt60s_s):
                 wet = convolved(sound, responses[r])
@@ -115,15 +138,15 @@ class Position:
                 )
                 for index, system in enumerate(experiment.systems):
                     samples = recorded(wet[self._channels[index]], settings.snr_db, noise, (len(heads), index))
-                    found[index].append(self._heard(system, samples))
+                    found[index].append(self._correlated(system, samples))
         return [
             row
-            for system, heard in zip(experiment.systems, found, strict=True)
-            for row in self._localized(system, heads, heard, source_m)
+            for system, events in zip(experiment.systems, found, strict=True)
+            for row in self._localized(system, heads, events, source_m)
         ]
 
-    def _heard(self, system: System, samples: Float32Array) -> tuple[_Heard, ...]:
-        """What is kept of a recording: for each method, each array's correlations around zero."""
+    def _correlated(self, system: System, samples: Float32Array) -> tuple[_Correlations, ...]:
+        """Correlate a recording (K, n): for each method, each array's correlations around zero lag."""
         rate_hz = self.settings.sample_rate_hz
         start, stop = active_segment(samples, rate_hz, self.settings.segment)
         segment = samples[:, start:stop]
@@ -138,19 +161,19 @@ class Position:
                 cross = CrossSpectra(spectra, microphone_pairs(count), rate_hz, spec.band_hz)
                 lags.append(np.ascontiguousarray(cross.correlations(reach).real[:, :: self._every]))
                 first += count
-            kept.append(_Heard(method, (stop - start) / rate_hz, lags))
+            kept.append(_Correlations(method, (stop - start) / rate_hz, lags))
         return tuple(kept)
 
     def _localized(
-        self, system: System, heads: list[Row], heard: list[tuple[_Heard, ...]], source_m: FloatArray
+        self, system: System, heads: list[Row], events: list[tuple[_Correlations, ...]], source_m: FloatArray
     ) -> list[Row]:
         rows = []
         for m, method in enumerate(system.methods):
-            power = np.zeros((self.grid.size, len(heard)), dtype=np.float32)
+            power = np.zeros((self.grid.size, len(events)), dtype=np.float32)
             for a, spec in enumerate(system.arrays):
-                lags = np.stack([one[m].lags[a] for one in heard])
+                lags = np.stack([one[m].lags[a] for one in events])
                 power += self._mapper.power(spec, microphone_pairs(len(spec.microphones_m)), lags)
-            for head, one, node in zip(heads, heard, power.argmax(axis=0), strict=True):
+            for head, one, node in zip(heads, events, power.argmax(axis=0), strict=True):
                 estimate_m = self.grid.node_m(int(node))
                 rows.append(
                     {"system": system.name, "method": method}
@@ -162,14 +185,19 @@ class Position:
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
+class _Correlations:
+    """Correlations of one event by one method: for each array (P, 2 reach + 1)."""
+
     method: str
     active_s: float
     lags: list[Float32Array]
 
 
 def active_segment(samples: Float32Array, sample_rate_hz: float, which: str) -> tuple[int, int]:
-    """First sample and end of the segment that is localized, of a recording (K, n): one mask for all channels."""
+    """Return first sample and end of the segment of a recording (K, n) that is localized.
+
+    All channels share one activity mask. `which` is "longest", or "peak" for the segment with the loudest frame.
+    """
     frame = round(FRAME_S * sample_rate_hz)
     count = max(1, samples.shape[1] // frame)
     squares = np.square(samples[:, : count * frame]).mean(axis=0, dtype=np.float64)
@@ -184,9 +212,9 @@ def active_segment(samples: Float32Array, sample_rate_hz: float, which: str) -> 
 
 
 def t30_s(response: Float32Array, sample_rate_hz: float, band_hz: tuple[float, float]) -> float:
-    """Time of a decay by 60 dB, from Schroeder's integral, -5 to -35 dB (ISO 3382-1); 0 for none.
+    """Return the time of a decay by 60 dB, from Schroeder's integral at -5 to -35 dB (ISO 3382-1); 0 for no decay.
 
-    Inside the band: below it, where images only ever add, rooms of images ring longer.
+    It is measured inside the band: below 100 Hz, where images only ever add, simulated rooms ring longer.
     """
     inside = sosfilt(butter(4, band_hz, "bandpass", fs=sample_rate_hz, output="sos"), response.astype(np.float64))
     left = np.cumsum(np.square(inside[::-1]))[::-1]
@@ -194,15 +222,15 @@ def t30_s(response: Float32Array, sample_rate_hz: float, band_hz: tuple[float, f
         level_db = 10.0 * np.log10(left / left[0])
     used = np.flatnonzero((level_db <= -5.0) & (level_db >= -35.0))
     if len(used) < 0.03 * sample_rate_hz:
-        return 0.0  # the filter's own ringing
+        return 0.0  # only the filter rings
     slope = np.polyfit(used / sample_rate_hz, level_db[used], 1)[0]
     return float(-60.0 / slope)
 
 
 def convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
-    """What each microphone hears: (K, n), of responses (K, m) whose common silence at the end is left out."""
-    heard = np.flatnonzero(responses.any(axis=0))
-    responses = responses[:, : int(heard[-1]) + 1]
+    """Return the sound at each microphone, (K, n), from responses (K, m) without their common silence at the end."""
+    sounding = np.flatnonzero(responses.any(axis=0))
+    responses = responses[:, : int(sounding[-1]) + 1]
     count = len(sound) + responses.shape[1] - 1
     n_fft = scipy.fft.next_fast_len(count, real=True)
     spectrum = scipy.fft.rfft(responses, n_fft, axis=1) * scipy.fft.rfft(sound, n_fft)
@@ -212,10 +240,10 @@ def convolved(sound: Float32Array, responses: Float32Array) -> Float32Array:
 def recorded(
     wet: Float32Array, snr_db: float | None, noise: np.random.SeedSequence, key: tuple[int, int]
 ) -> Float32Array:
-    """Add the sensors' noise to what a system hears (K, n), set the level, round to 16 bits.
+    """Add sensor noise to the sound at a system's microphones (K, n), set the level, round to 16 bits.
 
-    The noise is white, independent at each microphone and drawn by `key`, `snr_db` below the mean power over all
-    microphones and the whole recording.
+    The noise is white, independent at each microphone and drawn by `key`. It is `snr_db` below the mean power over all
+    microphones and the whole recording; None adds no noise.
     """
     if snr_db is not None:
         rng = np.random.default_rng(np.random.SeedSequence(noise.entropy, spawn_key=(*noise.spawn_key, *key)))
@@ -226,7 +254,7 @@ def recorded(
 
 
 def _errors(source_m: FloatArray, estimate_m: FloatArray, centre_m: FloatArray) -> Row:
-    """How far off, and of that along the distance from the centre, around and up."""
+    """Return the error of an estimate: total, and along the distance, azimuth and elevation seen from a centre."""
     azimuth, elevation, distance = direction_deg(centre_m, source_m)
     found_azimuth, found_elevation, found_distance = direction_deg(centre_m, estimate_m)
     return {

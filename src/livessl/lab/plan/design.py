@@ -1,4 +1,4 @@
-"""Everything that is known about a site before it has heard a sound. It draws and prints nothing."""
+"""Everything that can be computed about a site before it is built. It draws and prints nothing."""
 
 from __future__ import annotations
 
@@ -18,57 +18,58 @@ from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 
 ANGLES_DEG: Final = (0.0, 30.0, 60.0, 80.0)
-"""Directions from broadside at which the angular error is told."""
+"""Directions from broadside, in degrees, at which the angular error is reported."""
 
 DISTANCES_M: Final = (1.0, 2.0, 3.0, 4.0)
-"""Distances at which the direct-to-reverberant ratio is told."""
+"""Distances, in metres, at which the direct-to-reverberant ratio is reported."""
 
 SHARES: Final = (5, 25, 50, 75, 95)
-"""Percentiles that are told."""
+"""Percentiles that are reported."""
 
 HEIGHT_M: Final = 1.5
-"""Where sounds are expected unless told otherwise: a mouth, a table, a door handle lie around it."""
+"""Default height, in metres, of the expected sounds: about that of a mouth, a table or a door handle."""
 
 CALIBRATION_M: Final = 0.002
-"""Microphones measured with a tape and a good will; the paper's own calibration left 0.7 mm."""
+"""Default error, in metres, of a microphone's position: a careful tape measurement. The paper's own left 0.7 mm."""
 
 SOUND_S: Final = 0.5
-"""Length of the expected sound; with reverberation it hardly counts, see `prediction.observation_s`."""
+"""Length, in seconds, of the expected sound; it hardly matters with reverberation, see `prediction.observation_s`."""
 
 RATE_HZ: Final = 44100.0
-"""Sample rate of an array that no node captures."""
+"""Sample rate, in hertz, that is assumed for an array that no node captures."""
 
-MAP_NODES: Final = 600
-"""Points of the floor map: a third of a metre apart in a room of 8 x 10 m."""
+MAP_POINTS: Final = 600
+"""Most points of the floor map: a third of a metre apart in a room of 8 x 10 m."""
 
-BAND_NODES: Final = 4000
-"""Points of the search volume at which pairs' bands are looked at."""
+BAND_POINTS: Final = 4000
+"""Most points of the search volume at which the bands of the pairs are examined."""
 
 LATTICE: Final = 150
-"""Places that are tried for an array, about."""
+"""Approximate number of positions that are tried for an array."""
 
 WORTH_WHILE: Final = 0.95
-"""A move is advised if it lowers the median error at least to this share."""
+"""Largest ratio of the median errors with and without a move for which the move is advised."""
 
 MOST_MOVES: Final = 3
+"""Most moves that are advised."""
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """A predicted error (ny, nx), metres, over the floor map, and its radial and tangential parts."""
+    """The predicted error (ny, nx) over the floor map, in metres, and its radial and tangential components."""
 
     total_m: FloatArray
     radial_m: FloatArray
     tangential_m: FloatArray
 
     def percentile_m(self, share: float) -> float:
-        """Percentile of the whole error over the map, metres."""
+        """Return a percentile of the total error over the map, in metres."""
         return float(np.percentile(self.total_m, share))
 
 
 @dataclass(frozen=True, slots=True)
 class PairPlan:
-    """Two microphones: channels from 1, distance, and percentiles over the room of the frequency kept on the grid."""
+    """Two microphones: channels from 1, their distance, and percentiles over the room of the alias-free frequency."""
 
     channels: tuple[int, int]
     spacing_m: float
@@ -77,26 +78,26 @@ class PairPlan:
 
 @dataclass(frozen=True, slots=True)
 class ArrayPlan:
-    """What one array can do.
+    """The plan of one array.
 
     Parameters
     ----------
     spec : ArraySpec
     sample_rate_hz : float
-        Of the node that captures it.
+        Sample rate of the node that captures the array.
     sample_rate_known : bool
-        False where no node says so, and `RATE_HZ` is taken.
+        False if no node captures the array and `RATE_HZ` is assumed.
     angle_error_deg : tuple of float
-        At `ANGLES_DEG`, of its widest pair; NaN where there is no such direction.
+        Angular error of the widest pair at `ANGLES_DEG`; NaN where the lag belongs to no direction.
     diffuse_correlation : float
-        Of its widest pair, averaged over its band.
+        Correlation of a diffuse field at the widest pair, averaged over the band.
     pairs : tuple of PairPlan
     alias_free_hz : tuple of float
-        Percentiles `SHARES` over points and pairs.
+        Percentiles `SHARES`, over points and pairs, of the frequency up to which there is no spatial aliasing.
     beyond_grid : float
-        Share of points and pairs that keep less than the band on this grid.
+        Share of points and pairs with spatial aliasing inside the band on this grid.
     alone : Errors
-        Predicted for this array without the others.
+        Errors predicted for this array without the others.
     """
 
     spec: ArraySpec
@@ -112,9 +113,9 @@ class ArrayPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A site's plan; the map's columns are at `x_m`, its rows at `y_m`, all at `height_m`.
+    """The plan of a site; the columns of the map are at `x_m`, its rows at `y_m`, all of it at `height_m`.
 
-    Of a site with one array, `addition` says where a second one like it would go.
+    For a site with one array, `addition` is the best position of a second one like it.
     """
 
     site: Site
@@ -137,7 +138,7 @@ def make_plan(
     calibration_m: float = CALIBRATION_M,
     progress: Callable[[int, int], None] | None = None,
 ) -> Plan:
-    """Work a site's plan out.
+    """Compute the plan of a site.
 
     Parameters
     ----------
@@ -145,16 +146,16 @@ def make_plan(
     rt60_s : float
         Reverberation time; 0 is anechoic.
     height_m : float or None
-        Height of the map. None is the search plane's, or `HEIGHT_M`, or half the search volume's where that is lower.
+        Height of the map. None takes that of the search plane, or `HEIGHT_M`, or the middle of a lower search volume.
     calibration_m : float
-        Standard deviation of a microphone's place along any direction, above 0.
+        Standard deviation of a microphone's position along any direction, above 0.
     progress : callable or None
-        Called with (arrays tried at other places, arrays).
+        Called with (arrays tried at other positions, arrays).
 
     Raises
     ------
     ValueError
-        Where the room cannot have the reverberation time, or the height lies outside the search volume.
+        If the room cannot have the reverberation time, or the height lies outside the search volume.
     """
     alpha = absorption(rt60_s, site.room.size_m, site.c_m_s)
     conditions = prediction.Conditions(
@@ -194,7 +195,7 @@ def make_plan(
 
 
 def _volume(site: Site) -> Grid:
-    """What of the search volume is in the room (some is: the site was checked), with the site's own spacing."""
+    """Return the part of the search volume inside the room, with the site's spacing; the site check requires one."""
     grid = search_grid(site)
     low = np.maximum(grid.lower_m, 0.0)
     high = np.minimum(grid.upper_m, site.room.size_m)
@@ -209,11 +210,11 @@ def _floor(volume: Grid, height_m: float | None) -> Grid:
     if not low <= height <= high:
         raise ValueError(f"height: expected {low:g} to {high:g} m, where the site searches, got {height:g} m")
     x, y, _ = volume.bounds_m
-    return _thinned(Grid((x, y, (height, height)), volume.spacing_m), MAP_NODES)
+    return _thinned(Grid((x, y, (height, height)), volume.spacing_m), MAP_POINTS)
 
 
 def _thinned(grid: Grid, most: int) -> Grid:
-    """The same volume with about so many nodes, or fewer."""
+    """Return a grid of the same volume with at most a number of points, and not many fewer."""
     spacing = grid.spacing_m
     while Grid(grid.bounds_m, spacing).size > most:
         spacing *= 1.05
@@ -221,7 +222,7 @@ def _thinned(grid: Grid, most: int) -> Grid:
 
 
 def _step_m(room_size_m: tuple[float, float, float]) -> float:
-    """Step of the lattice of places: half a metre, in a large room more, in tenths of a metre."""
+    """Return the step of the positions that are tried: 0.5 m, more in a large room, in multiples of 0.1 m."""
     x, y, _ = room_size_m
     return max(0.5, float(np.ceil(10.0 * np.sqrt(x * y / LATTICE)) / 10.0))
 
@@ -240,7 +241,7 @@ def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> Arr
     known_hz = site.nodes[node].device.sample_rate_hz if node is not None else None
     rate_hz = known_hz or RATE_HZ
     pairs = microphone_pairs(len(spec.microphones_m))
-    points = _thinned(volume, BAND_NODES).nodes_m()
+    points = _thinned(volume, BAND_POINTS).nodes_m()
     kept = alias_free_hz(points, spec.microphones_m, pairs, site.grid.spacing_m, site.c_m_s)
     apart = np.linalg.norm(spec.microphones_m[pairs[:, 0]] - spec.microphones_m[pairs[:, 1]], axis=1)
     errors = prediction.angle_error_deg(np.array(ANGLES_DEG), spec.aperture_m, rate_hz, site.c_m_s)
@@ -261,5 +262,5 @@ def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> Arr
 
 
 def _shares(limits_hz: FloatArray) -> tuple[float, ...]:
-    """Percentiles; "lower", as an interpolation with an infinite limit would be none."""
+    """Return the percentiles `SHARES`, without interpolation, because limits may be infinite."""
     return tuple(float(value) for value in np.percentile(limits_hz, SHARES, method="lower"))

@@ -1,4 +1,4 @@
-"""A plan as a picture: floor maps of the predicted error, and the angular error against spacing. Needs matplotlib."""
+"""A plan as a figure: floor maps of the predicted error, and the angular error against spacing. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TICKS_M: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Candidates for the contours and ticks of the predicted error."""
+
 COLUMNS: Final = 3
-"""Panels in a row, where there are more than four."""
+"""Panels in a row if there are more than four."""
 
 SPACINGS_M: Final = np.geomspace(0.03, 4.0, 200)
 _INK: Final = "#222222"
 
 
 class FigureError(RunError):
-    """There is nothing to draw with."""
+    """The figure cannot be drawn."""
 
 
 def require_matplotlib() -> None:
-    """Fail early, before anything is worked out, where no figure can be drawn.
+    """Check, before anything is computed, that figures can be drawn.
 
     Raises
     ------
     FigureError
-        With the cure.
+        If matplotlib is missing; the message names the cure.
     """
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it would tell which fonts it found
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its debug messages list fonts
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise FigureError(
-            "plan.png needs matplotlib, which is not installed; run `sh scripts/setup.sh figures`, or leave --out away"
+            "plan.png needs matplotlib, which is not installed; run `sh scripts/setup.sh figures`, or omit --out"
         ) from error
 
 
@@ -52,9 +54,9 @@ def draw(plan: Plan, path: Path) -> None:
     Raises
     ------
     FigureError
-        Where matplotlib is missing.
+        If matplotlib is missing.
     OSError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -136,19 +138,19 @@ def _floor(ax: Axes, plan: Plan, title: str, errors: Errors, norm: Any) -> Any:
     ax.set_title(f"{title}: median {errors.percentile_m(50):.2g} m, 95 % {errors.percentile_m(95):.2g} m", fontsize=10)
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     ax.yaxis.set_major_locator(MaxNLocator(8, integer=True))
-    ax.set_xlabel("x, east (m)")
-    ax.set_ylabel("y, north (m)")
+    ax.set_xlabel("x (m)")
+    ax.set_ylabel("y (m)")
     return image
 
 
 def _ends(nodes_m: FloatArray) -> tuple[float, float]:
-    """Outer edges of the cells around nodes; half a metre to either side of a single one."""
+    """Return the outer edges of the cells around grid points; half a metre to either side of a single one."""
     half = 0.5 * float(nodes_m[1] - nodes_m[0]) if len(nodes_m) > 1 else 0.5
     return float(nodes_m[0]) - half, float(nodes_m[-1]) + half
 
 
 def _inside(errors: Errors) -> list[float]:
-    """Contours, but none in the narrow places around microphones."""
+    """Return the levels of contours, without those in the narrow minima around microphones."""
     low, high = errors.percentile_m(3), float(errors.total_m.max())
     return [tick for tick in TICKS_M if low < tick < high]
 

@@ -1,8 +1,8 @@
-"""What error to expect where, before anything is built: geometry and room acoustics only. It has heard no sound.
+"""The error to expect at each place of a room, from geometry and room acoustics alone, without any recording.
 
-A plan rests on four facts. A pair tells a place by its delay, so the gradient of the delay says what it can tell.
+A plan rests on four facts. A pair measures a delay, so the gradient of the delay decides how well it resolves a place.
 Reverberation is noise to that delay, as strong as the direct sound at the critical distance. Microphones are never
-quite where they are said to be. And the errors of several arrays are independent, so their information adds up.
+exactly at their stated positions. The errors of several arrays are independent, so their information adds up.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from livessl.core.steering import delay_gradients_s_m
 from livessl.core.types import ArraySpec, FloatArray, IntArray
 
 CLEARANCE_M: Final = 0.5
-"""Least distance from a microphone to a wall or another array: what is nearer reflects into the direct sound's peak."""
+"""Least distance, in metres, from a microphone to a wall or another array: nearer reflections blur the direct peak."""
 
 DECAY_60_DB: Final = 3.0 * np.log(10.0)
-"""An amplitude's time constants in a decay by 60 dB: it falls as exp(-6.9 t / RT60), energy as exp(-13.8 t / RT60)."""
+"""Time constants in a decay by 60 dB: the amplitude falls as exp(-6.9 t / RT60), the energy as exp(-13.8 t / RT60)."""
 
 _NEAREST_M: Final = 1e-9
 
@@ -32,15 +32,15 @@ _NEAREST_M: Final = 1e-9
 def angle_error_deg(
     angle_deg: ArrayLike, spacing_m: ArrayLike, sample_rate_hz: float, c_m_s: float = 343.0
 ) -> FloatArray:
-    """Error of a direction from a lag rounded to whole samples: arcsin(sin theta + c/(fs d sqrt 12)) - theta.
+    """Return the error of a direction from a lag in whole samples: arcsin(sin theta + c/(fs d sqrt 12)) - theta.
 
     Parameters
     ----------
     angle_deg : float or array
-        theta from **broadside** (the plane half-way between the microphones), degrees. The paper's text says from the
-        line that joins them; its equation holds for this one.
+        theta from **broadside** (the plane half-way between the microphones), in degrees. The paper's text measures it
+        from the line that joins them, but its equation holds for this angle.
     spacing_m : float or array
-        d, between the two microphones; broadcasts against `angle_deg`.
+        d, distance between the two microphones; broadcasts against `angle_deg`.
     sample_rate_hz : float
         fs. A lag rounded to 1/fs errs by 1/(fs sqrt 12).
     c_m_s : float
@@ -49,12 +49,12 @@ def angle_error_deg(
     Returns
     -------
     float64
-        Degrees; NaN where the lag would belong to no direction.
+        Degrees; NaN where the lag belongs to no direction.
 
     Raises
     ------
     ValueError
-        Where a spacing or a rate is not above 0.
+        If a spacing or a rate is not above 0.
     """
     sine = np.sin(np.radians(angle_deg)) + _lag_error(spacing_m, sample_rate_hz, c_m_s)
     direction = np.arcsin(sine, out=np.full(sine.shape, np.nan), where=np.abs(sine) <= 1.0)
@@ -71,25 +71,25 @@ def _lag_error(spacing_m: ArrayLike, sample_rate_hz: float, c_m_s: float) -> Flo
 
 
 def diffuse_correlation(frequency_hz: ArrayLike, spacing_m: ArrayLike, c_m_s: float = 343.0) -> FloatArray:
-    """Correlation of a diffuse sound field at two microphones: rho = sin(kd)/(kd), k = 2 pi f / c."""
+    """Return the correlation of a diffuse sound field at two microphones: rho = sin(kd)/(kd), k = 2 pi f / c."""
     return np.asarray(np.sinc(2.0 * np.asarray(frequency_hz) * np.asarray(spacing_m) / c_m_s))
 
 
 def band_diffuse_correlation(band_hz: tuple[float, float], spacing_m: float, c_m_s: float = 343.0) -> float:
-    """Mean of `diffuse_correlation` over a band: (Si(k2 d) - Si(k1 d)) / (k2 d - k1 d)."""
+    """Return the mean of `diffuse_correlation` over a band: (Si(k2 d) - Si(k1 d)) / (k2 d - k1 d)."""
     low, high = (2.0 * np.pi * frequency * spacing_m / c_m_s for frequency in band_hz)
     return float((sici(high)[0] - sici(low)[0]) / (high - low))
 
 
 def critical_distance_m(absorption: float, room_size_m: ArrayLike) -> float:
-    """Where the direct sound of an omnidirectional source is as strong as the reverberant one, metres.
+    """Return the distance, in metres, at which an omnidirectional source's direct and reverberant sound are equal.
 
-    r_c = sqrt(S alpha / (16 pi (1 - alpha))), S the room's surface; infinite where the walls absorb all.
+    r_c = sqrt(S alpha / (16 pi (1 - alpha))), with the room's surface S; infinite if the walls absorb everything.
 
     Raises
     ------
     ValueError
-        Where alpha is not above 0 and at most 1.
+        If alpha is not above 0 and at most 1.
     """
     if not 0.0 < absorption <= 1.0:
         raise ValueError(f"absorption: expected above 0 and at most 1, got {absorption}")
@@ -101,7 +101,7 @@ def critical_distance_m(absorption: float, room_size_m: ArrayLike) -> float:
 
 
 def direct_to_reverberant(distance_m: ArrayLike, critical_m: float) -> FloatArray:
-    """Ratio of powers (r_c / r)^2 at a distance r; infinite without reverberation and at the source."""
+    """Return the ratio of powers (r_c / r)^2 at a distance r; infinite without reverberation."""
     distance = np.asarray(distance_m, dtype=np.float64)
     return np.asarray((critical_m / np.maximum(distance, _NEAREST_M)) ** 2)
 
@@ -109,7 +109,7 @@ def direct_to_reverberant(distance_m: ArrayLike, critical_m: float) -> FloatArra
 def coherence_squared(
     points_m: FloatArray, microphones_m: FloatArray, pairs: IntArray, critical_m: float
 ) -> FloatArray:
-    """Squared coherence of each pair for a sound at each point: D_i/(1 + D_i) D_k/(1 + D_k), (P, N).
+    """Return the squared coherence of each pair for a sound at each point: D_i/(1 + D_i) D_k/(1 + D_k), (P, N).
 
     D is the direct-to-reverberant ratio at each microphone. The reverberant parts are taken as uncorrelated: averaged
     over 100 to 6000 Hz their correlation is 0.013 at 0.5 m.
@@ -123,31 +123,31 @@ def coherence_squared(
 
 
 def observation_s(sound_s: float, rt60_s: float) -> float:
-    """Time over which reverberation counts as new noise: a sound's length, but at most RT60 / 6.9.
+    """Return the time, in seconds, that averages the error of a delay: the sound's length, but at most RT60 / 6.9.
 
     The reverberant part is the same sound again through a random response. Over frequency that response is correlated
-    as 1/(1 + j 2 pi f T / 13.8), so a band B holds B T / 6.9 independent values of it and no more, however long the
-    sound is: a longer sound averages noise out, but not reverberation.
+    as 1/(1 + j 2 pi f T / 13.8), so a band B holds B T / 6.9 independent values of it, however long the sound is: a
+    longer sound averages noise out, but not reverberation.
     """
     return min(sound_s, rt60_s / DECAY_60_DB) if rt60_s > 0 else sound_s
 
 
 def delay_std_s(coherence2: ArrayLike, band_hz: tuple[float, float], time_s: float) -> FloatArray:
-    """Cramér-Rao bound of a delay: sigma = sqrt(3 (1 - g2) / (8 pi^2 T g2 (f2^3 - f1^3))), seconds.
+    """Return the Cramér-Rao bound of a delay: sigma = sqrt(3 (1 - g2) / (8 pi^2 T g2 (f2^3 - f1^3))), seconds.
 
     Parameters
     ----------
     coherence2 : float or array
         g2, the squared coherence, in (0, 1]; the same all over the band.
     band_hz : (float, float)
-        f1, f2.
+        f1 and f2.
     time_s : float
         T, the length of sound that is averaged.
 
     Raises
     ------
     ValueError
-        Where an argument is out of its range.
+        If an argument is out of its range.
     """
     g2 = np.asarray(coherence2, dtype=np.float64)
     low, high = band_hz
@@ -160,17 +160,17 @@ def delay_std_s(coherence2: ArrayLike, band_hz: tuple[float, float], time_s: flo
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What disturbs every array alike.
+    """The conditions that disturb every array alike.
 
     Parameters
     ----------
     critical_m : float
         Critical distance; infinite without reverberation.
     time_s : float
-        Length of sound that counts: see `observation_s`.
+        Time that averages the error of a delay: see `observation_s`.
     calibration_m : float
-        Standard deviation of a microphone's place along any direction. It is the floor under all other errors, so it
-        must be above 0.
+        Standard deviation of a microphone's position along any direction. It is the floor under all other errors, so
+        it must be above 0.
     c_m_s : float
         Speed of sound.
     """
@@ -186,7 +186,7 @@ class Conditions:
                 raise ValueError(f"{name}: expected above 0, got {value}")
         if not (np.isfinite(self.calibration_m) and self.calibration_m > 0):
             raise ValueError(
-                f"calibration error: expected metres above 0 (nothing is known exactly), got {self.calibration_m}"
+                f"calibration error: expected metres above 0 (no position is exact), got {self.calibration_m}"
             )
 
     @property
@@ -198,10 +198,10 @@ class Conditions:
 def delay_information_1_m2(
     points_m: FloatArray, microphones_m: FloatArray, sigma_s: ArrayLike, c_m_s: float
 ) -> FloatArray:
-    """Fisher information about a place from all pairs of an array: 2/K sum grad tau grad tau^T / sigma^2.
+    """Return the Fisher information about a position from all pairs of an array: 2/K sum grad tau grad tau^T / sigma^2.
 
-    Of K(K-1)/2 pairs only K-1 delays are independent; 2/K counts each once, and is exact where every microphone errs on
-    its own by sigma / sqrt 2.
+    Of K(K-1)/2 pairs only K-1 delays are independent. The factor 2/K counts each once; it is exact if every microphone
+    has an independent error of sigma / sqrt 2.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def delay_information_1_m2(
 
 
 def information_1_m2(spec: ArraySpec, points_m: FloatArray, conditions: Conditions) -> FloatArray:
-    """Fisher information (N, 3, 3) of one array about a sound at each point, 1/m^2; that of several adds up.
+    """Return the Fisher information (N, 3, 3) of one array about a sound at each point, in 1/m^2; several add up.
 
     A pair's variance is the Cramér-Rao bound for its coherence plus the floor of the calibration.
     """
@@ -235,14 +235,15 @@ def information_1_m2(spec: ArraySpec, points_m: FloatArray, conditions: Conditio
 
 
 def covariance_m2(information: FloatArray, extent_m: FloatArray | None = None) -> FloatArray:
-    """Covariance (N, 3, 3) of a place from its information, m^2.
+    """Return the covariance (N, 3, 3) of a position from its information, in m^2.
 
     Parameters
     ----------
     information : (N, 3, 3) float64
     extent_m : (3,) float64 or None
-        Size of the search volume. What the arrays cannot tell stays as wide as the volume, L^2/12, and an axis of no
-        extent is known: its rows are 0. None leaves the information as it is, which must then have an inverse.
+        Size of the search volume. Along axes that the arrays do not resolve, the variance is that of the volume,
+        L^2/12; an axis without extent is known, and its rows are 0. None uses the information alone, which must then
+        have an inverse.
     """
     if extent_m is None:
         return np.asarray(np.linalg.inv(information))
@@ -254,14 +255,14 @@ def covariance_m2(information: FloatArray, extent_m: FloatArray | None = None) -
 
 
 def position_error_m(covariance: FloatArray) -> FloatArray:
-    """Root of the expected squared distance to the truth: sqrt(trace C), (N,)."""
+    """Return the root of the expected squared distance to the truth: sqrt(trace C), (N,)."""
     return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
 
 
 def radial_tangential_m(
     covariance: FloatArray, points_m: FloatArray, origin_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (N,) along the line from an origin, and across it (root mean square of two directions)."""
+    """Return standard deviations (N,) along the line from an origin, and across it (RMS over two directions)."""
     towards = points_m - origin_m
     unit = towards / np.maximum(np.sqrt((towards**2).sum(axis=1, keepdims=True)), _NEAREST_M)
     along = np.einsum("na,nab,nb->n", unit, covariance, unit)
@@ -271,7 +272,7 @@ def radial_tangential_m(
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One array, or one more like it, at another place: what the median of the predicted error was, and would be."""
+    """A shift of an array, or of a copy of it, and the median predicted error without and with the shift."""
 
     array: str
     offset_m: tuple[float, float]
@@ -280,7 +281,7 @@ class Move:
 
 
 def moved(spec: ArraySpec, offset_m: Sequence[float]) -> ArraySpec:
-    """The array shifted by (dx, dy) metres, neither turned nor raised."""
+    """Return the array shifted by (dx, dy) metres, neither rotated nor raised."""
     return replace(spec, microphones_m=spec.microphones_m + np.array([*offset_m, 0.0]))
 
 
@@ -293,24 +294,29 @@ def best_moves(
     step_m: float = 0.5,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Move]:
-    """For each array alone, the move that lowers the median error most; best first, none that does not.
+    """Find, for each array alone, the move that lowers the median error most.
 
-    Tried are all shifts by whole steps along x and y that keep every microphone `CLEARANCE_M` from walls and from
-    other arrays' microphones.
+    The candidates are all shifts by whole steps along x and y that keep every microphone `CLEARANCE_M` from walls and
+    from other arrays' microphones. Arrays whose moves do not lower the error are omitted.
 
     Parameters
     ----------
     specs : sequence of ArraySpec
     points_m : (N, 3) float64
-        Where sounds are expected: the median is over these.
+        Positions at which sounds are expected; the median is over these.
     conditions : Conditions
     room_size_m : (3,)
     extent_m : (3,) float64
-        Of the search volume, as in `covariance_m2`.
+        Size of the search volume, as in `covariance_m2`.
     step_m : float
-        Of the lattice.
+        Step of the shifts.
     progress : callable or None
         Called with (arrays tried, arrays).
+
+    Returns
+    -------
+    list of Move
+        The best move first.
     """
     own = [information_1_m2(spec, points_m, conditions) for spec in specs]
     everything = np.sum(own, axis=0)
@@ -335,7 +341,7 @@ def best_addition(
     extent_m: FloatArray,
     step_m: float = 0.5,
 ) -> Move | None:
-    """Where a second array like a lone one lowers the median error most, as a shift from it; as in `best_moves`."""
+    """Find where a copy of the only array lowers the median error most, as a shift from it; see `best_moves`."""
     own = information_1_m2(spec, points_m, conditions)
     shifts = shifts_m(spec, [spec.microphones_m], room_size_m, step_m)
     return _best_of(shifts, spec, own, _median_error_m(own, extent_m), points_m, conditions, extent_m)
@@ -350,7 +356,7 @@ def _best_of(
     conditions: Conditions,
     extent_m: FloatArray,
 ) -> Move | None:
-    """The shift of an array that lowers the median error most, beside others' information; None if none does."""
+    """Return the shift of an array that lowers the median error most, given the others' information, or None."""
     best = None
     for shift in shifts:
         there = information_1_m2(moved(spec, shift), points_m, conditions)

@@ -1,4 +1,4 @@
-"""What is wrong with a plan, in words: each with what, where and the cure."""
+"""Warnings about a plan, each with the fault, its place and the cure."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from livessl.lab.plan.prediction import CLEARANCE_M
 from livessl.site.build.grid import search_grid
 
 FLAT_M: Final = 0.01
-"""Microphones that lie so near to one plane, root mean square, are in it."""
+"""Largest RMS distance, in metres, of microphones from a plane in which they are taken to lie."""
 
 IN_LINE_M: Final = 0.3
-"""Arrays that lie so near to one line, root mean square, are in it."""
+"""Largest RMS distance, in metres, of arrays from a line on which they are taken to lie."""
 
 MOSTLY: Final = 0.5
-"""A share of points and pairs above which a grid is too coarse."""
+"""Share of points and pairs with aliasing inside the band above which a grid is too coarse."""
 
 OF_RATE: Final = 0.45
-"""Correlations are interpolated well up to this share of the sample rate."""
+"""Share of the sample rate up to which correlations are interpolated accurately."""
 
 _WALLS: Final = (("x = 0", "x = {:g} m"), ("y = 0", "y = {:g} m"), ("the floor", "the ceiling"))
 
 
 def warnings(plan: Plan) -> list[str]:
-    """Everything that a user should think about before drilling holes."""
+    """Return everything that a user should consider before mounting the arrays."""
     found = [*_together(plan)]
     for array in plan.arrays:
         found += _near_walls(plan, array)
@@ -41,22 +41,22 @@ def warnings(plan: Plan) -> list[str]:
 def _together(plan: Plan) -> Iterator[str]:
     if plan.site.joint:
         yield (
-            f"joint arrays ({', '.join(plan.site.joint)}) are not planned as such: the error above is that of the maps "
-            "of the arrays that they join, summed"
+            f"joint arrays ({', '.join(plan.site.joint)}) are not planned as such: the error above is that of the sum "
+            "of the maps of the single arrays"
         )
     if len(plan.arrays) == 1:
-        yield "one array alone tells a direction, but hardly a distance; set up a second one, metres apart"
+        yield "one array alone measures a direction, but hardly a distance; set up a second one, metres apart"
     centres = np.array([array.spec.centre_m for array in plan.arrays])
     if len(centres) >= 3 and _scatter_m(centres)[1] < IN_LINE_M:
         yield (
-            "all arrays stand in one line, so that a sound further along it has hardly a distance; "
-            "move one of them metres to the side"
+            "all arrays stand in one line, so that the distance of a sound on its extension is hardly determined; "
+            "move one array metres to the side"
         )
     microphones = np.concatenate([array.spec.microphones_m for array in plan.arrays])
     if _scatter_m(microphones)[2] < FLAT_M and _searched_on_both_sides(plan, microphones):
         yield (
-            "all microphones lie in one plane: a place and its mirror image behind it sound alike, and the error above "
-            "knows nothing of it; raise a microphone, tilt an array, or let grid.bounds_m end at the plane"
+            "all microphones lie in one plane: a position and its mirror image cannot be distinguished, and the error "
+            "above does not include that; raise a microphone, tilt an array, or let grid.bounds_m end at the plane"
         )
 
 
@@ -69,7 +69,7 @@ def _searched_on_both_sides(plan: Plan, microphones_m: FloatArray) -> bool:
 
 
 def _scatter_m(points_m: FloatArray) -> FloatArray:
-    """Root mean square spread (3,) along the points' own axes, largest first."""
+    """Return the RMS spread (3,) along the points' principal axes, largest first."""
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False) / np.sqrt(len(points_m))
     return np.concatenate([spread, np.zeros(3)])[:3]
 
@@ -85,8 +85,8 @@ def _near_walls(plan: Plan, array: ArrayPlan) -> Iterator[str]:
             if gap < CLEARANCE_M - 1e-9:
                 wall = name if axis == 2 else f"the wall {name}"
                 yield (
-                    f"array {array.spec.name!r}: microphone {k + 1} is {gap:.2f} m from {wall}, whose reflection comes "
-                    f"too soon to be told from the sound; keep {CLEARANCE_M:g} m"
+                    f"array {array.spec.name!r}: microphone {k + 1} is {gap:.2f} m from {wall}, whose reflection "
+                    f"arrives too soon to be separated from the direct sound; keep {CLEARANCE_M:g} m"
                 )
 
 
@@ -94,16 +94,16 @@ def _size(plan: Plan, array: ArrayPlan) -> Iterator[str]:
     aperture, (_, high) = array.spec.aperture_m, array.spec.band_hz
     if aperture > plan.conditions.critical_m:
         yield (
-            f"array {array.spec.name!r}: with {aperture:.2f} m it is wider than the critical distance of "
-            f"{plan.conditions.critical_m:.2f} m at RT60 {plan.rt60_s:g} s: hardly a sound stands out at all of its "
-            "microphones, and false peaks are likely, which the error above does not count; "
-            "build it smaller, and set several far apart"
+            f"array {array.spec.name!r}: its aperture of {aperture:.2f} m is wider than the critical distance of "
+            f"{plan.conditions.critical_m:.2f} m at RT60 {plan.rt60_s:g} s: reverberation covers the direct sound "
+            "at some microphones, and false peaks are likely, which the error above does not include; "
+            "build it smaller, and set several arrays far apart"
         )
     if aperture * high / plan.site.c_m_s < 0.5:
         needed = plan.site.c_m_s / (2.0 * high)
         yield (
-            f"array {array.spec.name!r}: with {aperture:.3f} m it is less than half a wavelength wide all over its "
-            f"band up to {high:g} Hz; give it {needed:.3f} m or more, or raise band_hz"
+            f"array {array.spec.name!r}: its aperture of {aperture:.3f} m is less than half a wavelength in its whole "
+            f"band up to {high:g} Hz; build it {needed:.3f} m wide or more, or raise band_hz"
         )
 
 
@@ -118,6 +118,6 @@ def _sampling(plan: Plan, array: ArrayPlan) -> Iterator[str]:
         fits = spacing * array.alias_free_hz[2] / high
         yield (
             f"array {array.spec.name!r}: a grid of {spacing:g} m is too coarse for {high:g} Hz: "
-            f"{array.beyond_grid:.0%} of points and pairs keep less, half of all {array.alias_free_hz[2]:.0f} Hz or "
-            f"less; use grid.spacing_m {fits:.2g} m"
+            f"{array.beyond_grid:.0%} of points and pairs are free of spatial aliasing only up to a lower frequency, "
+            f"half of them up to {array.alias_free_hz[2]:.0f} Hz or less; use grid.spacing_m {fits:.2g} m"
         )

@@ -1,4 +1,4 @@
-"""A plan as text to read and as an object for JSON."""
+"""A plan as readable text and as an object for JSON."""
 
 from __future__ import annotations
 
@@ -16,30 +16,28 @@ JsonObject = dict[str, Any]
 
 
 def move_text(move: Move) -> str:
-    """Say a move as a person would: east is +x, north is +y."""
-    return f"move {move.array} {_way(move)}"
+    """Return a move as advice: "move array 'west' by +1.0 m in x: median predicted error 0.20 → 0.15 m"."""
+    return f"move array {move.array!r} by {_shift(move)}"
 
 
 def addition_text(move: Move) -> str:
-    """Say where one more array goes."""
-    return f"add an array like {move.array}, {_way(move)}"
+    """Return the position of one more array as advice."""
+    return f"add an array like {move.array!r}, shifted by {_shift(move)}"
 
 
 def advice_texts(plan: Plan) -> list[str]:
-    """All advice, the most helpful first."""
+    """Return all advice, the most helpful first."""
     added = [] if plan.addition is None else [addition_text(plan.addition)]
     return added + [move_text(move) for move in plan.moves]
 
 
-def _way(move: Move) -> str:
-    (dx, dy) = move.offset_m
-    ways = [f"{abs(dx):.1f} m {'east' if dx > 0 else 'west'}"] if dx else []
-    ways += [f"{abs(dy):.1f} m {'north' if dy > 0 else 'south'}"] if dy else []
-    return f"{' and '.join(ways)}: median predicted error {_length(move.before_m)} → {_length(move.after_m)} m"
+def _shift(move: Move) -> str:
+    shifts = [f"{length_m:+.1f} m in {axis}" for axis, length_m in zip("xy", move.offset_m, strict=True) if length_m]
+    return f"{' and '.join(shifts)}: median predicted error {_length(move.before_m)} → {_length(move.after_m)} m"
 
 
 def as_text(plan: Plan) -> str:
-    """All but the maps, to read."""
+    """Return everything but the maps as text."""
     return "\n".join(_lines(plan))
 
 
@@ -51,11 +49,11 @@ def _lines(plan: Plan) -> Iterator[str]:
         levels = ", ".join(f"{level:+.1f} dB at {r:g} m" for r, level in _levels(plan))
         yield f"critical distance {conditions.critical_m:.2f} m; direct to reverberant sound {levels}"
     else:
-        yield "no reverberation: the only error is that of the microphones' places"
+        yield "no reverberation: the only error is that of the microphones' positions"
     yield ""
     yield (
-        f"predicted error at {plan.height_m:g} m height (a bound: sounds that stand out, no gross errors; "
-        f"microphones known to {1000 * conditions.calibration_m:g} mm)"
+        f"predicted error at {plan.height_m:g} m height (a lower bound: loud sounds, no gross errors; "
+        f"microphone positions known to {1000 * conditions.calibration_m:g} mm)"
     )
     yield f"{'':<14}{'median':>8}{'95 %':>8}   median along the line of sight / across it"
     for name, errors in [(array.spec.name, array.alone) for array in plan.arrays] + [("all", plan.fused)]:
@@ -67,8 +65,8 @@ def _lines(plan: Plan) -> Iterator[str]:
         yield ""
         yield from _array_lines(plan, array)
     yield ""
-    yield "advice (east is +x, north is +y)"
-    yield from [f"  {text}" for text in advice_texts(plan)] or ["  no move of a single array is worth while"]
+    yield "advice"
+    yield from [f"  {text}" for text in advice_texts(plan)] or ["  no move of a single array is worth its effort"]
     found = warnings(plan)
     if found:
         yield ""
@@ -78,20 +76,20 @@ def _lines(plan: Plan) -> Iterator[str]:
 
 def _array_lines(plan: Plan, array: ArrayPlan) -> Iterator[str]:
     spec, (low, high) = array.spec, array.spec.band_hz
-    rate = f"{array.sample_rate_hz:g} Hz" + ("" if array.sample_rate_known else " (assumed: no node says)")
+    rate = f"{array.sample_rate_hz:g} Hz" + ("" if array.sample_rate_known else " (assumed; no node captures it)")
     yield f"{spec.name}: {len(spec.microphones_m)} microphones, {spec.aperture_m:.3g} m wide, {low:g} to {high:g} Hz"
     errors = ", ".join(
         f"{'none' if np.isnan(error) else f'{error:.3g}°'} at {angle:g}°"
         for angle, error in zip(ANGLES_DEG, array.angle_error_deg, strict=True)
     )
     yield f"  angular error from broadside, lags in whole samples of {rate}: {errors}"
-    yield f"  correlation of reverberation between its microphones: {array.diffuse_correlation:.2g}, mean over the band"
+    yield f"  correlation of reverberation between the widest pair: {array.diffuse_correlation:.2g}, mean over the band"
     yield (
-        f"  kept free of aliasing on the {plan.site.grid.spacing_m:g} m grid: "
+        f"  free of spatial aliasing on the {plan.site.grid.spacing_m:g} m grid: up to "
         f"{_frequency(array.alias_free_hz[0])} or more at 95 % of points and pairs, "
-        f"{_frequency(array.alias_free_hz[2])} or more at half; {array.beyond_grid:.0%} keep less than the band"
+        f"{_frequency(array.alias_free_hz[2])} or more at half; {array.beyond_grid:.0%} do not reach the whole band"
     )
-    yield f"    {'pair':<8}{'apart':>8}{'95 % keep':>13}{'half keep':>13}"
+    yield f"    {'pair':<8}{'distance':>8}{'95 % reach':>13}{'half reach':>13}"
     for pair in array.pairs[:6]:
         channels = "-".join(map(str, pair.channels))
         low_hz, half_hz = (_frequency(pair.alias_free_hz[k]) for k in (0, 2))
@@ -101,7 +99,7 @@ def _array_lines(plan: Plan, array: ArrayPlan) -> Iterator[str]:
 
 
 def as_json(plan: Plan) -> JsonObject:
-    """Everything, as an object that JSON can hold: what is infinite or not there is null."""
+    """Return everything as an object for JSON; infinite and missing values are null."""
     conditions = plan.conditions
     return {
         "site": plan.site.site,
@@ -187,7 +185,7 @@ def _shares_json(values: tuple[float, ...]) -> JsonObject:
 
 
 def _levels(plan: Plan) -> list[tuple[float, float]]:
-    """Direct-to-reverberant ratio in dB at each distance."""
+    """Return each distance with its direct-to-reverberant ratio in dB."""
     ratios = direct_to_reverberant(np.array(DISTANCES_M), plan.conditions.critical_m)
     return [(r, float(10.0 * np.log10(ratio))) for r, ratio in zip(DISTANCES_M, ratios, strict=True)]
 

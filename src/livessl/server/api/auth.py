@@ -1,4 +1,4 @@
-"""The gate before the HTTP face: tokens, roles and limits, for requests and WebSockets alike. It knows no route."""
+"""Gate in front of the HTTP application: tokens, roles and limits of requests and WebSockets. It knows no route."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from livessl.site.tokens import Client, Role, Tokens
 DOOR: Final = "http"
 
 MAX_BODY_BYTES: Final = 65_536
-"""Nothing that a client has to say is longer."""
+"""Longest body of a request, in bytes; the longest that a route reads has about 20."""
 
 PROTOCOL: Final = "livessl"
 TOKEN_PROTOCOL: Final = "livessl.token."  # noqa: S105 - what stands before a token
-"""A browser's WebSocket sends no headers of its own, but can name protocols: `livessl` and `livessl.token.TOKEN`."""
+"""A page cannot set headers of a WebSocket, but it can offer protocols: `livessl` and `livessl.token.TOKEN`."""
 
 HEALTH: Final = "/api/v1/health"
 ACCESS: Final = "/api/v1/access"
 
 ANYONE: Final = Client("anyone", Role.ADMIN)
-"""Where a site has no tokens: it then listens on this machine only."""
+"""Every client of a site without tokens, whose server listens on the local machine only."""
 
-SAY_S: Final = 1.0
-"""How long a client whose token is revoked has to take the reason."""
+CLOSE_S: Final = 1.0
+"""Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
 
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 class Access:
-    """The tokens in force, and the WebSockets that were opened with them. All calls on the event loop's thread.
+    """The valid tokens, and the WebSockets that were opened with them. Call it from the event loop's thread only.
 
     Parameters
     ----------
     tokens : Tokens or None
-        None lets everyone do everything.
+        None gives every client the role of an admin.
     """
 
     def __init__(self, tokens: Tokens | None) -> None:
@@ -50,22 +50,22 @@ class Access:
 
     @property
     def wanted(self) -> bool:
-        """Whether a token is needed."""
+        """True if clients need a token."""
         return self._tokens is not None
 
     @property
     def clients(self) -> tuple[Client, ...]:
-        """Everyone who has a token."""
+        """Every client that has a token."""
         return () if self._tokens is None else self._tokens.clients
 
     def client(self, token: str | None) -> Client | None:
-        """Whom a request comes from."""
+        """The client that a token was issued to; None if there is none."""
         if self._tokens is None:
             return ANYONE
         return None if token is None else self._tokens.client(token)
 
     def replace(self, tokens: Tokens) -> None:
-        """Other tokens are in force from now on; WebSockets of those that are not any more end."""
+        """Replace the valid tokens, and end the WebSockets whose token is revoked or has another role."""
         self._tokens = tokens
         for revoked, (token, client) in self._open.items():
             if tokens.client(token) != client:
@@ -73,7 +73,7 @@ class Access:
 
     @contextmanager
     def held(self, token: str, client: Client) -> Iterator[asyncio.Event]:
-        """While a WebSocket is open: what is set when its token is revoked, or has another role."""
+        """Register an open WebSocket; the event is set when its token is revoked or has another role."""
         revoked = asyncio.Event()
         self._open[revoked] = token, client
         try:
@@ -83,18 +83,18 @@ class Access:
 
 
 class Gate:
-    """Lets a request through, or answers it.
+    """ASGI middleware that passes a request on, or refuses it.
 
-    What the application may want to know of its client is in the scope, under `client_role` and `client_name`.
+    It puts the client into the scope, as `client_role` and `client_name`; both are None without a token.
 
     Parameters
     ----------
     app : ASGIApp
-        What it guards.
+        The application behind the gate.
     access : Access
-        Who may.
+        The valid tokens.
     refusals : Refusals
-        Told of everyone who is turned away.
+        Counts and logs refused requests.
     """
 
     def __init__(self, app: ASGIApp, access: Access, refusals: Refusals) -> None:
@@ -113,7 +113,7 @@ class Gate:
         if refusal is not None:
             status, reason = refusal
             self._refusals.note(DOOR, (scope["client"] or ("a local socket",))[0], reason)
-            if scope["type"] == "websocket":  # before it is open: the handshake is answered with 403
+            if scope["type"] == "websocket":  # before it is accepted: the handshake is answered with 403
                 await send({"type": "websocket.close"})
                 return
             headers = {"WWW-Authenticate": 'Bearer realm="livessl"'} if status == 401 else None
@@ -125,39 +125,39 @@ class Gate:
             with self._access.held(token, client) as revoked:
                 await self._app(scope, _until(revoked, receive), _choosing_protocol(scope, send))
                 if revoked.is_set():
-                    await _say_why(send)
+                    await _close_revoked(send)
         else:
             await self._app(scope, receive, _choosing_protocol(scope, send))
 
 
-async def _say_why(send: Send) -> None:
-    """To a client that reads; one that does not is cut all the same."""
+async def _close_revoked(send: Send) -> None:
+    """Close a WebSocket with the reason; a client that does not read is disconnected without it."""
     with suppress(TimeoutError):
-        async with asyncio.timeout(SAY_S):
-            await send({"type": "websocket.close", "code": 1008, "reason": "the token is not valid any more"})
+        async with asyncio.timeout(CLOSE_S):
+            await send({"type": "websocket.close", "code": 1008, "reason": "the token is no longer valid"})
 
 
 def _until(revoked: asyncio.Event, receive: Receive) -> Receive:
-    """As what the client says; but once its token is revoked, it has left."""
+    """Return a `receive` that reports a disconnection once the token is revoked."""
 
     async def receive_or_leave() -> Message:
-        said, ended = asyncio.ensure_future(receive()), asyncio.ensure_future(revoked.wait())
+        received, ended = asyncio.ensure_future(receive()), asyncio.ensure_future(revoked.wait())
         try:
-            await asyncio.wait((said, ended), return_when=asyncio.FIRST_COMPLETED)
-            return {"type": "websocket.disconnect", "code": 1008} if ended.done() else said.result()
+            await asyncio.wait((received, ended), return_when=asyncio.FIRST_COMPLETED)
+            return {"type": "websocket.disconnect", "code": 1008} if ended.done() else received.result()
         finally:
-            said.cancel()
+            received.cancel()
             ended.cancel()
 
     return receive_or_leave
 
 
 def needed_role(method: str, path: str) -> Role | None:
-    """What a request takes: nothing for the empty dashboard and a word on health, else by what it does.
+    """Lowest role that a request needs; None for the pages without data and for health, which anyone may read.
 
-    A route that is added later is guarded before anyone thinks of it.
+    Every path is covered: a route that is added later is guarded from the start.
     """
-    if method in _READING and (path in ("/", HEALTH) or path.startswith("/static/")):
+    if method in _READING and (path in ("/", "/docs", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
     if path == ACCESS:
         return Role.ADMIN
@@ -165,15 +165,15 @@ def needed_role(method: str, path: str) -> Role | None:
 
 
 def _refusal(scope: Scope, client: Client | None) -> tuple[int, str] | None:
-    """Status and reason, in words that hold nothing of the request."""
+    """Status and reason of a refusal, or None. The text repeats nothing of the request: it is a label of a metric."""
     needed = needed_role(scope.get("method", "GET"), scope["path"])
     if needed is not None and client is None:
         return 401, "expected a valid token; send it as Authorization: Bearer TOKEN"
     if needed is not None and client is not None and client.role < needed:
-        return 403, f"expected a token of the role {needed}, this one is of a {client.role}"
+        return 403, f"expected a token of the role {needed}, got one of the role {client.role}"
     headers = Headers(scope=scope)
     if "transfer-encoding" in headers:
-        return 411, "expected a body whose length is told beforehand"
+        return 411, "expected a body with Content-Length, got one of unknown length"
     if int(headers.get("content-length", "0")) > MAX_BODY_BYTES:
         return 413, f"expected a body of at most {MAX_BODY_BYTES} bytes"
     return None
@@ -188,7 +188,7 @@ def _token(scope: Scope) -> str | None:
 
 
 def _choosing_protocol(scope: Scope, send: Send) -> Send:
-    """A browser that offers protocols hangs up unless one is chosen; it must not be the one with the token."""
+    """Return a `send` that accepts the protocol `livessl`, not the one with the token: browsers want one accepted."""
     if PROTOCOL not in scope.get("subprotocols", ()):
         return send
 

@@ -1,4 +1,4 @@
-"""What subscribers read: estimates, events, tracks and array states as JSON-ready dictionaries."""
+"""Encoder of estimates, events, tracks and array states as JSON-ready dictionaries; `schema.py` describes them."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ JsonObject = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """Where an answer's time went, from the end of its sound on; seconds, which add up.
+    """Consecutive stages between the end of a sound and its answer, in seconds.
 
     Parameters
     ----------
     waited : float
-        For the quiet that ends an event; 0 for an update.
+        Wait for the quiet that ends an event; 0 for an update.
     sent : float
-        Until the node had sent the last message that the answer needs: by the node's clock.
+        Time until the node had sent the last message that the answer needs, by the node's clock.
     received : float
-        Until the server had it: between two clocks, unless node and server share a machine.
+        Time until the server had received it; the difference of two clocks unless node and server share a machine.
     located : float
-        Until the answer was there: by the server's clock.
+        Time until the answer was computed, by the server's clock.
     """
 
     waited: float
@@ -43,12 +43,12 @@ class Stages:
 
     @property
     def ours(self) -> float:
-        """From when all had happened that the answer needs until it was there."""
+        """Time from the last moment that the answer depends on to the answer, in seconds."""
         return self.sent + self.received + self.located
 
     @property
     def total(self) -> float:
-        """From the end of the sound to the answer."""
+        """Time from the end of the sound to the answer, in seconds."""
         return self.waited + self.ours
 
 
@@ -58,11 +58,11 @@ class Messages:
     Parameters
     ----------
     site : Site
-        For the zones.
+        The site, for its zones.
     origin_ns : int
-        Site time that `start_s` counts from: the beginning of the recording, or of the live run.
+        Site time at which `start_s` is 0: the beginning of the recording or of the live run, in nanoseconds.
     utc : bool
-        Whether site time is UTC; where a recording does not say when it was made, `time_utc` is null.
+        Whether site time is UTC; it is not where a recording does not say when it was made. Then `time_utc` is null.
     """
 
     def __init__(self, site: Site, origin_ns: int, *, utc: bool) -> None:
@@ -71,7 +71,7 @@ class Messages:
         self._utc = utc
 
     def event(self, event: Event, stages: Stages | None = None, replaces: Sequence[str] = ()) -> JsonObject:
-        """An event, and the ids of the early ones that it replaces: the contract's fields first."""
+        """Encode an event, with the ids of the early ones that it replaces; the fields of the contract come first."""
         position, covariance, confidence, arrays = where(event.estimate)
         return {
             "kind": "event",
@@ -98,7 +98,7 @@ class Messages:
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
-        """Where a sound that still lasts seems to be."""
+        """Encode the preliminary position of a sound that still lasts."""
         position, covariance, confidence, arrays = where(update.estimate)
         return {
             "kind": "update",
@@ -128,7 +128,7 @@ class Messages:
         }
 
     def track(self, track: Track) -> JsonObject:
-        """A followed source."""
+        """Encode the state of a track."""
         position = _metres(track.position_m)
         return {
             "kind": "track",
@@ -159,7 +159,7 @@ def where(
 
 
 def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:
-    """Return an array's state, with the threshold that its node's activity detection applies."""
+    """Encode the state of an array that `node` captures, with the threshold of its activity detection."""
     noise = status.noise_power
     return {
         "name": status.name,
@@ -195,12 +195,12 @@ def _clock_offset(status: ArrayStatus) -> JsonObject | None:
 
 
 def json_text(message: JsonObject) -> str:
-    """The message as JSON, without blanks."""
+    """The message as JSON, without white space."""
     return orjson.dumps(message).decode()
 
 
 def dbfs(power: float | None) -> float | None:
-    """Level of a power in full scale squared; null for none, and for digital silence, which has no level."""
+    """Level in dB of a power in full scale squared; None for None and for digital silence, which has no level."""
     return round(10.0 * math.log10(power), 1) if power else None
 
 

@@ -1,4 +1,4 @@
-"""Power maps as PNG pictures, by the standard library alone."""
+"""Encoder of power maps as PNG pictures; it needs the standard library and numpy only."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from livessl.core.types import Float32Array
 _ANCHORS: Final = np.array(
     [[10, 8, 30], [66, 20, 108], [140, 42, 115], [214, 72, 82], [248, 142, 60], [252, 246, 176]], dtype=np.float64
 )
-"""Dark to light through purple, red and orange; evenly spaced."""
+"""Colours (RGB) of the scale from low to high power, evenly spaced: dark, purple, red, orange, light."""
 
 
 def map_png(image: Float32Array) -> bytes:
-    """A map (rows, columns) as a PNG, first row at the bottom; its median is dark, its maximum light."""
+    """Draw a map (rows, columns) as a PNG with the first row at the bottom, dark up to the median, light at the top."""
     low, high = float(np.median(image)), float(image.max())
     level = np.clip((image - low) / max(high - low, 1e-12), 0.0, 1.0)[::-1]
     place = level * (len(_ANCHORS) - 1)
@@ -29,7 +29,7 @@ def map_png(image: Float32Array) -> bytes:
 
 
 def encode_png(pixels: NDArray[np.uint8]) -> bytes:
-    """An RGB picture (rows, columns, 3) as PNG (RFC 2083): signature, header, one compressed block, end."""
+    """Encode an RGB picture (rows, columns, 3) as PNG (RFC 2083): signature, header, one compressed block, end."""
     rows, columns, _ = pixels.shape
     lines = np.concatenate([np.zeros((rows, 1), dtype=np.uint8), pixels.reshape(rows, -1)], axis=1)
     header = struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)

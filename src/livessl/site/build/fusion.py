@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from livessl.core.locate.estimator import Estimator, create
 from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.stream.correlation_cache import Each
-from livessl.core.stream.fusion import ANSWER_S, Fusion, FusionParameters
+from livessl.core.stream.correlation_cache import ForEach
+from livessl.core.stream.final_pass import TwoPassFusion
+from livessl.core.stream.fusion import Fusion, Role
+from livessl.core.stream.parameters import BACKFILL_WAIT_S, FusionParameters
 from livessl.core.stream.segmenter import RECENT_S
+from livessl.core.stream.site_state import SiteState
+from livessl.errors import ConfigError, Fault
 from livessl.site.build.grid import search_grid
+from livessl.site.build.pipeline import activity_parameters
 from livessl.site.models import Site
 
 
@@ -17,8 +24,17 @@ def make_clock_offsets(site: Site) -> ClockOffsets:
 
 
 def make_estimator(site: Site, method: str | None = None) -> Estimator:
-    """Return a new estimator of a site's arrays: the site's method, or another of `METHODS`."""
-    return create(method or site.fusion.method, site.processed, search_grid(site), site.c_m_s)
+    """Return a new estimator of a site's arrays, by the site's method or by another one.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method, or it cannot be imported.
+    """
+    try:
+        return create(method or site.fusion.method, site.processed, search_grid(site), site.c_m_s)
+    except ValueError as error:
+        raise ConfigError([Fault("fusion.method" if method is None else "method", str(error))]) from error
 
 
 def make_fusion(
@@ -26,47 +42,83 @@ def make_fusion(
     method: str | None = None,
     *,
     updates: bool = True,
-    live: bool = False,
+    corrects_clocks: bool = True,
     clock_offsets: ClockOffsets | None = None,
-    each: Each | None = None,
 ) -> Fusion:
-    """Return a new fusion of this site's arrays.
+    """Return a single pass over this site's recordings.
 
     Parameters
     ----------
     site : Site
-    method : str or None
-        One of `METHODS`; None for the site's own.
+    method : str, optional
+        Registered name, or `MODULE:NAME`; the site's own by default.
     updates : bool
-        Publish updates while an event lasts.
-    live : bool
-        True for live sound: wait less long for requested frames, and leave out updates that are overdue.
-    clock_offsets : ClockOffsets or None
-        Offsets that are known already; None to begin with unknown ones.
-    each : Each or None
-        Parallel `for_each` that correlates the arrays' frames; None for a plain loop.
+        Whether windows are located while a sound goes on.
+    corrects_clocks : bool
+        Whether the offsets of the arrays' clocks are learned and corrected.
+    clock_offsets : ClockOffsets, optional
+        What is known already of the arrays' clocks.
     """
-    f, a = site.fusion, site.activity
+    if corrects_clocks and clock_offsets is None:
+        clock_offsets = make_clock_offsets(site)
+    return Fusion(_site_state(site, method, RECENT_S, clock_offsets), Role(updates=updates))
+
+
+def make_two_pass_fusion(
+    site: Site,
+    arrays: Iterable[str],
+    settled: int | None = None,
+    *,
+    live: bool = False,
+    clock_offsets: ClockOffsets | None = None,
+    for_each: ForEach | None = None,
+) -> TwoPassFusion:
+    """Return the early and the final pass of this site.
+
+    Parameters
+    ----------
+    site : Site
+    arrays : iterable of str
+        Arrays whose sound is awaited.
+    settled : int or None
+        Frame index before which all results are final already.
+    live : bool
+        Whether the sound is live, so that the early pass has to keep up with it.
+    clock_offsets : ClockOffsets, optional
+        What is known already of the arrays' clocks.
+    for_each : ForEach, optional
+        Correlates several arrays in parallel.
+    """
+    if clock_offsets is None:
+        clock_offsets = make_clock_offsets(site)
+    state = _site_state(site, None, BACKFILL_WAIT_S if live else RECENT_S, clock_offsets, for_each)
+    return TwoPassFusion(state, arrays, settled, newest_only=live)
+
+
+def _site_state(
+    site: Site,
+    method: str | None,
+    backfill_wait_s: float,
+    clock_offsets: ClockOffsets | None,
+    for_each: ForEach | None = None,
+) -> SiteState:
+    f = site.fusion
     parameters = FusionParameters(
         deadline_s=f.deadline_s,
-        answer_s=ANSWER_S if live else RECENT_S,
+        backfill_wait_s=backfill_wait_s,
         window_s=f.window_s,
         update_s=f.update_s,
         max_event_s=f.max_event_s,
         min_arrays=f.min_arrays,
         sources=f.sources,
         live_sources=f.live_sources,
-        threshold=a.threshold,
-        pre_roll_s=a.pre_roll_s,
-        hang_over_s=a.hang_over_s,
+        activity=activity_parameters(site),
     )
-    return Fusion(
+    return SiteState(
         site.site,
         site.processed,
         make_estimator(site, method),
         parameters,
-        updates=updates,
-        newest_only=live,
-        clock_offsets=make_clock_offsets(site) if clock_offsets is None else clock_offsets,
-        each=each,
+        clock_offsets=clock_offsets,
+        for_each=for_each,
     )

@@ -1,4 +1,4 @@
-"""Arrays that did not find a sound are asked for it, offline and live alike; and old nodes work as ever."""
+"""Frames are requested from arrays that did not detect a sound, offline and live alike; old nodes work as before."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from livessl import offline
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
-from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.final_pass import FinalResults
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, BackfillRequest, Event, Frame, Message, Output, Status
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import MemoryRecording
 from livessl.simulation.scene import render
-from livessl.site.build.fusion import make_fusion
+from livessl.site.build.fusion import make_clock_offsets, make_fusion, make_two_pass_fusion
 from livessl.site.models import Site
 from small_site import RATE_HZ, running_server, scene, site_of
 
 START_NS = 1_767_225_600_000_000_000
 SOUNDS = 4
 WEAKER_DB = 39.0
-"""So much lower, a burst of noise lies a little above the microphones' noise, and below what is taken for sound."""
+"""Attenuation in dB at which a burst is a little above the microphones' noise, and below the level of sound."""
 
 NODES: dict[str, Any] = {
     "nodes": {
@@ -54,7 +55,7 @@ def recorded(array: str) -> Any:
 
 
 def parts(start_ns: int = START_NS, ahead_ns: int = 0, times: int = 1) -> list[AssignedRecording]:
-    """North hears the scene, so many times, well; south, whose clock may be ahead, faintly."""
+    """The scene, `times` in a row, strong at north and faint at south, whose clock may be ahead."""
     begin = {"north": start_ns, "south": start_ns + ahead_ns}
     heard = {name: np.tile(recorded(name), (1, times)) for name in begin}
     return [
@@ -83,7 +84,7 @@ def told(events: Sequence[Event]) -> list[tuple[object, ...]]:
     ]
 
 
-def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
+def test_sound_that_one_array_detected_is_located_with_requested_frames_of_the_other() -> None:
     without = offline_events(ask=False)
     assert [event.heard_by for event in without] == [("north",)] * SOUNDS
     assert {event.status for event in without} == {Status.DIRECTION_ONLY}
@@ -98,16 +99,24 @@ def test_a_sound_that_one_array_heard_is_located_with_the_other() -> None:
         assert error_m(event) < 0.5
 
 
-def test_methods_that_cannot_weigh_an_array_ask_nobody() -> None:
+def test_methods_without_onsets_request_nothing() -> None:
     assert told(offline_events(method="srp-phat")) == told(offline_events(method="srp-phat", ask=False))
 
 
 class Live:
-    """Two nodes and the server's fusions; what is asked arrives `way` batches after, and its answer as many after."""
+    """Two nodes and the two passes of a server; requested frames arrive `way` batches after the request."""
 
-    def __init__(self, way: int, *, answers: bool = True, deaf: bool = False, ahead_ns: int = 0) -> None:
+    def __init__(
+        self,
+        way: int,
+        *,
+        answers: bool = True,
+        deaf: bool = False,
+        ahead_ns: int = 0,
+        clocks: ClockOffsets | None = None,
+    ) -> None:
         self.lines, self.inputs = make_pipelines(site(), parts(ahead_ns=ahead_ns))
-        self.settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
+        self.settling = make_two_pass_fusion(site(), ("north", "south"), live=True, clock_offsets=clocks)
         for name in ("north", "south"):
             self.settling.greet(name, None, START_NS, answers=answers)
         self.way, self.deaf = way, deaf
@@ -136,7 +145,7 @@ def settled(outputs: Sequence[Output | FinalResults]) -> list[Event]:
 
 
 @pytest.mark.parametrize("way", [1, 4, 8])
-def test_live_answers_are_those_offline(way: int) -> None:
+def test_results_are_the_same_live_and_offline(way: int) -> None:
     """Blocks of 20 ms from each node: eight batches are 80 ms."""
     live = Live(way)
     outputs = live.run()
@@ -149,20 +158,20 @@ def test_live_answers_are_those_offline(way: int) -> None:
     assert all((ask.last - ask.first + 1) * FRAME_S <= 0.4 + 0.5 for ask in live.asks)  # run-up and burst
 
 
-def test_old_nodes_are_asked_nothing() -> None:
+def test_nothing_is_requested_from_old_nodes() -> None:
     live = Live(1, answers=False)
     assert told(settled(live.run())) == told(offline_events(ask=False))
     assert live.asks == []
 
 
-def test_disabled_arrays_are_asked_nothing() -> None:
+def test_nothing_is_requested_from_excluded_arrays() -> None:
     live = Live(1)
     live.settling.exclude({"south"})
     live.run()
     assert live.asks == []
 
 
-def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
+def test_requested_frames_are_awaited_for_a_limited_time() -> None:
     live = Live(1, deaf=True)
     events = settled(live.run())
     assert told(events) == told(offline_events(ask=False))
@@ -171,24 +180,20 @@ def test_an_answer_that_does_not_come_is_not_waited_for_long() -> None:
         assert 0.3 + 0.3 - 0.11 < event.latency_s < 0.3 + 0.3 + 0.11  # the hang-over, and as long again
 
 
-def test_arrays_are_asked_by_their_own_clocks() -> None:
-    """Nobody can know the offset before three sounds that both heard; here it is known already."""
+def test_requests_use_the_frame_indices_of_the_arrays_own_clock() -> None:
+    """The offset is usually known only after three sounds that both arrays detect; here it is known from the start."""
     ahead_ns = 150_000_000
-    live = Live(1, ahead_ns=ahead_ns)
-    clocks = live.settling.live.clock_offsets
-    assert clocks is not None
+    clocks = make_clock_offsets(site())
     for k in range(3):
         clocks.learn(START_NS + k, {"north": 0.0, "south": 0.15})
-    live.settling = TwoPassFusion(live.settling.live, ("north", "south"))
-    live.settling.greet("south", None, START_NS, answers=True)
-    events = settled(live.run())
+    events = settled(Live(1, ahead_ns=ahead_ns, clocks=clocks).run())
     expected = offline_events()
     assert [event.estimate and event.estimate.arrays for event in events] == [("north", "south")] * SOUNDS
     for event, other in zip(events, expected, strict=True):
         assert abs(error_m(event) - error_m(other)) < 0.02
 
 
-def test_nobody_is_asked_where_the_answer_is_sure() -> None:
+def test_nothing_is_requested_for_a_sure_event() -> None:
     loud = [
         replace(
             part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
@@ -196,7 +201,7 @@ def test_nobody_is_asked_where_the_answer_is_sure() -> None:
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
-    fusion.can_backfill = {"north", "south"}
+    fusion.can_backfill.update({"north", "south"})
     outputs: list[Output] = []
     for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
@@ -211,7 +216,7 @@ def recorded_loud(array: str) -> Any:
     return render(scene(SOUNDS), site().array(array).microphones_m, seed=3 + len(array))
 
 
-def test_asking_is_bounded() -> None:
+def test_number_of_requested_frames_is_bounded() -> None:
     allowance = Allowance()
     burst = round(RECENT_S / FRAME_S)
     assert allowance.take(burst, 0)
@@ -223,7 +228,7 @@ def test_asking_is_bounded() -> None:
     assert not allowance.take(burst, 10**6 + 1)
 
 
-def test_the_nearest_are_asked() -> None:
+def test_nearest_silent_arrays_come_first() -> None:
     def at(x_m: float) -> ArraySpec:
         return ArraySpec(f"{x_m:g}", np.array([[x_m, 0.0, 0.0], [x_m + 0.1, 0.0, 0.0]]), (100.0, 6000.0))
 
@@ -232,18 +237,18 @@ def test_the_nearest_are_asked() -> None:
     assert MOST_ARRAYS == 4
 
 
-def test_frames_that_nobody_asked_for_change_nothing() -> None:
+def test_frames_that_were_not_requested_change_nothing() -> None:
     fusion = make_fusion(site(), updates=False)
     samples = np.random.default_rng(0).standard_normal((4, 800)).astype(np.float32)
     frame_index = START_NS // FRAME_NS
-    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True)
+    stray = Frame("south", 0, frame_index, START_NS, float(RATE_HZ), samples, 0.01, True, requested=True)
     assert fusion.step([stray], START_NS) == []
     assert fusion.closed is None
     assert fusion.status(START_NS)[1].counters["frames"] == 0
 
 
 @pytest.mark.parametrize("speed", [4.0, None])
-def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None) -> None:
+def test_session_played_to_a_server_gives_the_same_events(speed: float | None) -> None:
     """At four times real time, and as fast as it goes: longer than what a node remembers, or it could not forget."""
     times = 1 if speed else 4
     played = parts(times=times)
@@ -264,15 +269,15 @@ def test_a_session_played_to_a_server_gives_the_same_answers(speed: float | None
         np.testing.assert_allclose(event["position_m"], other.estimate.position_m, atol=1e-4)
 
 
-def test_what_has_been_settled_while_others_were_asked_is_not_told_again() -> None:
-    """A node stood still: its sound comes after the live event has asked it, and before it answers."""
+def test_event_that_became_final_while_frames_were_awaited_is_not_reported_again() -> None:
+    """A node stood still: its sound comes after the early pass has requested frames, and before they come."""
     loud = [
         replace(
             part, recording=MemoryRecording(part.array, float(RATE_HZ), recorded_loud(part.array)), start_ns=START_NS
         )
         for part in parts()
     ]
-    settling = TwoPassFusion(make_fusion(site(), live=True), ("north", "south"))
+    settling = make_two_pass_fusion(site(), ("north", "south"), live=True)
     for name in ("north", "south"):
         settling.greet(name, None, START_NS, answers=True)
     held: list[Message] | None = []

@@ -1,0 +1,302 @@
+"""Collects what an event or a window is located from: sounds, correlations, and the powers of their frames.
+
+It also decides which samples are kept while a sound goes on, and correlates frames in quiet so that a sound that begins
+soon does not have to wait for its pre-roll.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, overload
+
+import numpy as np
+
+from livessl.core.correlate.onset_gcc import OnsetGCC
+from livessl.core.locate.estimator import Sound
+from livessl.core.stream.activity import exact_mask, runs
+from livessl.core.stream.alignment import Alignment
+from livessl.core.stream.array_stream import ArrayStream
+from livessl.core.stream.site_state import SiteState
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, FloatArray, Frame
+
+KEPT_ARRAYS: Final = 24
+"""Number of arrays whose samples are kept while a sound goes on: those with the greatest onset strength so far, half as
+many again as an estimator uses. Of the others only the correlations stay, for 64 arrays send 45 MB a second."""
+
+RELEASE_FRAMES: Final = 10
+"""Number of frames between two choices of these arrays."""
+
+
+class Segments(Sequence[Float32Array]):
+    """Segments of one array's samples, each (K, n), joined from frames when it is read.
+
+    Samples are thus never copied for all arrays at once, and not at all if they are not used. Frames whose samples were
+    released, which are the first ones, are left out.
+    """
+
+    def __init__(self, segments: Iterable[Sequence[Frame]]) -> None:
+        kept = ([frame for frame in segment if frame.samples.size] for segment in segments)
+        self._segments = [segment for segment in kept if segment]
+
+    @overload
+    def __getitem__(self, index: int) -> Float32Array: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Float32Array]: ...
+    def __getitem__(self, index: int | slice) -> Float32Array | Sequence[Float32Array]:
+        if isinstance(index, slice):
+            return Segments(self._segments[index])
+        return np.concatenate([frame.samples for frame in self._segments[index]], axis=1)
+
+    def __len__(self) -> int:
+        return len(self._segments)
+
+
+class Sounds(Mapping[str, Sound]):
+    """The sound of each array, as an estimator takes it.
+
+    Parameters
+    ----------
+    sources : int
+        Number of sources to search for.
+    suspects : collection of str
+        Names of the suspect arrays.
+    ended : bool
+        Whether the sound has ended, so that these are whole.
+    """
+
+    def __init__(self, sources: int, suspects: Collection[str] = (), *, ended: bool = True) -> None:
+        self.sources = sources
+        self.suspects = suspects
+        self.ended = ended
+        self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
+        self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
+
+    def add(self, array: str, segments: Sequence[Sequence[Frame]], onsets: tuple[OnsetGCC, ...]) -> None:
+        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames."""
+        self._segments[array], self._onsets[array] = segments, onsets
+
+    def copy(self) -> Sounds:
+        """Return a copy that sounds can be added to."""
+        copy = Sounds(self.sources, self.suspects, ended=self.ended)
+        copy._segments |= self._segments
+        copy._onsets |= self._onsets
+        return copy
+
+    @property
+    def has_onsets(self) -> bool:
+        """True where the estimator correlates every frame, and so weighs each array by what it received."""
+        return any(self._onsets.values())
+
+    def __getitem__(self, array: str) -> Sound:
+        segments = self._segments[array]
+        return Sound(
+            Segments(segments),
+            segments[0][0].sample_rate_hz,
+            self._onsets[array],
+            array in self.suspects,
+            self.sources,
+            self.ended,
+        )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._segments)
+
+    def __len__(self) -> int:
+        return len(self._segments)
+
+
+@dataclass(frozen=True, slots=True)
+class BackfilledSound:
+    """The sound of an array that was requested: its frames from the event's start on, and their correlations."""
+
+    frames: list[Frame]
+    onsets: tuple[OnsetGCC, ...]
+
+
+@dataclass(slots=True)
+class Excerpt:
+    """The part of all arrays' sound that an event or a window is located from.
+
+    Parameters
+    ----------
+    sounds : Sounds
+    start_ns, end_ns : int
+        Site time of its first frame's start and of its last frame's end.
+    powers : dict of array to (n,) float64
+        In-band mean power of each frame, full scale squared.
+    """
+
+    sounds: Sounds
+    start_ns: int = 2**63 - 1
+    end_ns: int = -(2**63)
+    powers: dict[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def middle_ns(self) -> int:
+        """Site time of its middle."""
+        return (self.start_ns + self.end_ns) // 2
+
+    @property
+    def greatest_power(self) -> float:
+        """Greatest power of a frame, full scale squared."""
+        return max(float(power.max()) for power in self.powers.values())
+
+    def with_backfill(self, backfilled: Mapping[str, BackfilledSound]) -> Excerpt:
+        """Return this excerpt with the sounds of requested frames added; the times stay."""
+        joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
+        for name, sound in backfilled.items():
+            joined.sounds.add(name, [sound.frames], sound.onsets)
+            joined.powers[name] = np.array([frame.power for frame in sound.frames])
+        return joined
+
+
+class EvidenceCollector:
+    """Correlates the arrays' frames and collects excerpts of them.
+
+    Parameters
+    ----------
+    state : SiteState
+    alignment : Alignment
+        The arrays' frames on the joint frame index.
+    correlates_ahead : bool
+        Whether frames are correlated in quiet. With many arrays there is no time for it once the sound has begun.
+    """
+
+    def __init__(self, state: SiteState, alignment: Alignment, *, correlates_ahead: bool) -> None:
+        self._cache = state.cache
+        self._votes = state.votes
+        self._parameters = state.parameters
+        self._alignment = alignment
+        self._correlates_ahead = correlates_ahead
+        self._ahead: range | None = None  # frame indices that the streams' upcoming correlations have followed
+        self._onset_strength: dict[str, float] = {}  # of each array, in the event that goes on
+
+    # --- correlations
+
+    def begin_event(self, start: int) -> None:
+        """Correlate the pre-roll of an event that became active at `start`.
+
+        The correlations begin anew, so that an event is the same whatever came before it; where a sound was split for
+        its length they continue.
+        """
+        self._onset_strength = {}
+        span, streams = range(self._alignment.first_of(start), start), self._alignment.streams.values()
+        if start != self._alignment.reported_until:
+            is_ready = self._ahead == span and all(
+                stream.upcoming.has(k for k in span if k in stream.frames) for stream in streams
+            )
+            for stream in streams:
+                stream.begin_correlations(from_upcoming=is_ready)
+            if not is_ready:
+                self._correlate(streams, span)
+        self._ahead = None
+
+    def correlate(self, frame_index: int) -> None:
+        """Correlate the frames of all arrays at a frame index that belongs to an event."""
+        self._correlate(self._alignment.streams.values(), [frame_index])
+
+    def correlate_what_is_here(self, frame_index: int) -> None:
+        """Correlate the frames that have come of a frame index which still waits for other arrays."""
+        streams = self._alignment.streams.values()
+        here = [s for s in streams if frame_index in s.frames and frame_index not in s.correlations.onsets]
+        self._correlate(here, [frame_index])
+
+    def correlate_ahead(self, frame_index: int, begin: int | None) -> None:
+        """Correlate a quiet frame index, which may be in the pre-roll of the next sound.
+
+        Parameters
+        ----------
+        frame_index : int
+            The quiet frame index.
+        begin : int or None
+            First frame index after the last sound. The pre-roll of the next sound begins there if that sound comes
+            soon; later it begins at a frame index that is not known yet.
+        """
+        if not self._correlates_ahead or begin is None:
+            return
+        if frame_index - begin >= self._parameters.activity.pre_roll_frames:
+            return
+        streams = self._alignment.streams.values()
+        if frame_index == begin:
+            for stream in streams:
+                stream.begin_upcoming()
+        elif self._ahead != range(begin, frame_index):
+            return
+        self._cache.extend(((stream.spec.name, stream.upcoming, stream.frames) for stream in streams), [frame_index])
+        self._ahead = range(begin, frame_index + 1)
+
+    def discard_ahead(self) -> None:
+        """Discard what was correlated ahead: an active frame came, or frame indices have moved."""
+        self._ahead = None
+
+    def _correlate(self, streams: Iterable[ArrayStream], frame_indices: Sequence[int]) -> None:
+        self._cache.extend(((s.spec.name, s.correlations, s.frames) for s in streams), frame_indices)
+
+    # --- samples
+
+    def release_samples(self, frame_index: int) -> None:
+        """Release the samples of the arrays with the least onset strength, but for those that a window may need.
+
+        To be called every `RELEASE_FRAMES` of an event.
+        """
+        streams = self._alignment.streams
+        if len(streams) <= KEPT_ARRAYS:
+            return
+        lately, strength = range(frame_index - RELEASE_FRAMES + 1, frame_index + 1), self._onset_strength
+        for name, stream in streams.items():
+            strength[name] = strength.get(name, 0.0) + sum(onsets.weight for onsets in stream.correlations.at(lately))
+        strongest = sorted(strength, key=lambda name: -strength[name])
+        window_s, hang_over_s = self._parameters.window_s, self._parameters.activity.hang_over_s
+        before = frame_index - round((window_s + hang_over_s) / FRAME_S)
+        for name in strongest[KEPT_ARRAYS:]:
+            if streams[name].correlations.onsets:
+                streams[name].release_samples(before)
+
+    # --- excerpts
+
+    def window(self, last: int) -> Excerpt:
+        """Return the active frames of the window that ends with a frame index, without those of suspect arrays."""
+        window = range(last - self._parameters.window_frames + 1, last + 1)
+        sounds = Sounds(self._parameters.live_sources, ended=False)
+        excerpt = Excerpt(sounds, window.start * FRAME_NS, window.stop * FRAME_NS)
+        for name, stream in self._alignment.streams.items():
+            segments, there = stream.segments([k for k in window if stream.has_active(k)])
+            if segments and not self._votes.is_suspect(name):
+                sounds.add(name, segments, stream.correlations.at(window))
+                excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
+        return excerpt
+
+    def whole_sounds(self, arrays: Iterable[str], span: range) -> list[tuple[ArraySpec, list[Frame]]]:
+        """Return each array's longest segment of frames in a span; without arrays whose samples were released."""
+        streams = [self._alignment.streams[name] for name in arrays]
+        return [(s.spec, max(s.segments(span)[0], key=len)) for s in streams if s.has_samples(span)]
+
+    def event(self, span: range) -> Excerpt:
+        """Return the active frames, by the exact rule, of an event that spans these frame indices with its pre-roll."""
+        excerpt = Excerpt(Sounds(self._parameters.sources, self._votes.suspects()))
+        for stream in self._alignment.streams.values():
+            self._add(excerpt, stream, span)
+        return excerpt
+
+    def _add(self, excerpt: Excerpt, stream: ArrayStream, span: range) -> None:
+        active = [k for k in span if stream.has_active(k)]
+        if not active:
+            return
+        # frames beyond the hang-over may be the pre-roll of the array's next sound, which come when that begins
+        own_end = active[-1] + self._parameters.activity.hang_over_frames + 1
+        _, there = stream.segments(range(span.start, min(span.stop, own_end)))
+        power = np.array([stream.frames[k].power for k in there])
+        mask = exact_mask(power, self._parameters.activity.threshold)
+        frame_indices = [there[index] for start, stop in runs(mask) for index in range(start, stop)]
+        segments, _ = stream.segments(frame_indices)
+        if not segments:
+            return
+        if not stream.correlations.has(there) and stream.has_samples(there):  # some frames came late
+            stream.begin_correlations()
+            self._correlate([stream], span)
+        name, end = stream.spec.name, frame_indices[-1] + 1
+        excerpt.sounds.add(name, segments, stream.correlations.at(range(span.start, end)))
+        excerpt.powers[name] = power[mask]
+        excerpt.start_ns = min(excerpt.start_ns, frame_indices[0] * FRAME_NS - stream.rest_ns)
+        excerpt.end_ns = max(excerpt.end_ns, end * FRAME_NS - stream.rest_ns)

@@ -1,0 +1,74 @@
+"""Which arrays were outliers in the last events, and which are therefore suspect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from livessl.core.locate.estimator import Localization
+
+VOTES: Final = 10
+"""Number of last events that an array's votes are kept of."""
+
+LEAST_VOTES: Final = 3
+"""Number of outlier votes from which on an array is suspect, if they are also more than half of its last `VOTES` votes.
+As many agreements in a row clear it. It is also the least number of arrays of which a consensus is counted."""
+
+Votes = tuple[tuple[int, float | None], ...]
+"""One entry for each of the last events: the frame index at which it began, and the angle in degrees by which the array
+was off; None where it agreed with the others."""
+
+
+class OutlierVotes:
+    """Votes of all arrays. Each array's votes are replaced, never changed: any thread may read them.
+
+    Parameters
+    ----------
+    arrays : iterable of str
+        Names of the arrays.
+    """
+
+    def __init__(self, arrays: Iterable[str]) -> None:
+        self._votes: dict[str, Votes] = dict.fromkeys(arrays, ())
+
+    def of(self, array: str) -> Votes:
+        """Return an array's votes, the oldest first."""
+        return self._votes[array]
+
+    def is_suspect(self, array: str) -> bool:
+        """Return whether an array is suspect: see `LEAST_VOTES`."""
+        return is_suspect(self._votes[array])
+
+    def suspects(self) -> set[str]:
+        """Return the names of the suspect arrays."""
+        return {array for array, votes in self._votes.items() if is_suspect(votes)}
+
+    def count(self, start: int, found: Localization, detected_by: Iterable[str]) -> None:
+        """Add the votes of an event; they replace earlier votes of the same event.
+
+        Parameters
+        ----------
+        start : int
+            Frame index at which the event began.
+        found : Localization
+            Its location. Without a consensus of at least `LEAST_VOTES` arrays nothing is counted.
+        detected_by : iterable of str
+            Arrays that detected the event by themselves.
+        """
+        if found.outliers is None or len(found.evidence) < LEAST_VOTES:
+            return
+        for array in detected_by:
+            if array not in found.unneeded:
+                others = [vote for vote in self._votes[array] if vote[0] != start]
+                self._votes[array] = (*others, (start, found.outliers.get(array)))[-VOTES:]
+
+    def clear(self) -> None:
+        """Remove all votes."""
+        self._votes.update(dict.fromkeys(self._votes, ()))
+
+
+def is_suspect(votes: Votes) -> bool:
+    """Return whether an array with these votes is suspect: see `LEAST_VOTES`."""
+    outlying = [vote for vote in votes if vote[1] is not None]
+    lately = any(vote[1] is not None for vote in votes[-LEAST_VOTES:])
+    return len(outlying) >= LEAST_VOTES and 2 * len(outlying) > len(votes) and lately

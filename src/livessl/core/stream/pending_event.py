@@ -1,0 +1,134 @@
+"""The life of an event, from its first active frame until it has been reported. It locates nothing.
+
+| state | entered when | left for |
+|---|---|---|
+| `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` where it is cut short |
+| `ENDED` | the sound was quiet for a hang-over, or has reached the greatest length | `AWAITING_BACKFILL`, `REPORTED` |
+| `AWAITING_BACKFILL` | frames were requested from arrays that did not detect the sound | `REPORTED` |
+| `REPORTED` | its results were handed over, or another pass reports it | |
+
+An event is cut short where nothing more comes: at the end of a recording, before a gap, when all arrays are silent, and
+when the server's clock is set back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+from livessl.core.stream.evidence import Excerpt
+from livessl.core.types import Event, Frame
+
+
+class EventState(StrEnum):
+    """A stage in the life of an event."""
+
+    OPEN = "open"
+    ENDED = "ended"
+    AWAITING_BACKFILL = "awaiting backfill"
+    REPORTED = "reported"
+
+
+_FOLLOWS: Final[Mapping[EventState, frozenset[EventState]]] = {
+    EventState.OPEN: frozenset(),
+    EventState.ENDED: frozenset({EventState.OPEN}),
+    EventState.AWAITING_BACKFILL: frozenset({EventState.ENDED}),
+    EventState.REPORTED: frozenset({EventState.OPEN, EventState.ENDED, EventState.AWAITING_BACKFILL}),
+}
+
+
+@dataclass(slots=True)
+class RequestedFrames:
+    """The frames that were requested from one array, and those that have come. Frame indices are joint ones."""
+
+    span: range
+    frames: dict[int, Frame] = field(default_factory=dict)
+
+    def take(self, frame: Frame) -> None:
+        """Take in a frame, if it was requested."""
+        if frame.frame_index in self.span:
+            self.frames[frame.frame_index] = frame
+
+    @property
+    def is_complete(self) -> bool:
+        """True once all have come; frames come in order."""
+        return self.span[-1] in self.frames
+
+
+class PendingEvent:
+    """An event that has not been reported yet. Frame indices are joint ones.
+
+    Parameters
+    ----------
+    start : int
+        Frame index of its first active frame.
+    """
+
+    def __init__(self, start: int) -> None:
+        self.state = EventState.OPEN
+        self.start = start
+        self.last_active = start
+        self.closed = start
+        """The last frame index that was closed in it; frames beyond it are no part of the event."""
+        self.became_quiet = False
+        """True where it ended with a quiet hang-over, not by its length."""
+        self.late_frames = 0
+        self.excerpt: Excerpt | None = None
+        """The part of the arrays' sound that it was located from; None before, and where another pass reports it."""
+        self.results: Sequence[Event] = ()
+        """Its results, one for each source; none before it was located, and where another pass reports it."""
+        self.requested: Mapping[str, RequestedFrames] = {}
+        self.requested_ns = 0
+
+    @property
+    def has_ended(self) -> bool:
+        """True where the sound has ended, by a quiet hang-over or by its length; False where it was cut short."""
+        return self.state in (EventState.ENDED, EventState.AWAITING_BACKFILL)
+
+    @property
+    def length(self) -> int:
+        """Number of frame indices from its start to the last one that was closed."""
+        return self.closed - self.start + 1
+
+    @property
+    def quiet_frames(self) -> int:
+        """Number of frame indices that were closed since the last active one."""
+        return self.closed - self.last_active
+
+    def close(self, frame_index: int, *, active: bool) -> None:
+        """Add a closed frame index."""
+        self.closed = frame_index
+        if active:
+            self.last_active = frame_index
+
+    def note_late_frame(self) -> None:
+        """Count an active frame that came after its frame index had closed."""
+        self.late_frames += 1
+
+    def end(self, *, became_quiet: bool) -> None:
+        """End the sound."""
+        self._go_to(EventState.ENDED)
+        self.became_quiet = became_quiet
+
+    def set_results(self, results: Sequence[Event], excerpt: Excerpt | None) -> None:
+        """Set its results and the excerpt that they were located from."""
+        self.results, self.excerpt = results, excerpt
+
+    def await_backfill(self, requested: Mapping[str, RequestedFrames], now_ns: int) -> None:
+        """Wait for frames that were requested now."""
+        self._go_to(EventState.AWAITING_BACKFILL)
+        self.requested, self.requested_ns = requested, now_ns
+
+    def report(self) -> None:
+        """End its life."""
+        self._go_to(EventState.REPORTED)
+
+    def _go_to(self, state: EventState) -> None:
+        if self.state not in _FOLLOWS[state]:
+            expected = " or ".join(repr(str(before)) for before in EventState if before in _FOLLOWS[state])
+            raise RuntimeError(
+                f"event at frame index {self.start}: expected {expected} before {str(state)!r}, got {str(self.state)!r}"
+            )
+        self.state = state

@@ -1,0 +1,103 @@
+"""Reception of one array: how much of its sound has come, live and as backlog, in frame indices of its own clock.
+
+A node that was away sends the frames that it kept meanwhile, its backlog, in order of time between its live frames.
+Until all of the backlog has come, the array's sound is known only up to the last backlog frame, however far its live
+frames have come.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from livessl.core.stream.array_health import LOST_NS
+
+
+@dataclass(slots=True)
+class Reception:
+    """The frames of one array that have come."""
+
+    live_until: int | None = None
+    backlog_until: int | None = None  # None while there is no backlog
+    live_from: int | None = None  # frames before it are backlog
+    last_message_ns: int | None = None
+    has_left: bool = False
+    seen: set[int] = field(default_factory=set)
+
+    @property
+    def known_until(self) -> int | None:
+        """Frame index up to which all frames have come; None before the first message."""
+        return self.live_until if self.backlog_until is None else self.backlog_until
+
+    def is_connected(self, now_ns: int) -> bool:
+        """Return whether its node has sent something lately."""
+        return self.last_message_ns is not None and now_ns - self.last_message_ns < LOST_NS
+
+    def is_backlog(self, frame_index: int) -> bool:
+        """Return whether a frame is one that the node has kept since before its connection."""
+        return self.backlog_until is not None and self.live_from is not None and frame_index < self.live_from
+
+    def greet(self, backlog: tuple[int, int] | None, now_ns: int) -> None:
+        """Take in the node's greeting.
+
+        Parameters
+        ----------
+        backlog : (int, int) or None
+            The oldest frame that it kept, and the first live one; None where all that it kept has come.
+        now_ns : int
+        """
+        self.touch(now_ns)
+        if backlog is not None:
+            first, live_from = backlog
+            if self.backlog_until is None or self.live_from != live_from:
+                self.backlog_until, self.live_from = first - 1, live_from
+        elif self.backlog_until is not None and self.live_from is not None:
+            self.live_until = later(self.live_until, self.live_from - 1)
+            self.backlog_until = None
+
+    def leave(self) -> None:
+        """Note that its node has ended on purpose."""
+        self.has_left = True
+
+    def touch(self, now_ns: int) -> None:
+        """Note that its node has sent something."""
+        self.last_message_ns, self.has_left = now_ns, False
+
+    def take_mark(self, frame_index: int) -> None:
+        """Take in a mark: all live sound up to it has come."""
+        self.live_until = later(self.live_until, frame_index)
+
+    def take_backlog(self, frame_index: int) -> None:
+        """Take in the index of a backlog frame, new or not: all of the backlog up to it has come."""
+        self.backlog_until = later(self.backlog_until, frame_index)
+
+    def is_passed(self, frame_index: int) -> bool:
+        """Return whether a frame that has not been seen comes after all that is known of the array's live sound."""
+        return frame_index not in self.seen and self.live_until is not None and self.live_until < frame_index
+
+    def add(self, frame_index: int) -> None:
+        """Add a new frame."""
+        self.seen.add(frame_index)
+        if not self.is_backlog(frame_index):
+            self.live_until = later(self.live_until, frame_index)
+
+    def forget(self, before: int) -> None:
+        """Forget which frames before a frame index have been seen."""
+        if self.seen:
+            self.seen = {frame_index for frame_index in self.seen if frame_index >= before}
+
+    def start_over(self) -> None:
+        """Forget all frames, for the server's clock was set back."""
+        self.seen.clear()
+        self.live_until = None
+
+
+def later(one: int | None, other: int | None) -> int | None:
+    """Return the later of two frame indices; None is before all of them."""
+    if one is None or other is None:
+        return other if one is None else one
+    return max(one, other)
+
+
+def earlier(one: int | None, other: int | None) -> int | None:
+    """Return the earlier of two frame indices; None is before all of them."""
+    return None if one is None or other is None else min(one, other)

@@ -1,0 +1,76 @@
+"""The state that all passes over one site's messages share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+from livessl.core.locate.estimator import Estimator
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
+from livessl.core.stream.outlier_votes import OutlierVotes
+from livessl.core.stream.parameters import FusionParameters
+from livessl.core.types import ArraySpec, Frame, Message
+
+
+class SiteState:
+    """State of a site that does not depend on the pass.
+
+    Parameters
+    ----------
+    site : str
+        Name that event ids begin with.
+    arrays : sequence of ArraySpec
+    estimator : Estimator
+    parameters : FusionParameters
+    clock_offsets : ClockOffsets or None
+        Offsets of the arrays' clocks, learned from events; None takes all clocks to agree.
+    for_each : ForEach or None
+        Correlates several arrays, perhaps in parallel; None does one after the other.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        arrays: Sequence[ArraySpec],
+        estimator: Estimator,
+        parameters: FusionParameters | None = None,
+        *,
+        clock_offsets: ClockOffsets | None = None,
+        for_each: ForEach | None = None,
+    ) -> None:
+        self.site = site
+        self.arrays = {spec.name: spec for spec in arrays}
+        self.estimator = estimator
+        self.parameters = parameters or FusionParameters()
+        self.clock_offsets = clock_offsets
+        self.cache = CorrelationCache(estimator, for_each)
+        self.votes = OutlierVotes(self.arrays)
+        self.can_backfill: set[str] = set()
+        """Arrays whose nodes answer backfill requests."""
+        self._excluded: Collection[str] = ()
+
+    def exclude(self, arrays: Collection[str]) -> None:
+        """Exclude these arrays from now on, and include all others again.
+
+        No frame of an excluded array is active, awaited or requested.
+        """
+        self._excluded = arrays
+
+    def is_excluded(self, array: str) -> bool:
+        """Return whether an array is excluded."""
+        return array in self._excluded
+
+    def without_excluded(self, message: Message) -> Message:
+        """Return a message as it is used: no frame of an excluded array is active."""
+        if message.array in self._excluded and isinstance(message, Frame) and message.active:
+            return replace(message, active=False)
+        return message
+
+    def answers_requests(self, array: str) -> bool:
+        """Return whether frames may be requested from an array."""
+        return array in self.can_backfill and array not in self._excluded
+
+    def specs(self, arrays: Sequence[str]) -> list[ArraySpec]:
+        """Return the specifications of the arrays named."""
+        return [self.arrays[name] for name in arrays]

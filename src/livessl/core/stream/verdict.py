@@ -1,0 +1,216 @@
+"""Turns what an estimator found into results: status, reason, and what each array contributed. It keeps no state."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from livessl.core.geometry import direction_deg
+from livessl.core.locate.estimator import Localization
+from livessl.core.stream.evidence import BackfilledSound, Excerpt
+from livessl.core.stream.pending_event import PendingEvent
+from livessl.core.stream.site_state import SiteState
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Contribution, Estimate, Event, FloatArray, Status, Update
+
+RANGE_UNKNOWN: Final = 0.25
+"""Ratio of the position's standard deviation to its distance from the nearest array beyond which only the direction is
+reported."""
+
+RANGE_APERTURES: Final = 2.0
+"""Ratio of the distance to the aperture beyond which a single array determines no distance. Reverberation changes its
+delays, which the covariance does not include, and moves the position along the line of sight by metres."""
+
+
+def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
+    """Decide whether a location is a position, only a direction, or neither, and why.
+
+    Parameters
+    ----------
+    found : Localization
+    specs : sequence of ArraySpec
+        The arrays that it was found by.
+
+    Returns
+    -------
+    Status, str or None
+        The status, and the reason for it in words; None where there is nothing to add.
+    """
+    spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
+    nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
+    alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
+    if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
+        return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
+    if found.features is not None and not found.features.has_direction:
+        return Status.REFUSED, "no direction stands out in the sound"
+    who = "one array" if len(specs) == 1 else "these arrays"
+    return Status.DIRECTION_ONLY, f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The events of a sound, one for each source, and the location they were made from; None without one."""
+
+    events: list[Event]
+    found: Localization | None
+
+
+class Verdicts:
+    """Locates excerpts and judges what was found.
+
+    Parameters
+    ----------
+    state : SiteState
+    """
+
+    def __init__(self, state: SiteState) -> None:
+        self._state = state
+
+    def event(
+        self,
+        event: PendingEvent,
+        excerpt: Excerpt,
+        now_ns: int,
+        backfilled: Mapping[str, BackfilledSound] | None = None,
+    ) -> Verdict:
+        """Locate an event and return one event for each source.
+
+        Parameters
+        ----------
+        event : PendingEvent
+        excerpt : Excerpt
+            From the arrays that detected it.
+        now_ns : int
+            Site time now.
+        backfilled : mapping of array to BackfilledSound, optional
+            Sounds of other arrays that are used as well.
+        """
+        backfilled = backfilled or {}
+        used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
+        first = self._refused(event, excerpt, now_ns, f"detected by {len(used.sounds)} of at least {least} arrays")
+        if len(used.sounds) < least:
+            return Verdict([first], None)
+        found = self._state.estimator.locate(used.sounds)
+        estimate = _estimate(found, used)
+        status, reason = self._judged(estimate, found)
+        first = replace(first, status=status, reason=reason)
+        if status is not Status.REFUSED:
+            contributions = self._contributions(used.powers, estimate, found, backfilled)
+            first = replace(first, estimate=estimate, contributions=contributions)
+        others = (
+            replace(
+                first,
+                id=f"{first.id}-{source}",
+                source=source,
+                status=Status.LOCATED,
+                reason=None,
+                estimate=other,  # the power stays that of both sources: it cannot be divided
+                contributions=self._contributions(used.powers, other, found, backfilled),
+            )
+            for source, other in enumerate(self._others(found, used), 2)
+        )
+        return Verdict([first, *others], found)
+
+    def _refused(self, event: PendingEvent, excerpt: Excerpt, now_ns: int, reason: str) -> Event:
+        return Event(
+            id=self._id(event.start),
+            start_ns=excerpt.start_ns,
+            end_ns=excerpt.end_ns,
+            status=Status.REFUSED,
+            reason=reason,
+            estimate=None,
+            power=excerpt.greatest_power,
+            method=self._state.estimator.name,
+            heard_by=tuple(excerpt.sounds),
+            late_frames=event.late_frames,
+            latency_s=(now_ns - excerpt.end_ns) / 1e9,
+            complete_ns=(event.closed + 1) * FRAME_NS,
+        )
+
+    def update(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
+        """Locate a window of an event that goes on; return the update, and the location that it was made from."""
+        found = self._state.estimator.locate(excerpt.sounds)
+        estimate = _estimate(found, excerpt)
+        status, _ = self._judged(estimate, found)
+        return Update(
+            event_id=self._id(event.start),
+            status=status,
+            estimate=estimate,
+            power=excerpt.greatest_power,
+            contributions=self._contributions(excerpt.powers, estimate, found),
+            complete_ns=excerpt.end_ns,
+            others=self._others(found, excerpt),
+        ), found
+
+    def count_votes(self, event: PendingEvent, excerpt: Excerpt, verdict: Verdict) -> None:
+        """Count which of the arrays that detected an event were outliers, unless it was refused."""
+        if verdict.found is not None and verdict.events[0].status is not Status.REFUSED:
+            self._state.votes.count(event.start, verdict.found, excerpt.sounds)
+
+    def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Estimate, ...]:
+        """Return the estimates of further sources of the same sound, those that are positions."""
+        estimates = ((_estimate(other, excerpt), other) for other in found.others)
+        return tuple(estimate for estimate, other in estimates if self._judged(estimate, other)[0] is Status.LOCATED)
+
+    def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
+        return judged(found, self._state.specs(estimate.arrays))
+
+    def _contributions(
+        self,
+        powers: Mapping[str, FloatArray],
+        estimate: Estimate,
+        found: Localization,
+        backfilled: Collection[str] = (),
+    ) -> tuple[Contribution, ...]:
+        arrays = self._state.arrays
+        return tuple(
+            _contribution(arrays[name], power, estimate, found, backfilled=name in backfilled)
+            for name, power in powers.items()
+        )
+
+    def _id(self, frame_index: int) -> str:
+        return f"{self._state.site}-{frame_index * FRAME_NS // 1_000_000}"
+
+
+def _estimate(found: Localization, excerpt: Excerpt) -> Estimate:
+    arrays = _used(found, excerpt.sounds)
+    return Estimate(excerpt.middle_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
+
+
+def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:
+    return tuple(name for name in arrays if name not in (found.outliers or ()) and name not in found.unneeded)
+
+
+def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:
+    """Return the distance of a position from an array, at least half the aperture: a position may lie inside it."""
+    return max(direction_deg(spec.centre_m, position_m)[2], spec.aperture_m / 2.0)
+
+
+def _contribution(
+    spec: ArraySpec, power: FloatArray, estimate: Estimate, found: Localization, *, backfilled: bool
+) -> Contribution:
+    azimuth_deg, elevation_deg, distance_m = direction_deg(spec.centre_m, estimate.position_m)
+    agrees: bool | None = None
+    if found.outliers is not None and len(found.evidence) > 1 and spec.name not in found.unneeded:
+        agrees = spec.name not in found.outliers
+    return Contribution(
+        array=spec.name,
+        active_s=len(power) * FRAME_S,
+        power=float(power.mean()),
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+        distance_m=distance_m,
+        agrees=agrees,
+        off_deg=(found.outliers or {}).get(spec.name),
+        asked=backfilled,
+    )
+
+
+def _dissent(found: Localization) -> str | None:
+    """Return a reason that names the outliers; None where there are none."""
+    if not found.outliers:
+        return None
+    each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outliers.items()))
+    return f"located without the {'outlier' if len(found.outliers) == 1 else 'outliers'} {each}"

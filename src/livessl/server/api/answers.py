@@ -1,0 +1,279 @@
+"""The contract of the API, continued: a model of every REST answer and of every error body. See `schema.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from livessl.server.api.schema import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
+
+IntervalM = Annotated[
+    list[float], Field(min_length=2, max_length=2, description="Lowest and highest coordinate in metres.")
+]
+BoundsM = Annotated[
+    list[IntervalM],
+    Field(min_length=3, max_length=3, description="Intervals in x, y and z.", examples=[[[0, 8], [0, 10], [0, 4]]]),
+]
+BandHz = Annotated[
+    list[float],
+    Field(
+        min_length=2, max_length=2, description="Lowest and highest frequency used, in hertz.", examples=[[100, 6000]]
+    ),
+]
+
+
+class HealthState(StrEnum):
+    """Condition of the server.
+
+    `ok`: every enabled array is healthy. `starting`: some have not sent anything yet. `degraded`: `reasons` says why.
+    `failed`: the server stops.
+    """
+
+    OK = "ok"
+    STARTING = "starting"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class PrivacyMode(StrEnum):
+    """Privacy mode: `recording` permits recordings of sound, `positions-only` forbids them."""
+
+    RECORDING = "recording"
+    POSITIONS_ONLY = "positions-only"
+
+
+class Door(StrEnum):
+    """The socket of the nodes, or the HTTP server."""
+
+    NODES = "nodes"
+    HTTP = "http"
+
+
+class _Versioned(BaseModel):
+    v: Version
+
+
+class RoomSize(BaseModel):
+    """The room: a box whose lowest corner is the origin."""
+
+    size_m: PositionM = Field(description="Size in x, y and z, in metres.", examples=[[8.0, 10.0, 4.0]])
+
+
+class SearchGrid(BaseModel):
+    """Grid of the points that are searched."""
+
+    bounds_m: BoundsM
+    spacing_m: float = Field(gt=0, description="Distance between neighbouring grid points in metres.", examples=[0.05])
+    shape: list[int] = Field(
+        min_length=3, max_length=3, description="Number of grid points in x, y and z.", examples=[[160, 200, 80]]
+    )
+
+
+class ActivitySettings(BaseModel):
+    """Settings of the activity detection."""
+
+    threshold: float = Field(gt=0, le=1, description="Threshold relative to the recent maximum.", examples=[0.1])
+    floor_factor: float = Field(ge=1, description="Threshold relative to the noise floor's power.", examples=[4.0])
+
+
+class ArrayGeometry(BaseModel):
+    """Position of an array and of its microphones."""
+
+    position_m: PositionM = Field(description="Mean position of the microphones [x, y, z] in metres.")
+    microphones_m: list[PositionM] = Field(
+        min_length=2, description="Position of each microphone in channel order, in metres."
+    )
+    band_hz: BandHz
+
+
+class ZoneBounds(BaseModel):
+    """A named box of interest."""
+
+    bounds_m: BoundsM
+
+
+class Privacy(BaseModel):
+    """Rules for keeping sound and events."""
+
+    mode: PrivacyMode
+    retention_days: float | None = Field(
+        gt=0, description="Days after which events are deleted; null keeps them for ever.", examples=[30.0]
+    )
+
+
+class Site(_Versioned):
+    """Geometry and settings of the site."""
+
+    site: str = Field(description="Name of the site.", examples=["lab"])
+    version: str = Field(description="Version of livessl that the server runs.", examples=["0.1.0"])
+    mode: Mode
+    room: RoomSize
+    grid: SearchGrid
+    speed_of_sound_m_s: float = Field(gt=0, description="Speed of sound in metres a second.", examples=[343.0])
+    band_hz: BandHz
+    method: str = Field(description="Name of the estimator.", examples=["onset"])
+    frame_s: float = Field(gt=0, description="Length of a frame in seconds.", examples=[0.05])
+    activity: ActivitySettings
+    arrays: dict[str, ArrayGeometry] = Field(description="Arrays by name; a joint array replaces those that it joins.")
+    joint: dict[str, list[str]] = Field(description="Names of the arrays that each joint array joins.", examples=[{}])
+    zones: dict[str, ZoneBounds] = Field(description="Zones by name.")
+    privacy: Privacy
+
+
+class Arrays(_Versioned):
+    """State of every array."""
+
+    now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
+    arrays: list[Array]
+
+
+class Tracks(_Versioned):
+    """The tracks that live now."""
+
+    tracks: list[Track]
+
+
+class EventPage(_Versioned):
+    """A page of events, the latest start first."""
+
+    events: list[Event]
+    next_cursor: str | None = Field(
+        description="Cursor of the next page: pass it unchanged as `cursor` and treat it as opaque. Null at the end.",
+        examples=["1767225600050000000-17"],
+    )
+
+
+class OneEvent(_Versioned, Event):
+    """One event."""
+
+
+class Secured(BaseModel):
+    """Which connections are protected."""
+
+    nodes: bool = Field(description="Whether nodes need an enrolled key and are encrypted.", examples=[True])
+    tokens: bool = Field(description="Whether clients need a token.", examples=[True])
+    tls: bool = Field(description="Whether HTTP is encrypted.", examples=[False])
+
+
+class Refused(BaseModel):
+    """Numbers of peers and requests that were refused since the start."""
+
+    nodes: int = Field(ge=0, description="Refused at the nodes' socket.", examples=[0])
+    http: int = Field(ge=0, description="Refused by the HTTP server.", examples=[0])
+
+
+class HealthStatus(_Versioned):
+    """Health as everyone may read it, without a token."""
+
+    status: HealthState
+
+
+class Health(HealthStatus):
+    """Health of the server and its arrays."""
+
+    version: str = Field(description="Version of livessl that the server runs.", examples=["0.1.0"])
+    mode: Mode
+    uptime_s: float = Field(ge=0, description="Seconds since the server started.", examples=[86400.0])
+    arrays: dict[str, ArrayCondition] = Field(description="State of each array by name.")
+    reasons: list[str] = Field(
+        description="What is wrong or worth knowing, one sentence each.", examples=[["north: its node has ended"]]
+    )
+    privacy: Privacy
+    secured: Secured
+    refused: Refused
+
+
+class KnownClient(BaseModel):
+    """A client that has a token."""
+
+    name: str = Field(description="Name that the token was issued to.", examples=["wall"])
+    role: RoleName
+
+
+class RefusedCaller(BaseModel):
+    """A caller that was refused, and how often for the same reason."""
+
+    door: Door
+    who: str = Field(description="Its address, as far as it is known.", examples=["192.0.2.7"])
+    reason: str = Field(description="Why it was refused.", examples=["its key is not enrolled"])
+    count: int = Field(ge=1, description="How often.", examples=[3])
+    last_utc: UtcTime = Field(description="When it was refused last.")
+
+
+class AccessList(_Versioned):
+    """Clients, nodes and refusals."""
+
+    clients: list[KnownClient] = Field(description="Clients that have a token; empty where the site uses none.")
+    nodes: list[str] = Field(
+        description="Nodes whose keys are enrolled; empty where the site uses none.", examples=[["lab-pc"]]
+    )
+    refused: list[RefusedCaller] = Field(description="Callers that were refused, the latest first.")
+
+
+class Switch(BaseModel):
+    """Request to use an array's sound or to ignore it."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    enabled: bool = Field(description="`false` disables the array, `true` enables it again.", examples=[False])
+
+
+class Switched(_Versioned):
+    """Confirmation that an array was enabled or disabled."""
+
+    name: str = Field(description="Name of the array.", examples=["north"])
+    enabled: bool = Field(description="Whether its sound is used from now on.", examples=[False])
+
+
+class Error(BaseModel):
+    """Body of every error but 422."""
+
+    detail: str = Field(
+        description="What was expected and what was received.", examples=["no array 'west'; there are north, south"]
+    )
+
+
+class ValidationError(BaseModel):
+    """One fault of a request."""
+
+    loc: list[str | int] = Field(description="Where the fault is.", examples=[["query", "min_confidence"]])
+    msg: str = Field(
+        description="What was expected and what was received.", examples=["Input should be less than or equal to 1"]
+    )
+    type: str = Field(description="Kind of the fault.", examples=["less_than_equal", "value_error"])
+    input: Any = Field(default=None, description="The value that was received.")
+    ctx: dict[str, Any] = Field(default={}, description="Limits that the value was checked against.")
+
+
+class HTTPValidationError(BaseModel):
+    """Body of a 422: every fault of the request."""
+
+    detail: list[ValidationError]
+
+
+_REASONS: Final = {
+    400: "The body is not text.",
+    401: "The token is missing or unknown.",
+    403: "The token's role is too low.",
+    404: "There is nothing of that name.",
+    411: "The body's length is not declared.",
+    413: "The body is too long.",
+    422: "A parameter or the body is not valid, or a parameter is unknown.",
+    503: "The event database cannot be written.",
+}
+
+Responses = dict[int | str, dict[str, Any]]
+
+
+def errors(*codes: int, texts: Mapping[int, str] | None = None) -> Responses:
+    """OpenAPI descriptions of error answers by status; `texts` replaces the usual description of some."""
+    return {
+        code: {
+            "model": HTTPValidationError if code == 422 else Error,
+            "description": (texts or {}).get(code, _REASONS[code]),
+        }
+        for code in codes
+    }

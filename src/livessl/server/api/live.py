@@ -1,0 +1,162 @@
+"""The two WebSockets: messages as JSON, and power maps as binary pictures."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Sequence
+from typing import Any, Final
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+
+from livessl.clock import utc_text
+from livessl.server.api import queries
+from livessl.server.api.encode import API_VERSION, JsonObject
+from livessl.server.fanout import Numbered, Subscription
+from livessl.server.maps import FUSED
+from livessl.server.parts import Parts
+
+LIVE: Final = "/api/v1/live"
+MAP: Final = "/api/v1/map"
+
+SEND_TIMEOUT_S: Final = 30.0
+"""A client that accepts no byte for this long, in seconds, is disconnected."""
+
+MAX_REASON: Final = 120
+"""Longest reason of a closing frame, in bytes; RFC 6455 allows 123."""
+
+POLICY_VIOLATION: Final = 1008
+"""Close code of RFC 6455 for a request that the server refuses."""
+
+
+def live_routes(parts: Parts) -> APIRouter:
+    """The WebSocket of messages and the WebSocket of power maps."""
+    site, fanout, router = parts.site, parts.fanout, APIRouter()
+
+    @router.websocket(LIVE)
+    async def live(
+        socket: WebSocket,
+        kinds: str | None = None,
+        min_confidence: str = "0",
+        zone: str | None = None,
+        since_seq: str | None = None,
+    ) -> None:
+        await socket.accept()  # only a connected client can receive a reason
+        try:
+            _refuse_other_pages(socket)
+            queries.check_parameters(socket.query_params, queries.LiveParameters)
+            wanted = queries.live_filter(site, kinds, min_confidence, zone)
+            since = queries.message_number("since_seq", since_seq)
+        except ValueError as error:
+            await _refuse(socket, error)
+            return
+        arrays = await asyncio.to_thread(parts.array_states.describe)
+        subscription = fanout.subscribe(wanted, since)
+        hello = Numbered(_hello(parts, str(socket.scope["client_role"]), arrays))
+        try:
+            await _while_connected(socket, _send_all(socket, subscription, hello, parts))
+        finally:
+            fanout.unsubscribe(subscription)
+
+    @router.websocket(MAP)
+    async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
+        await socket.accept()
+        try:
+            _refuse_other_pages(socket)
+            queries.check_parameters(socket.query_params, queries.MapParameters)
+            chosen = queries.chosen_views(site, array, views)
+        except ValueError as error:
+            await _refuse(socket, error)
+            return
+        news, loop = asyncio.Event(), asyncio.get_running_loop()
+
+        def drawn() -> None:
+            loop.call_soon_threadsafe(news.set)
+
+        with parts.maps.watching(array, chosen, drawn):
+            await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
+
+    return router
+
+
+def _hello(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
+    """Encode the first message of a connection."""
+    return {
+        "v": API_VERSION,
+        "seq": parts.fanout.last_seq,
+        "kind": "hello",
+        "now_utc": utc_text(parts.site_time.now_ns()),
+        "site": parts.site.site,
+        "mode": parts.site_time.mode,
+        "last_seq": parts.fanout.last_seq,
+        "role": role,
+        "arrays": arrays,
+    }
+
+
+def _refuse_other_pages(socket: WebSocket) -> None:
+    """Raise ValueError if a page of another server opened the WebSocket: browsers do not prevent that themselves."""
+    origin = socket.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
+        raise ValueError("origin: expected a page of this server; pages of other servers may not connect")
+
+
+async def _refuse(socket: WebSocket, error: ValueError) -> None:
+    reason = str(error).encode()[:MAX_REASON].decode(errors="ignore")
+    await socket.close(POLICY_VIOLATION, reason)
+
+
+async def _while_connected(socket: WebSocket, work: Coroutine[Any, Any, None]) -> None:
+    """Do the work until it ends or the client disconnects."""
+    tasks = asyncio.create_task(work), asyncio.create_task(_until_gone(socket))
+    try:
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises the exception that ended the task, if there was one
+
+
+async def _send_all(socket: WebSocket, subscription: Subscription, first: Numbered, parts: Parts) -> None:
+    """Send the first message, and then those of the subscription, until the client is gone."""
+    message = first
+    while await _sent(socket.send_text(message.text)):
+        if message.published_ns is not None:
+            parts.latency.delivered(message.message, (parts.clock.monotonic_ns() - message.published_ns) / 1e9)
+        if subscription.lags:  # otherwise the whole queue is sent in one turn, even to a client that has disconnected
+            await asyncio.sleep(0)
+        message = await subscription.next()
+
+
+async def _send_pictures(
+    socket: WebSocket, parts: Parts, array: str, views: tuple[str, ...], news: asyncio.Event
+) -> None:
+    """Send each window's pictures as they are drawn; a slow client skips windows."""
+    shown = None
+    while True:
+        news.clear()
+        drawn = parts.maps.drawn
+        pictures = [] if drawn is None else [drawn.pictures.get((array, view)) for view in views]
+        if drawn is not None and drawn.window is not shown and all(pictures):
+            shown = drawn.window
+            for picture in pictures:
+                if picture is not None and not await _sent(socket.send_bytes(picture.packed(parts.site_time.now_ns()))):
+                    return
+        await news.wait()
+
+
+async def _sent(sending: Coroutine[Any, Any, None]) -> bool:
+    """Await a sending; return whether the client accepted it within `SEND_TIMEOUT_S`."""
+    try:
+        async with asyncio.timeout(SEND_TIMEOUT_S):
+            await sending
+    except (TimeoutError, WebSocketDisconnect, RuntimeError):
+        return False
+    return True
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Read and discard the client's messages, so that its disconnection is noticed."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass

@@ -1,0 +1,188 @@
+"""Query parameters of REST and WebSockets: their meaning, and the answer to one that is wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
+from typing import Final
+
+from fastapi import HTTPException, Request
+from fastapi.routing import APIRoute
+from pydantic import BaseModel, Field
+
+from livessl.clock import utc_ns
+from livessl.server.fanout import Filter
+from livessl.server.maps import FUSED, VIEWS
+from livessl.server.store import Cursor
+from livessl.site.models import Site
+
+KINDS: Final = frozenset({"update", "event", "track", "arrays"})
+"""Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
+
+
+class LiveParameters(BaseModel):
+    """Query parameters of the live WebSocket."""
+
+    kinds: str | None = Field(
+        default=None,
+        description="Message kinds, separated by commas: arrays, event, track, update. All if absent.",
+        examples=["event,track"],
+    )
+    min_confidence: float = Field(
+        default=0.0, ge=0, le=1, description="Events and updates with a lower confidence are not sent.", examples=[0.8]
+    )
+    zone: str | None = Field(
+        default=None, description="Only events, updates and tracks inside this zone are sent.", examples=["door"]
+    )
+    since_seq: int | None = Field(
+        default=None,
+        ge=0,
+        description="`seq` of the last message received: everything published since then is sent first.",
+        examples=[1767225600123],
+    )
+
+
+class MapParameters(BaseModel):
+    """Query parameters of the map WebSocket."""
+
+    array: str = Field(default=FUSED, description="`fused`, or an array's name.", examples=["fused", "north"])
+    views: str = Field(
+        default="floor", description="Views, separated by commas: floor, side, front.", examples=["floor,side"]
+    )
+
+
+async def refuse_unknown_parameters(request: Request) -> None:
+    """Answer 422 to a request with a query parameter that its route does not have.
+
+    Raises
+    ------
+    HTTPException
+        In FastAPI's form of a validation error.
+    """
+    if not request.query_params:
+        return
+    route: APIRoute = request.scope["route"]
+    known = [parameter.alias for parameter in route.dependant.query_params]
+    faults = [
+        {"type": "extra_forbidden", "loc": ["query", name], "msg": unknown_parameter(name, known), "input": value}
+        for name, value in request.query_params.items()
+        if name not in known
+    ]
+    if faults:
+        raise HTTPException(422, faults)
+
+
+def unknown_parameter(name: str, known: Collection[str]) -> str:
+    """Error text for a parameter that is not known, with the closest one that is."""
+    close = get_close_matches(name, known, n=1)
+    if close:
+        cure = f"did you mean {close[0]!r}?"
+    else:
+        cure = f"expected one of {', '.join(known)}" if known else "this request takes no parameters"
+    return f"unknown parameter {name!r}; {cure}"
+
+
+def check_parameters(given: Iterable[str], model: type[BaseModel]) -> None:
+    """Raise ValueError if a WebSocket was opened with a query parameter that its model does not have."""
+    for name in given:
+        if name not in model.model_fields:
+            raise ValueError(unknown_parameter(name, list(model.model_fields)))
+
+
+def unprocessable(name: str, what: str) -> HTTPException:
+    """A 422 in FastAPI's form, for a query parameter whose value is not valid."""
+    return HTTPException(422, [{"type": "value_error", "loc": ["query", name], "msg": what}])
+
+
+def instant(name: str, text: str | None) -> int | None:
+    """Nanoseconds since the epoch of an RFC 3339 text, clipped to 64 bits.
+
+    Raises
+    ------
+    HTTPException
+        422 if the text is no time with an offset.
+    """
+    if text is None:
+        return None
+    text = text.replace(" ", "+")  # an unescaped + in a query arrives as a blank
+    try:
+        time_ns = utc_ns(re.sub(r"(?<=\d)[tz]", lambda letter: letter[0].upper(), text))  # RFC 3339 allows lower case
+    except (ValueError, OverflowError) as error:
+        raise unprocessable(name, f"{name}: {error}") from error
+    return max(-(2**63), min(2**63 - 1, time_ns))
+
+
+def page_cursor(text: str | None) -> Cursor | None:
+    """The place in the list of events that a page's `next_cursor` stands for.
+
+    Raises
+    ------
+    HTTPException
+        422 if no page has such a cursor.
+    """
+    try:
+        return None if text is None else Cursor.parse(text)
+    except ValueError as error:
+        raise unprocessable("cursor", f"cursor: {error}") from error
+
+
+def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
+    """Filter of a live subscriber.
+
+    Raises
+    ------
+    ValueError
+        If a kind or the zone does not exist, or the confidence is out of range.
+    """
+    chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
+    if chosen is not None and not chosen <= KINDS:
+        raise ValueError(f"kinds: expected some of {', '.join(sorted(KINDS))}, got {kinds!r}")
+    try:
+        least = float(min_confidence)
+    except ValueError:
+        least = float("nan")
+    if not 0.0 <= least <= 1.0:
+        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
+    if zone is not None and zone not in site.zones:
+        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+    return Filter(chosen, least, zone)
+
+
+def message_number(name: str, text: str | None) -> int | None:
+    """The `seq` of a message.
+
+    Raises
+    ------
+    ValueError
+        If the text is no decimal number of at most 19 digits.
+    """
+    if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ValueError(f"{name}: expected the seq of a message, got {text!r}")
+    return None if text is None else int(text)
+
+
+def array_names(site: Site) -> list[str]:
+    """Names of the arrays that are processed."""
+    return [spec.name for spec in site.processed]
+
+
+def map_names(site: Site) -> list[str]:
+    """Names of the power maps: `fused`, and one for each array."""
+    return [FUSED, *array_names(site)]
+
+
+def chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:
+    """Views that a watcher of maps has chosen, each once.
+
+    Raises
+    ------
+    ValueError
+        If the array or a view does not exist.
+    """
+    if array not in map_names(site):
+        raise ValueError(f"array: no array {array!r}; there are {', '.join(map_names(site))}")
+    chosen = tuple(dict.fromkeys(view.strip() for view in views.split(",")))
+    if not set(chosen) <= VIEWS.keys():
+        raise ValueError(f"views: expected some of {', '.join(VIEWS)}, got {views!r}")
+    return chosen

@@ -1,0 +1,163 @@
+"""Holds every message and every answer of the servers that tests run against the models of the API.
+
+A plugin of pytest: it watches each application that a `Server` makes. What breaks the contract makes the test that ran
+at that moment fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Final
+
+import orjson
+import pytest
+from fastapi import FastAPI
+from pydantic import TypeAdapter, ValidationError
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Message as Sent
+
+from livessl.server.api.answers import Error, HTTPValidationError
+from livessl.server.api.app import create_app
+from livessl.server.api.auth import Access
+from livessl.server.api.live import LIVE
+from livessl.server.api.schema import Message
+from livessl.server.fanout import Fanout
+from livessl.server.parts import Parts
+
+UNMODELLED: Final = ("/api/v1/openapi.json", "/api/v1/asyncapi.json")
+"""JSON whose form others define."""
+
+
+class Contract:
+    """Counts of checked messages and answers, and the faults found in them."""
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+        self.messages = 0
+        self.answers = 0
+        self.paths: dict[str, Any] = {}
+
+    def take(self) -> list[str]:
+        """The faults since the last call."""
+        faults, self.faults = self.faults, []
+        return faults
+
+    @contextmanager
+    def broken(self) -> Iterator[list[str]]:
+        """Collect the faults of a context in a list instead of failing the test."""
+        before, faults = self.take(), []  # type: tuple[list[str], list[str]]
+        self.faults = faults
+        try:
+            yield faults
+        finally:
+            self.faults = before
+
+    def check(self, model: Any, text: str | bytes, what: str) -> None:
+        """Note a fault unless a JSON text is an instance of a model in strict mode, without further fields."""
+        try:
+            _adapter(model).validate_json(text, strict=True, extra="forbid")
+        except ValidationError as error:
+            self.faults.append(f"{what}: {error}\n{text[:500]!r}")
+
+    def check_message(self, text: str | bytes) -> None:
+        """Check a message of the live WebSocket."""
+        self.messages += 1
+        self.check(Message, text, "message")
+
+    def check_answer(self, scope: Scope, status: int, headers: dict[bytes, bytes], body: bytes) -> None:
+        """Check a REST answer against what its route and the OpenAPI description declare."""
+        path, route = scope["path"], scope.get("route")
+        if not path.startswith("/api/") or path in UNMODELLED:
+            return
+        self.answers += 1
+        what = f"{scope['method']} {path} -> {status}"
+        form = headers.get(b"content-type", b"").decode()
+        model = HTTPValidationError if status == 422 else Error
+        if route is not None and status != 405:
+            method = scope["method"].replace("HEAD", "GET").lower()
+            described = self.paths[route.path][method]["responses"]
+            if str(status) not in described or form not in described[str(status)].get("content", [""]):
+                self.faults.append(f"{what}: status {status} with content {form!r} is not described")
+            model = route.response_model if status == 200 else route.responses.get(status, {}).get("model", model)
+        if form == "application/json" and body:
+            self.check(model, body, what)
+
+    def watch(self, fanout: Fanout) -> None:
+        """Check all that a fan-out publishes, with or without subscribers."""
+        publish = fanout.publish
+
+        def checked(message: dict[str, Any], *rest: Any) -> None:
+            publish(message, *rest)
+            self.check_message(orjson.dumps({"v": 1, "seq": fanout.last_seq, **message}))
+
+        vars(fanout)["publish"] = checked
+
+
+CONTRACT: Final = Contract()
+
+
+@cache
+def _adapter(model: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(model)
+
+
+class Checked:
+    """ASGI middleware that checks what leaves the application."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one connection of the ASGI interface."""
+        started: dict[str, Any] = {}
+        body = bytearray()
+
+        async def checked(message: Sent) -> None:
+            if message["type"] == "websocket.send" and scope["path"] == LIVE:
+                CONTRACT.check_message(message["text"])
+            elif message["type"] == "http.response.start":
+                started.update(message)
+            elif message["type"] == "http.response.body":
+                body.extend(message.get("body", b""))
+                if not message.get("more_body"):
+                    CONTRACT.check_answer(scope, started["status"], dict(started["headers"]), bytes(body))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, checked)
+        except Exception as error:
+            CONTRACT.faults.append(f"{scope['type']} {scope['path']}: {error!r}")
+            raise
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch every application that a server makes from now on."""
+    monkey = pytest.MonkeyPatch()
+    config.add_cleanup(monkey.undo)
+
+    def watched(parts: Parts, access: Access) -> FastAPI:
+        application = create_app(parts, access)
+        application.add_middleware(Checked)
+        if access.wanted or not CONTRACT.paths:  # with tokens, more statuses are described
+            CONTRACT.paths = application.openapi()["paths"]
+        CONTRACT.watch(parts.fanout)
+        return application
+
+    monkey.setattr("livessl.server.app.create_app", watched)
+
+
+@pytest.fixture(autouse=True)
+def _contract_of_the_api() -> Iterator[None]:
+    """The test fails if a message or an answer breaks the contract meanwhile."""
+    yield
+    faults = CONTRACT.take()
+    if faults:
+        pytest.fail("\n".join(faults))
+
+
+@pytest.fixture
+def contract() -> Contract:
+    """The check that runs beside all tests."""
+    return CONTRACT

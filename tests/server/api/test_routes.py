@@ -1,0 +1,311 @@
+"""The REST routes: every promised one, its errors and its headers; metrics and dashboard."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import socket
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from scene_server import CLOCK, get, live, located_scene, replay_scene
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from livessl.clock import utc_ns, utc_text
+from livessl.server.api.app import STATIC
+from livessl.server.app import Server
+from livessl.site.tokens import add_token
+from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
+
+PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}
+ROUTES = {
+    "/api/v1/site",
+    "/api/v1/arrays",
+    "/api/v1/arrays/{name}/enabled",
+    "/api/v1/events",
+    "/api/v1/events/{event_id}",
+    "/api/v1/tracks",
+    "/api/v1/map",
+    "/api/v1/health",
+    "/api/v1/access",
+    "/metrics",
+}
+"""Every promised path but the WebSockets, which OpenAPI cannot describe."""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with located_scene() as server:
+        yield server
+
+
+@pytest.fixture
+def client(server: Server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Iterator[httpx.Client]:
+    """A client of a server that has received nothing."""
+    with running_server(site_of()) as server, httpx.Client(base_url=server.url) as client:
+        yield client
+
+
+def test_openapi_is_complete(client: httpx.Client) -> None:
+    described = client.get("/api/v1/openapi.json").json()
+    assert set(described["paths"]) == ROUTES
+    for path, methods in described["paths"].items():
+        assert set(methods) == {"put" if path.endswith("/enabled") else "get"}
+        assert all(method["description"] for method in methods.values()), path
+    parameters = {p["name"] for p in described["paths"]["/api/v1/events"]["get"]["parameters"]}
+    assert parameters == {"since", "until", "zone", "min_confidence", "limit", "cursor"}
+    assert set(described["paths"]["/api/v1/map"]["get"]["responses"]) >= {"200", "204", "422"}
+
+
+@pytest.mark.parametrize("path", [*sorted(ROUTES), "/", "/static/index.html", "/api/v1/nothing"])
+def test_headers_are_safe(client: httpx.Client, path: str) -> None:
+    response = client.get(path)
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+    policy = response.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy
+    assert "unsafe" not in policy
+    assert response.headers["Cache-Control"] == "no-cache"
+
+
+def test_site(client: httpx.Client) -> None:
+    found = get(client, "site")
+    assert found["site"] == "small"
+    assert found["mode"] == "live"
+    assert found["room"] == {"size_m": [4.0, 5.0, 3.0]}
+    assert found["grid"] == {"bounds_m": [[0, 4], [0, 5], [0, 3]], "spacing_m": 0.25, "shape": [16, 20, 12]}
+    assert found["speed_of_sound_m_s"] == 343.0
+    assert found["method"] == "onset"
+    north = found["arrays"]["north"]
+    assert north["position_m"] == [1.9, 1.3, 1.4]
+    assert np.shape(north["microphones_m"]) == (4, 3)
+    assert north["band_hz"] == [100, 6000]
+    assert found["zones"]["door"] == SMALL["zones"]["door"]
+
+
+def test_arrays(client: httpx.Client) -> None:
+    found = get(client, "arrays")
+    assert abs(utc_ns(found["now_utc"]) - CLOCK.now_ns()) < 5e9
+    assert [array["name"] for array in found["arrays"]] == ["north", "south"]
+    for array in found["arrays"]:
+        assert array["state"] == "lost"
+        assert array["reason"] == "its node has ended"
+        assert array["node"] == "lab-pc"
+        assert array["age_s"] >= 0
+        assert len(array["channel_levels_dbfs"]) == 4
+        assert array["level_dbfs"] < -40
+        # four times the noise's power, the default factor; both levels are rounded to 0.1 dB
+        assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 6.02, abs=0.1)
+        assert array["sample_rate_hz"] == 16000.0
+        assert array["drift_ppm"] == 0.0
+        assert array["counters"]["frames"] > 10
+        assert array["counters"]["marks"] > 0
+        assert set(array["counters"]) >= {"late", "rejected", "lost_frames", "overflows", "duplicates", "sequence_gaps"}
+
+
+def test_activity_threshold_follows_the_site_file() -> None:
+    with (
+        running_server(site_of({"activity.floor_factor": 100.0})) as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        replay_scene(server)
+        for array in get(client, "arrays")["arrays"]:
+            assert array["activity_threshold_dbfs"] == pytest.approx(array["noise_floor_dbfs"] + 20.0, abs=0.1)
+
+
+def test_arrays_before_their_first_message(fresh: httpx.Client) -> None:
+    for array in get(fresh, "arrays")["arrays"]:
+        assert (array["state"], array["reason"], array["age_s"]) == ("starting", "no message yet", None)
+
+
+def test_events_are_where_the_sounds_were(client: httpx.Client) -> None:
+    newest, oldest = get(client, "events")["events"]
+    for event, source in zip((oldest, newest), scene().sources, strict=True):
+        assert event["status"] == "located"
+        # half the diagonal of a cell of 0.25 m
+        assert math.dist(event["position_m"], source.position_m) < 0.25 * math.sqrt(3) / 2
+        assert event["arrays"] == ["north", "south"]
+        assert event["zones"] == ["room"]
+    between_s = scene().sources[1].start_s - scene().sources[0].start_s
+    assert newest["start_s"] - oldest["start_s"] == pytest.approx(between_s, abs=0.1)  # a frame at either start
+
+
+def test_event_by_its_id(client: httpx.Client) -> None:
+    event = get(client, "events")["events"][0]
+    assert get(client, f"events/{event['id']}") == {"v": 1, **event}
+    assert get(client, "events/small-0", 404)["detail"] == "no event 'small-0'"
+
+
+def test_events_page_by_page(client: httpx.Client) -> None:
+    newest, oldest = get(client, "events")["events"]
+    first = get(client, "events", limit=1)
+    assert first["events"] == [newest]
+    second = get(client, "events", limit=1, cursor=first["next_cursor"])
+    assert second["events"] == [oldest]
+    assert second["next_cursor"] is None
+
+
+def test_events_of_a_time(client: httpx.Client) -> None:
+    newest, oldest = get(client, "events")["events"]
+    at = newest["time_utc"]
+    before = utc_text(utc_ns(at) - 1000)
+    assert get(client, "events", since=at)["events"] == [newest]
+    assert get(client, "events", until=before)["events"] == [oldest]
+    assert get(client, "events", since=before, until=before)["events"] == []
+    local = at.replace("Z", "+00:00")
+    assert client.get(f"/api/v1/events?since={local}").json()["events"] == [newest]  # the plus sign not escaped
+    assert get(client, "events", since="0001-01-01T00:00:00Z", until="9999-12-31T00:00:00Z")["events"] == [
+        newest,
+        oldest,
+    ]
+
+
+def test_events_of_a_zone_and_confidence(client: httpx.Client) -> None:
+    assert len(get(client, "events", zone="room")["events"]) == 2
+    assert get(client, "events", zone="door")["events"] == []
+    assert len(get(client, "events", min_confidence=0)["events"]) == 2
+    assert get(client, "events", min_confidence=1)["events"] == []
+
+
+@pytest.mark.parametrize(
+    ("query", "status", "detail"),
+    [
+        ({"zone": "hall"}, 404, "no zone 'hall'; zones are door, room"),
+        ({"since": "yesterday"}, 422, "since: time: expected RFC 3339 .* got 'yesterday'"),
+        ({"until": "2026-01-01T00:00:00"}, 422, "until: time: expected RFC 3339"),
+        ({"min_confidence": 1.5}, 422, "less than or equal to 1"),
+        ({"min_confidence": "nan"}, 422, "min_confidence"),
+        ({"limit": 0}, 422, "greater than or equal to 1"),
+        ({"limit": 1001}, 422, "less than or equal to 1000"),
+        ({"limit": "many"}, 422, "valid integer"),
+        ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of the page before, got 'rubbish'"),
+        ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of the page before"),
+    ],
+)
+def test_wrong_query_is_refused(client: httpx.Client, query: dict[str, Any], status: int, detail: str) -> None:
+    assert re.search(detail, json.dumps(get(client, "events", status, **query), ensure_ascii=False))
+
+
+def test_tracks(client: httpx.Client, fresh: httpx.Client) -> None:
+    assert get(fresh, "tracks") == {"v": 1, "tracks": []}
+    for track in get(client, "tracks")["tracks"]:
+        assert track["kind"] == "track"
+
+
+def test_health(client: httpx.Client, fresh: httpx.Client) -> None:
+    starting = get(fresh, "health")
+    assert starting["status"] == "starting"
+    assert starting["arrays"] == {"north": "starting", "south": "starting"}
+    ended = get(client, "health")
+    assert ended["status"] == "degraded"
+    assert ended["mode"] == "live"
+    assert ended["uptime_s"] > 0
+    assert ended["reasons"] == ["north: its node has ended", "south: its node has ended"]
+
+
+def test_events_are_published_while_the_database_is_locked(tmp_path: Path) -> None:
+    """Health and metrics report that the history of these events is lost."""
+    path = tmp_path / "events.db"
+    with running_server(site_of({"server.events_db": str(path)})) as server, closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with live(server, "?kinds=event") as socket:
+            replay_scene(server)
+            kinds = [json.loads(socket.recv(timeout=HANG_S))["kind"] for _ in range(3)]
+        other.rollback()
+        assert kinds == ["hello", "event", "event"]
+        with httpx.Client(base_url=server.url) as client:
+            assert get(client, "events")["events"] == []
+            assert "\nlivessl_events_unkept_total 2.0\n" in client.get("/metrics").text
+            lost = "server.events_db: 2 events were not kept; free space or release the file"
+            assert lost in get(client, "health")["reasons"]
+            replay_scene(server)
+            wait_until(lambda: len(get(client, "events")["events"]) == 2, "both events, now that the file is free")
+
+
+def test_metrics(client: httpx.Client) -> None:
+    response = client.get("/metrics")
+    assert response.headers["Content-Type"].startswith("text/plain; version=0.0.4")
+    families = {family.name: family for family in text_string_to_metric_families(response.text)}
+    for family in families.values():
+        assert family.documentation
+
+    def value(name: str, **labels: str) -> float:
+        samples = [s for family in families.values() for s in family.samples if s.name == name]
+        [found] = [s.value for s in samples if s.labels == labels]
+        return float(found)
+
+    assert value("livessl_events_total") == 2
+    assert value("livessl_events_stored") == 2
+    assert value("livessl_events_unkept_total") == 0
+    assert value("livessl_sink_failures_total") == 0
+    assert value("livessl_messages_refused_total") == 0
+    assert value("livessl_uptime_seconds") > 0
+    for stage in ("sent", "received", "located"):
+        assert value("livessl_latency_seconds_count", kind="event", stage=stage) == 2
+        assert value("livessl_latency_seconds_count", kind="update", stage=stage) > 2
+    assert value("livessl_latency_seconds_count", kind="event", stage="delivered") == 0  # there was no subscriber
+    for array in ("north", "south"):
+        assert value("livessl_array_up", array=array) == 0
+        assert value("livessl_array_age_seconds", array=array) >= 0
+        assert value("livessl_array_level_dbfs", array=array) < 0
+        assert value("livessl_array_total", array=array, what="frames") > 10
+
+
+def test_dashboard_and_its_files_are_served(client: httpx.Client) -> None:
+    page = client.get("/")
+    assert page.status_code == 200
+    assert page.headers["Content-Type"].startswith("text/html")
+    loaded = re.findall(r'(?:src|href)="(/?static/[^"]+)"', page.text)
+    assert loaded
+    for path in loaded:
+        assert client.get(f"/{path.removeprefix('/')}").status_code == 200, path
+    for file in STATIC.iterdir():
+        response = client.get(f"/static/{file.name}")
+        assert response.status_code == 200
+        assert response.content == file.read_bytes()
+    assert "http://" not in re.sub(r"http://www\.w3\.org/\S*", "", page.text)
+    assert "https://" not in page.text
+
+
+@pytest.mark.parametrize(
+    "path", ["/static/nothing.js", "/static/../app.py", "/static/%2e%2e/app.py", "/api/v1/", "/api/v2/site"]
+)
+def test_other_paths_are_404(client: httpx.Client, path: str) -> None:
+    assert client.get(path).status_code == 404
+
+
+def test_other_methods_are_405(client: httpx.Client) -> None:
+    assert client.post("/api/v1/events", json={}).status_code == 405
+    assert client.delete("/api/v1/events/x").status_code == 405
+
+
+def test_requests_to_another_host_name_are_refused(server: Server, client: httpx.Client) -> None:
+    """DNS rebinding: a page's own host name points to the server, so that the browser lets the page read answers."""
+    port = server.url.rpartition(":")[2]
+    for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", ""):
+        assert client.get("/api/v1/site", headers={"Host": host}).status_code == 400, host
+    for host in (f"127.0.0.1:{port}", f"localhost:{port}", "LocalHost", f"[::1]:{port}", "[::1]"):
+        assert client.get("/api/v1/site", headers={"Host": host}).status_code == 200, host
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://evil.example:{port}/api/v1/live", sock=socket.create_connection(("127.0.0.1", int(port))))
+
+
+def test_server_with_tokens_answers_to_any_host_name(tmp_path: Path) -> None:
+    add_token(tmp_path / "tokens.yaml", "wall", "viewer")
+    with running_server(site_of({"server.http": PUBLIC}, tmp_path)) as server:
+        url = server.url.replace("0.0.0.0", "127.0.0.1")
+        assert httpx.get(f"{url}/api/v1/health", headers={"Host": "lab-pc.local:8000"}).status_code == 200
