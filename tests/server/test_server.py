@@ -137,7 +137,12 @@ def test_running_replay_has_maps_tracks_and_its_own_time() -> None:
         url = f"{server.url}/api/v1"
         wait_until(lambda: httpx.get(f"{url}/map").status_code == 200, "a map")
         tracks: list[dict[str, Any]] = []
-        wait_until(lambda: tracks.extend(httpx.get(f"{url}/tracks").json()["tracks"]) or tracks, "a track")
+
+        def tracked() -> bool:
+            tracks[:] = httpx.get(f"{url}/tracks").json()["tracks"]
+            return bool(tracks)
+
+        wait_until(tracked, "a track")
         picture, numbers = httpx.get(f"{url}/map"), httpx.get(f"{url}/map?format=float32&array=north&view=volume")
         site, arrays = httpx.get(f"{url}/site").json(), httpx.get(f"{url}/arrays").json()
         playing.join()
