@@ -152,7 +152,7 @@ class ArrayStates:
             **status.counters,
             "duplicates": self._ingest.duplicates[name] + fusion.duplicates.get(name, 0),
             "sequence_gaps": self._ingest.sequence_gaps[name],
-            "backfilled": fusion.backfilled.get(name, 0),
+            "backfilled": fusion.backlog_frames.get(name, 0),
             "asked": fusion.asked.get(name, 0),
             "helped": fusion.helped.get(name, 0),
             "too_late": fusion.too_late.get(name, 0),

@@ -1,4 +1,4 @@
-"""Array health: what is wrong with an array, in words, and the figures that people look at. It reads no clock."""
+"""Array health: the state of an array, the reason for it, and the figures that people look at. It reads no clock."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ know of a loss within 2 s."""
 TROUBLE_NS: Final = 10_000_000_000
 """Time, in nanoseconds, for which a fault keeps an array degraded after it was last seen."""
 
-SILENT_NS: Final = 1_000_000_000
+DEAD_CHANNEL_NS: Final = 1_000_000_000
 """Time, in nanoseconds, after which a channel of all-zero samples is a dead microphone; every live one has noise."""
 
 WEAK_FRAMES: Final = 4
-"""One active frame in this many is examined for channels without sound. They are reported after a second."""
+"""Channels are checked for missing sound in one active frame out of this many; a fault is reported after a second."""
 
 _ZERO_STRIDE: Final = 64
-"""One sample in this many is enough to see that a live channel is not all zeros; only the others are examined whole."""
+"""One sample in this many shows that a live channel is not all zeros; channels that look silent are then examined
+completely."""
 
 
 class ArrayState(StrEnum):
@@ -87,7 +88,7 @@ class ArrayHealth:
         self.fault_ns, self.fault = now_ns, fault
 
     def reject(self, now_ns: int, fault: str) -> None:
-        """Count a message that is not used, and note why."""
+        """Count a message that is not used, and note the reason."""
         self.counters["rejected"] += 1
         self.note(now_ns, fault)
 
@@ -95,6 +96,10 @@ class ArrayHealth:
         """Note that frames are late, and count those of them that have come."""
         self.counters["late"] += frames
         self.note(now_ns, "its frames come after their deadline")
+
+    def count_frame(self) -> None:
+        """Count a frame that is used."""
+        self.counters["frames"] += 1
 
     def take_frame(self, frame: Frame, now_ns: int) -> None:
         """Take in the newest frame."""
@@ -110,7 +115,7 @@ class ArrayHealth:
             if mark.overflows > self.mark.overflows:
                 self.note(now_ns, "its device loses samples; use larger blocks or a less busy machine")
             elif mark.lost_frames > self.mark.lost_frames:
-                self.note(now_ns, "frames were torn by a gap in the sound")
+                self.note(now_ns, "the device skipped samples; frames at the gap were dropped")
         if mark.clock is ClockState.STEPPED:
             self.note(now_ns, "its clock has stepped")
         self.counters["overflows"], self.counters["lost_frames"] = mark.overflows, mark.lost_frames
@@ -142,10 +147,10 @@ class ArrayHealth:
         return (ArrayState.HEALTHY, None) if reason is None else (ArrayState.DEGRADED, reason)
 
     def _channel_fault(self, now_ns: int) -> str | None:
-        if self.dead and now_ns - self.dead_since_ns >= SILENT_NS:
+        if self.dead and now_ns - self.dead_since_ns >= DEAD_CHANNEL_NS:
             which = "all channels are" if len(self.dead) == self.microphones else f"microphone {list(self.dead)} is"
             return f"{which} dead: all-zero samples; check cable, gain and channel numbers"
-        if self.weak and now_ns - self.weak_since_ns >= SILENT_NS:
+        if self.weak and now_ns - self.weak_since_ns >= DEAD_CHANNEL_NS:
             which = f"microphone {list(self.weak)} receives next to nothing of what the others receive, and is excluded"
             return f"{which}; check cable, gain and channel numbers"
         return None
