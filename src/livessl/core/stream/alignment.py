@@ -8,10 +8,11 @@ uses it. An array is awaited while it sends, keeps up, and is not excluded.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from livessl.core.stream.array_health import LOST_NS, ArrayHealth, ArrayStatus
+from livessl.core.stream.array_health import ArrayHealth, ArrayStatus, NodeReport, is_connected
 from livessl.core.stream.array_stream import ArrayStream
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, Frame, Message
@@ -25,6 +26,16 @@ LATEST_NS: Final = 500_000_000
 
 JUMP_FRAMES: Final = 1200
 """Gap, in frames, that is skipped instead of being closed one frame index after the other: a minute."""
+
+
+def is_ahead_of_clock(frame_index: int, now_ns: int) -> bool:
+    """Return whether a joint frame index lies in the future of the server's clock, by more than clocks may differ."""
+    return frame_index * FRAME_NS - now_ns > LATEST_NS
+
+
+def is_too_old(frame_index: int, now_ns: int) -> bool:
+    """Return whether a joint frame index lies so far in the past that only backlog may have it."""
+    return frame_index * FRAME_NS - now_ns < EARLIEST_NS
 
 
 class Alignment:
@@ -83,10 +94,10 @@ class Alignment:
     def accept(self, message: Message) -> bool:
         """Take in a message on the joint frame index; return whether it is an active frame that came too late."""
         stream, now_ns, is_late = self.streams[message.array], self.now_ns, False
-        ahead_ns = message.frame_index * FRAME_NS - now_ns
-        if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
-            side = "ahead of" if ahead_ns > 0 else "behind"
-            fault = f"its clock is {abs(ahead_ns) / 1e9:.1f} s {side} the server's; set both by NTP"
+        is_ahead = is_ahead_of_clock(message.frame_index, now_ns)
+        if is_ahead or is_too_old(message.frame_index, now_ns):
+            off_s = abs(message.frame_index * FRAME_NS - now_ns) / 1e9
+            fault = f"its clock is {off_s:.1f} s {'ahead of' if is_ahead else 'behind'} the server's; set both by NTP"
             stream.health.reject(now_ns, fault)
             return False
         if isinstance(message, Frame):
@@ -184,18 +195,18 @@ class Alignment:
         return True
 
     def _is_awaited(self, stream: ArrayStream, frame_index: int) -> bool:
-        if stream.complete_until is None or stream.last_message_ns is None or stream.has_left:
+        if stream.complete_until is None or stream.has_left:
             return False
         if self._state.is_excluded(stream.spec.name) or stream.complete_until >= frame_index:
             return False
-        return stream.keeps_up and self.now_ns - stream.last_message_ns < LOST_NS
+        return stream.keeps_up and is_connected(stream.last_message_ns, self.now_ns)
 
     # --- clocks
 
     def is_set_back(self, now_ns: int) -> bool:
         """Return whether the server's clock was set back, so that frame indices that were closed lie in its future."""
         closed = self.closed
-        return closed is not None and closed * FRAME_NS - now_ns > LATEST_NS
+        return closed is not None and is_ahead_of_clock(closed, now_ns)
 
     def start_over(self) -> None:
         """Discard all frames and begin anew: after the server's clock was set back, new frames would be late."""
@@ -226,10 +237,16 @@ class Alignment:
         if array in self.streams:
             self.streams[array].leave()
 
-    def status(self, now_ns: int, *, levels: bool) -> list[ArrayStatus]:
+    def status(self, now_ns: int, nodes: Mapping[str, NodeReport], *, levels: bool) -> list[ArrayStatus]:
         """Return the status of every array; without `levels` it has no channel powers. Any thread may call it."""
         clocks, votes = self._state.clock_offsets, self._state.votes
         return [
-            stream.status(now_ns, votes.of(name), None if clocks is None else clocks.of(name), levels=levels)
+            stream.status(
+                now_ns,
+                votes.of(name),
+                None if clocks is None else clocks.of(name),
+                nodes.get(name, NodeReport()),
+                levels=levels,
+            )
             for name, stream in self.streams.items()
         ]

@@ -1,4 +1,7 @@
-"""Array health: the state of an array, the reason for it, and the figures that people look at. It reads no clock."""
+"""Array health: the state of an array, the reason for it, and the figures that people look at. It reads no clock.
+
+`ArrayHealth.state` is the only place where the state is decided.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import dead_channels
-from livessl.core.stream.clock_offsets import ClockOffset
+from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off
 from livessl.core.stream.outlier_votes import Votes, is_suspect
-from livessl.core.types import ClockState, Float32Array, Frame, Mark
+from livessl.core.types import FRAME_S, ClockState, Float32Array, Frame, Mark
 
 LOST_NS: Final = 1_500_000_000
 """Time, in nanoseconds, without a message after which an array is lost. Messages come every 50 ms, and clients are to
@@ -40,6 +43,26 @@ class ArrayState(StrEnum):
     QUIET = "quiet"
     DEGRADED = "degraded"
     LOST = "lost"
+    DISABLED = "disabled"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeReport:
+    """What else is known of an array: by its node's messages that are not sound, and by the operator.
+
+    Parameters
+    ----------
+    problem : str or None
+        Fault of its device that the node reports.
+    is_live : bool
+        Whether the node has sent anything lately, with or without sound.
+    is_disabled : bool
+        Whether an operator has disabled the array.
+    """
+
+    problem: str | None = None
+    is_live: bool = False
+    is_disabled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +146,46 @@ class ArrayHealth:
             self.mark, self.power, self.active = mark, mark.power, False
             self._find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
-    def state(self, age_ns: int | None, now_ns: int, votes: Votes, *, has_left: bool) -> tuple[ArrayState, str | None]:
-        """Return the array's state and the reason for it.
+    def state(
+        self,
+        now_ns: int,
+        *,
+        age_ns: int | None,
+        has_left: bool,
+        votes: Votes,
+        clock_offset: ClockOffset | None,
+        node: NodeReport,
+    ) -> tuple[ArrayState, str | None]:
+        """Decide the array's state; return it and the reason for it.
 
         Parameters
         ----------
+        now_ns : int
         age_ns : int or None
             Time since its last message; None before the first.
-        now_ns : int
-        votes : Votes
         has_left : bool
             Whether its node has ended on purpose.
+        votes : Votes
+        clock_offset : ClockOffset or None
+            Offset of its node's clock, if it is known.
+        node : NodeReport
         """
+        state, reason = self._state_by_messages(now_ns, age_ns, votes, has_left=has_left)
+        if state is ArrayState.HEALTHY and clock_offset is not None and abs(clock_offset.offset_s) > FRAME_S:
+            state, reason = ArrayState.DEGRADED, clock_is_off(clock_offset)
+        if node.problem is not None:
+            state, reason = ArrayState.DEGRADED if state is ArrayState.HEALTHY else state, node.problem
+        if state is ArrayState.LOST and node.is_live:
+            state, reason = ArrayState.QUIET, node.problem or "its node is there, but no sound comes from its device"
+        if node.is_disabled:
+            otherwise = f"{state}: {reason}" if reason else state
+            reason = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
+            state = ArrayState.DISABLED
+        return state, reason
+
+    def _state_by_messages(
+        self, now_ns: int, age_ns: int | None, votes: Votes, *, has_left: bool
+    ) -> tuple[ArrayState, str | None]:
         troubled = self.fault_ns is not None and now_ns - self.fault_ns < TROUBLE_NS
         if age_ns is None:
             return (ArrayState.DEGRADED, self.fault) if troubled else (ArrayState.STARTING, "no message yet")
@@ -166,6 +217,11 @@ class ArrayHealth:
         if weak and not self.weak:
             self.weak_since_ns = now_ns
         self.weak = weak
+
+
+def is_connected(last_message_ns: int | None, now_ns: int) -> bool:
+    """Return whether the last message came less than `LOST_NS` ago."""
+    return last_message_ns is not None and now_ns - last_message_ns < LOST_NS
 
 
 def _disagreement(votes: Votes) -> str | None:

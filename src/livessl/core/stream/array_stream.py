@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from livessl.core.correlate.band import band_power
-from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
-from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off
+from livessl.core.stream.array_health import LOST_NS, ArrayHealth, ArrayStatus, NodeReport
+from livessl.core.stream.clock_offsets import ClockOffset
 from livessl.core.stream.correlation_cache import Correlations
 from livessl.core.stream.outlier_votes import Votes
-from livessl.core.types import FRAME_S, ArraySpec, Frame
+from livessl.core.types import ArraySpec, Frame
 
 
 @dataclass(slots=True)
@@ -125,18 +125,21 @@ class ArrayStream:
         while onsets and (first := next(iter(onsets))) < oldest:
             del onsets[first]
 
-    def status(self, now_ns: int, votes: Votes, offset: ClockOffset | None, *, levels: bool) -> ArrayStatus:
+    def status(
+        self, now_ns: int, votes: Votes, offset: ClockOffset | None, node: NodeReport, *, levels: bool
+    ) -> ArrayStatus:
         """Return the array's status; without `levels` it has no channel powers. Any thread may call it."""
         health, mark = self.health, self.health.mark
         age_ns = None if self.last_message_ns is None else max(0, now_ns - self.last_message_ns)
-        state, reason = health.state(age_ns, now_ns, votes, has_left=self.has_left)
-        if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
-            state, reason = ArrayState.DEGRADED, clock_is_off(offset)
+        is_lost = age_ns is not None and (self.has_left or age_ns >= LOST_NS)
+        state, reason = health.state(
+            now_ns, age_ns=age_ns, has_left=self.has_left, votes=votes, clock_offset=offset, node=node
+        )
         return ArrayStatus(
             name=self.spec.name,
             state=state,
             reason=reason,
-            active=health.active and state is not ArrayState.LOST,
+            active=health.active and not is_lost,
             age_s=None if age_ns is None else age_ns / 1e9,
             power=health.power,
             noise_power=mark.noise_power if mark else None,

@@ -7,14 +7,14 @@ nothing is late both keep in step, and only the final pass reports events. It re
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Final
 
 from livessl.core.locate.estimator import PowerMaps
-from livessl.core.stream.alignment import EARLIEST_NS, LATEST_NS
-from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.stream.alignment import is_ahead_of_clock, is_too_old
+from livessl.core.stream.array_health import ArrayStatus, NodeReport
 from livessl.core.stream.fusion import Fusion, Role
 from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
 from livessl.core.stream.reception import FinalReception, earlier, later
@@ -109,9 +109,11 @@ class TwoPassFusion:
         """Return the estimator's maps of a window that it located. Any thread may call it."""
         return self._early.power_maps(window, separately)
 
-    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+    def status(
+        self, now_ns: int, nodes: Mapping[str, NodeReport] | None = None, *, levels: bool = True
+    ) -> list[ArrayStatus]:
         """Return the status of every array: see `Fusion.status`."""
-        return self._early.status(now_ns, levels=levels)
+        return self._early.status(now_ns, nodes, levels=levels)
 
     def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int, *, answers: bool = False) -> None:
         """Take in the greeting of an array's node.
@@ -145,7 +147,7 @@ class TwoPassFusion:
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output | FinalResults]:
         """Take in messages, in any order between arrays; return what there is to report."""
         settled = self.settled
-        if settled is not None and settled * FRAME_NS - now_ns > LATEST_NS:
+        if settled is not None and is_ahead_of_clock(settled, now_ns):
             self._begin(None)  # the server's clock was set back: final results lie in the future now
             self._early.skip_events(None, None)
         live: list[Message] = []
@@ -196,8 +198,7 @@ class TwoPassFusion:
             return True
         own = message.frame_index
         frame_index, is_backlog = own - self._ahead(message.array), reception.is_backlog(own)
-        ahead_ns = frame_index * FRAME_NS - now_ns
-        if ahead_ns > LATEST_NS or (ahead_ns < EARLIEST_NS and not is_backlog):
+        if is_ahead_of_clock(frame_index, now_ns) or (not is_backlog and is_too_old(frame_index, now_ns)):
             return True  # the early pass rejects it, and notes why
         reception.touch(now_ns)
         self._newest = frame_index if self._newest is None else max(self._newest, frame_index)
@@ -214,7 +215,7 @@ class TwoPassFusion:
         self._held.push(message, frame_index, now_ns)
         self.backlog_frames[message.array] += is_backlog
         closed = self._early.closed
-        is_in_time = not is_backlog or -ahead_ns < self._state.parameters.deadline_s * 1e9
+        is_in_time = not is_backlog or now_ns - frame_index * FRAME_NS < self._state.parameters.deadline_s * 1e9
         if message.active and (not is_in_time or (closed is not None and frame_index <= closed)):
             self._late.add(frame_index)
         return is_in_time

@@ -7,12 +7,12 @@ locates and judges these, `EventReporter` decides when an event is reported, and
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from livessl.core.locate.estimator import PowerMaps
 from livessl.core.stream.alignment import Alignment
-from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.stream.array_health import ArrayStatus, NodeReport
 from livessl.core.stream.event_reporter import EventReporter
 from livessl.core.stream.evidence import RELEASE_FRAMES, EvidenceCollector
 from livessl.core.stream.pending_event import EventState, PendingEvent
@@ -167,12 +167,20 @@ class Fusion:
         stream = self._alignment.streams.get(array)
         return 0 if stream is None else stream.frames_ahead
 
-    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+    def status(
+        self, now_ns: int, nodes: Mapping[str, NodeReport] | None = None, *, levels: bool = True
+    ) -> list[ArrayStatus]:
         """Return the status of every array. Any thread may call it.
 
-        Without `levels` it has no channel powers, which cost a transform for each array.
+        Parameters
+        ----------
+        now_ns : int
+        nodes : mapping of array to NodeReport, optional
+            What a server knows of the arrays besides their messages.
+        levels : bool
+            Whether it has channel powers, which cost a transform for each array.
         """
-        return self._alignment.status(now_ns, levels=levels)
+        return self._alignment.status(now_ns, nodes or {}, levels=levels)
 
     def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
         """Return the estimator's maps of a window that it located. Any thread may call it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from livessl.core.stream.array_health import LOST_NS
+from livessl.core.stream.array_health import is_connected
 
 
 @dataclass(slots=True)
@@ -30,7 +30,7 @@ class FinalReception:
 
     def is_connected(self, now_ns: int) -> bool:
         """Return whether its node has sent anything in the last `LOST_NS`."""
-        return self.last_message_ns is not None and now_ns - self.last_message_ns < LOST_NS
+        return is_connected(self.last_message_ns, now_ns)
 
     def is_backlog(self, frame_index: int) -> bool:
         """Return whether a frame belongs to the backlog, which the node kept from before its connection."""
