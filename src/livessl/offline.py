@@ -172,7 +172,9 @@ def run(
     fusion = make_fusion(site, method, updates=False)
     pipelines, inputs = make_pipelines(site, recordings)
     if backfill:
-        fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
+        for pipeline in pipelines:
+            for array in pipeline.arrays:
+                fusion.set_answers(array, True)
     now_ns = 0
     for now_ns, batch in paced_messages(pipelines, inputs, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
