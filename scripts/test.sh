@@ -2,7 +2,8 @@
 # Installs livessl with everything that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
 set -eu
 cd "$(dirname "$0")/.."
-packages="chromium nginx-light libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl nodejs npm"
+packages="chromium nginx-light libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl"
+command -v npm >/dev/null || packages="$packages nodejs npm" # where it is not from elsewhere already
 
 missing=
 for package in $packages; do
