@@ -392,7 +392,7 @@ def test_one_faulty_array_causes_no_other_faults() -> None:
         ("site: 2026-02-31\n", "site.yaml", "not valid YAML"),
         ("site: !!bool perhaps\n", "site.yaml", "not valid YAML"),
         ("site: !!python/object:os.system {}\n", "site.yaml:1", "not valid YAML"),
-        ("site: &a [*a]\n", "site.yaml", "it holds itself"),
+        ("site: &a [*a]\n", "site.yaml", "an alias contains itself"),
         ("[" * 2000, "site.yaml", "not valid YAML"),
     ],
     ids=lambda value: str(value)[:20],

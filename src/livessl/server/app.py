@@ -36,7 +36,7 @@ from livessl.site.models import Site
 from livessl.site.tokens import file_stamp, read_tokens
 
 SWITCH_S: Final = 0.0005
-"""Longest time, in seconds, that a thread keeps the interpreter while another one waits for it. The fusion thread
+"""Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
 releases it thousands of times a second; by Python's default it would wait 5 ms each time to get it back."""
 
 NOTICE_S: Final = 2.0
@@ -77,7 +77,7 @@ def assemble(
     Raises
     ------
     BindError, ConfigError
-        As `Receiver` does.
+        See `Receiver`.
     """
     with ExitStack() as undo:
         if receiver is None:
@@ -159,7 +159,9 @@ class Server:
         self._stepped = stepped
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        first_seq = clock.now_ns() // 1_000_000  # fewer than a message a millisecond, so no number comes twice
+        # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
+        # per millisecond
+        first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)

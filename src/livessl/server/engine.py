@@ -128,7 +128,7 @@ class Engine:
         self._maps.clear()
 
     def _switch(self, run: Run) -> None:
-        """Begin another run; nodes must not forget frames because the run before it had made them final."""
+        """Begin another run, and replace the acknowledged final indices: those of the previous run do not apply."""
         self._begin(run)
         self._receiver.ingest.final_until = run.fusion.settled_of
 

@@ -3,8 +3,8 @@
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
 pair can add at any point of the cell; the sum of these maxima bounds the cell, and a cell whose bound is below the best
 power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
-Usually some two thousand of millions of points are visited. The size of a cell in metres is fixed, so memory does not
-grow with a finer grid.
+Usually about 2000 points out of millions are visited. The size of a cell in metres is fixed, so memory does not grow
+with a finer grid.
 """
 
 from __future__ import annotations
