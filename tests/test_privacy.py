@@ -14,7 +14,7 @@ from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.errors import ConfigError
-from livessl.server import app
+from livessl.server import retention
 from livessl.server.store import Query, Store
 from messages import event_message
 from small_site import running_server, scene_recordings, site_of, wait_until, write_site
@@ -108,7 +108,7 @@ def test_database_file_holds_no_trace_of_deleted_events(tmp_path: Path) -> None:
 
 
 def test_running_server_deletes_old_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(app, "EXPIRE_S", 0.05)
+    monkeypatch.setattr(retention, "EXPIRE_S", 0.05)
     path = tmp_path / "events.db"
     site = site_of({"store": {"retention_days": 2.0}, "server.events_db": str(path)})
     now_ns = CLOCK.now_ns()

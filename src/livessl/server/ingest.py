@@ -91,14 +91,23 @@ class Ingest:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
-        self.final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
-        """Frame index, by each array's own clock, before which all events are final: nodes may forget those frames."""
+        self._final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
         """Malformed messages since the start."""
         names = [spec.name for spec in site.processed]
         self.duplicates = dict.fromkeys(names, 0)
         self.sequence_gaps = dict.fromkeys(names, 0)
+
+    def note_final(self, until: Mapping[str, int]) -> None:
+        """Acknowledge from now on that nodes may delete the frames before these.
+
+        Parameters
+        ----------
+        until : mapping of array to int
+            Frame index, by the array's own clock, before which all events are final.
+        """
+        self._final_until = until
 
     def problem_of(self, array: str) -> str | None:
         """Return what an array's node reports to be wrong with its device, None if nothing is."""
@@ -235,7 +244,7 @@ class Ingest:
         return Received(greeted=hello if news else None, reply=reply, offer=offer)
 
     def _ack(self, peer: Peer) -> wire.Ack:
-        final = [self.final_until[array] for array in peer.hello.arrays if array in self.final_until]
+        final = [self._final_until[array] for array in peer.hello.arrays if array in self._final_until]
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
     def _key_fault(self, hello: wire.Hello, enrolled: str | None) -> str | None:

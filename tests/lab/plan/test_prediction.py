@@ -408,7 +408,7 @@ def test_no_move_where_there_is_no_room() -> None:
         (lambda: prediction.delay_std_s(0.0, BAND_HZ, 0.1), "squared coherence"),
         (lambda: prediction.delay_std_s(0.5, (200.0, 100.0), 0.1), "band low < high"),
         (lambda: prediction.delay_std_s(0.5, BAND_HZ, 0.0), "time above 0"),
-        (lambda: prediction.Conditions(1.0, 0.1, 0.0), "nothing is known exactly"),
+        (lambda: prediction.Conditions(1.0, 0.1, 0.0), "no position is exact"),
         (lambda: prediction.Conditions(0.0, 0.1, 0.002), "critical distance: expected above 0"),
         (lambda: alias_free_hz(FLOOR_M, NORTH.microphones_m, microphone_pairs(4), 0.0, C_M_S), "grid spacing"),
         (lambda: prediction.shifts_m(NORTH, [], ROOM_M, 0.0), "step: expected metres above 0"),

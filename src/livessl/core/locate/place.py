@@ -10,7 +10,7 @@ import numpy as np
 
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import array_power, peak_to_rms
+from livessl.core.locate.confidence import Judgement, array_power, judge, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Evidence, FloatArray
@@ -50,6 +50,10 @@ class Place:
         terms = self.functional.pair_terms(self.position_m)
         ratios = (peak_to_rms(part, array_power(part, term)) for part, term in zip(self.evidence, terms, strict=True))
         return min(ratios) >= 1.0
+
+    def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:
+        """Judge the place; `whole` if the evidence includes whole segments."""
+        return judge(self.functional, self.evidence, self.position_m, self.power, self.rival_power, grid, whole=whole)
 
     def apart_m(self, other: Place) -> float:
         """Distance from another place, in metres."""
