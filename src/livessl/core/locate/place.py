@@ -77,7 +77,7 @@ def highest_place(evidence: Sequence[Evidence], search: PeakSearch, grid: Grid, 
     find = search.among(evidence)
     found = find(_STARTS)
     functional = SRPFunctional(evidence, c_m_s)
-    starts_m = np.stack([grid.node_m(peak.node) for peak in found])
+    starts_m = np.stack([grid.point_m(peak.point) for peak in found])
     position_m, power = refine.refine(functional, starts_m, grid)
     rival_power = refine.rival_power(find, grid, position_m)
     return Place(evidence, functional, position_m, power, rival_power, found[0].proven)

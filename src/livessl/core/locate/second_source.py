@@ -294,20 +294,20 @@ class SecondSourceSearch:
         evidence = tuple(each.without(taken_s) for each, taken_s in zip(frames, delays_s, strict=True))
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [refine.neighbourhood(place.position_m, self._grid)]
-        apart_nodes = round(CANDIDATES_APART_M / self._grid.spacing_m)
+        apart_points = round(CANDIDATES_APART_M / self._grid.spacing_m)
         best, chosen = 0.0, (place, 0.0)
         for _ in range(CANDIDATES):
             found = find(1, without=known)
             if not found:
                 break
-            position_m, power = refine.refine(functional, self._grid.node_m(found[0].node), self._grid)
+            position_m, power = refine.refine(functional, self._grid.point_m(found[0].point), self._grid)
             terms = functional.pair_terms(position_m)
             each = zip(frames, terms, delays_s, strict=True)
             prominent = prominence([one.prominence(term.lags_s, taken_s) for one, term, taken_s in each])
             if power * prominent > best:
                 candidate = Place(evidence, functional, position_m, power, power, found[0].proven)
                 best, chosen = power * prominent, (candidate, confidence(prominent))
-            known.append(refine.box_around(self._grid, found[0].node, apart_nodes))
+            known.append(refine.box_around(self._grid, found[0].point, apart_points))
         other, other_confidence = chosen
         return replace(other, rival_power=refine.rival_power(find, self._grid, other.position_m)), other_confidence
 
