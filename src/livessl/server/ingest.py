@@ -151,7 +151,7 @@ class Ingest:
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
         if isinstance(message, Frame) and message.requested:
-            return Received(message=message)  # it stands outside the node's own count of frames
+            return Received(message=message)  # requested frames have no sequence number
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
             return Received(message=message)

@@ -93,9 +93,9 @@ class ArrayPlan:
         Correlation of a diffuse field at the widest pair, averaged over the band.
     pairs : tuple of PairPlan
     alias_free_hz : tuple of float
-        Percentiles `SHARES`, over points and pairs, of the frequency up to which there is no spatial aliasing.
+        Percentiles `SHARES`, over (point, pair) combinations, of the frequency up to which there is no aliasing.
     beyond_grid : float
-        Share of points and pairs with spatial aliasing inside the band on this grid.
+        Share of (point, pair) combinations with spatial aliasing inside the band on this grid.
     alone : Errors
         Errors predicted for this array without the others.
     """
