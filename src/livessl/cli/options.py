@@ -76,7 +76,7 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="channels of that array's file, counted from 1, in the site file's microphone order",
+        help="channels of the file, from 1, in microphone order",
     )
 
 

@@ -31,7 +31,7 @@ from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array
 APART_M: Final = 1.0
 """Distance, in metres, below which two places are one source."""
 
-MOST_ARRAYS: Final = 8
+MOST_ARRAYS_SEPARATED: Final = 8
 """Most arrays used to separate two sources; the time it takes is in proportion to their number."""
 
 MAX_FRAMES: Final = 40
@@ -317,7 +317,7 @@ def _separable(evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tup
 
     It takes two arrays, `sources` > 1 and onsets. Envelopes do not qualify: magnitudes of two sources do not add up.
     """
-    strongest = strongest_onsets({part.spec.name: sounds[part.spec.name] for part in evidence}, MOST_ARRAYS)
+    strongest = strongest_onsets({part.spec.name: sounds[part.spec.name] for part in evidence}, MOST_ARRAYS_SEPARATED)
     used = tuple(part for part in evidence if part.spec.name in strongest)
     if len(used) < 2 or not all(sound.onsets and sound.sources > 1 for sound in strongest.values()):
         return ()
