@@ -68,7 +68,7 @@ class Contract:
 
     def check_answer(self, scope: Scope, status: int, headers: dict[bytes, bytes], body: bytes) -> None:
         """Check a REST answer against what its route and the OpenAPI description declare."""
-        path, route = scope["path"], scope.get("route")
+        path, route = scope["path"].removeprefix(scope["root_path"]), scope.get("route")
         if not path.startswith("/api/") or path in UNMODELLED:
             return
         self.answers += 1

@@ -15,7 +15,7 @@ import pytest
 from livessl import offline
 from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
-from livessl.core.stream.backfill import MOST_ARRAYS, SHARE, SURE, Allowance, nearest
+from livessl.core.stream.backfill import MOST_REQUESTED_ARRAYS, SHARE, SURE_WITHOUT_BACKFILL, Allowance, nearest
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.stream.segmenter import RECENT_S
@@ -201,13 +201,14 @@ def test_nothing_is_requested_for_a_sure_event() -> None:
         for part in parts()
     ]
     fusion = make_fusion(site(), updates=False)
-    fusion.can_backfill.update({"north", "south"})
+    for array in ("north", "south"):
+        fusion.set_answers(array, True)
     outputs: list[Output] = []
     for now_ns, batch in paced_messages(*make_pipelines(site(), loud), UnpacedClock()):
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
-    assert all(event.estimate is not None and event.estimate.confidence >= SURE for event in events)
+    assert all(event.estimate is not None and event.estimate.confidence >= SURE_WITHOUT_BACKFILL for event in events)
     assert not [output for output in outputs if isinstance(output, BackfillRequest)]
 
 
@@ -234,7 +235,7 @@ def test_nearest_silent_arrays_come_first() -> None:
 
     silent = [at(x_m) for x_m in (30.0, 5.0, 9.0, 1.0, 2.0, 40.0)]
     assert [spec.name for spec in nearest(silent, [at(0.0), at(29.0)])] == ["30", "1", "2", "5"]
-    assert MOST_ARRAYS == 4
+    assert MOST_REQUESTED_ARRAYS == 4
 
 
 def test_frames_that_were_not_requested_change_nothing() -> None:

@@ -40,6 +40,15 @@ def test_samples_and_files_give_the_same_events(tmp_path: Path) -> None:
         assert positions(livessl.locate(livessl.load_site(site), given)) == positions(from_files)
 
 
+def test_microphones_may_have_a_file_each(tmp_path: Path) -> None:
+    microphones = [write_wav(tmp_path / f"{k}.wav", heard("north")[k : k + 1]) for k in range(4)]
+    given: dict[str, livessl.offline.Given] = {
+        "north": [str(microphones[0]), *microphones[1:]],
+        "south": heard("south"),
+    }
+    assert positions(livessl.locate(site_of(), given)) == positions(livessl.locate(site_of(), {**samples()}))
+
+
 def test_integers_are_scaled_by_their_full_scale() -> None:
     integers = {name: np.round(heard(name) * 32767).astype(np.int16) for name in ARRAYS}
     of_integers, of_floats = livessl.locate(site_of(), integers), livessl.locate(site_of(), samples())

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from livessl.site.load import load_site
     from livessl.site.models import Site
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 
 __all__ = [
     "METHODS",

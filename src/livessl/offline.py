@@ -39,8 +39,9 @@ SiteOrPath = Site | Path | str
 Samples = NDArray[Any]
 """Samples (channels, n): floats with full scale at 1, or integers of a converter."""
 
-Given = Samples | Path | str
-"""The recording of one array: samples, or the path of a WAV or FLAC file."""
+Given = Samples | Path | str | Sequence[Path | str]
+"""The recording of one array: samples, the path of a WAV or FLAC file, or the paths of several files that hold its
+channels, such as one for each microphone."""
 
 _WIDEST: Final = 64
 """Most rows of samples that can be channels; with more rows, the array is likely transposed."""
@@ -79,9 +80,10 @@ def locate(
     ----------
     site : Site, Path or str
         A site, or the path of a site file.
-    recordings : mapping of array name to (channels, n) array, Path or str
+    recordings : mapping of array name to (channels, n) array, Path, str or sequence of paths
         One recording for each array, its channels in the order of the microphones. All begin at the same time. A file
-        may have more channels; then the node in the site file says which of them belong to the array.
+        may have more channels; then the node in the site file says which of them belong to the array. Several files
+        are one recording: the channels of the first, then of the second, ….
     sample_rate_hz : float or None
         Sampling rate of recordings that are given as samples; None takes the rate of the site's device.
     method : str or None
@@ -170,7 +172,9 @@ def run(
     fusion = make_fusion(site, method, updates=False)
     pipelines, inputs = make_pipelines(site, recordings)
     if backfill:
-        fusion.can_backfill.update(array for pipeline in pipelines for array in pipeline.arrays)
+        for pipeline in pipelines:
+            for array in pipeline.arrays:
+                fusion.set_answers(array, True)
     now_ns = 0
     for now_ns, batch in paced_messages(pipelines, inputs, clock):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
@@ -199,11 +203,20 @@ def _site(site: SiteOrPath) -> Site:
 def _parts(site: Site, recordings: Mapping[str, Given], sample_rate_hz: float | None) -> list[AssignedRecording]:
     if not recordings:
         raise DeviceError(f"recordings: expected one for each of {', '.join(site.arrays)}, got none")
-    files = {name: Path(given) for name, given in recordings.items() if isinstance(given, str | Path)}
-    samples = {name: given for name, given in recordings.items() if not isinstance(given, str | Path)}
+    files = {name: found for name, given in recordings.items() if (found := _files(given))}
+    samples = {name: np.asarray(given) for name, given in recordings.items() if name not in files}
     parts = {part.array: part for part in assign_files(site, files)}
     parts |= {name: _part(site, name, given, sample_rate_hz) for name, given in samples.items()}
     return [parts[name] for name in recordings]
+
+
+def _files(given: Given) -> tuple[Path, ...]:
+    """Return the files of one array; nothing if samples are given."""
+    if isinstance(given, str | Path):
+        return (Path(given),)
+    if isinstance(given, np.ndarray):
+        return ()
+    return tuple(Path(name) for name in given if isinstance(name, str | Path))
 
 
 def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None) -> AssignedRecording:
@@ -214,7 +227,7 @@ def _part(site: Site, array: str, samples: Samples, sample_rate_hz: float | None
     rate_hz = sample_rate_hz or (site.nodes[node].device.sample_rate_hz if node else None)
     if rate_hz is None:
         raise DeviceError(f"array {array!r}: expected the sampling rate of its samples; pass sample_rate_hz")
-    recording = MemoryRecording(f"array {array!r}", float(rate_hz), _checked(array, np.asarray(samples)))
+    recording = MemoryRecording(f"array {array!r}", float(rate_hz), _checked(array, samples))
     return AssignedRecording(array, recording, 0, tuple(recording_channels(site, array, recording)))
 
 

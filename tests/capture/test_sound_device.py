@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from ctypes.util import find_library
@@ -28,7 +27,7 @@ from livessl.clock import UnpacedClock
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
 from livessl.site.node_models import SoundDeviceConfig
-from small_site import HANG_S
+from small_site import HANG_S, wait_until
 
 RATE_HZ = 48000
 BLOCK = 960
@@ -459,11 +458,9 @@ class VirtualCard:
             f"--load=module-native-protocol-unix auth-anonymous=1 socket={self.socket}",
             f"--load=module-null-sink sink_name=virtual channels=4 rate={RATE_HZ} channel_map={self.CHANNELS}",
         )
-        deadline = time.monotonic() + 20
-        while self._sinks() != ["virtual"]:
-            assert self.server.poll() is None, f"pulseaudio has exited with {self.server.returncode}"
-            assert time.monotonic() < deadline, "pulseaudio does not answer"
-            time.sleep(0.05)
+        server = self.server
+        wait_until(lambda: server.poll() is not None or self._sinks() == ["virtual"], "pulseaudio's answer")
+        assert server.poll() is None, f"pulseaudio has exited with {server.returncode}"
 
     def _sinks(self) -> list[str]:
         listed = subprocess.run(

@@ -17,7 +17,7 @@ import pytest
 from cli.command_runs import Recorded, Run, free_endpoint
 from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.server.receiver import Receiver
-from small_site import RATE_HZ, running_server, site_of, wait_until, write_site
+from small_site import HANG_S, RATE_HZ, running_server, site_of, wait_until, write_site
 
 STOP_S = 5.0
 """Longest time in seconds from Ctrl-C or SIGTERM to the end of a command."""
@@ -137,7 +137,7 @@ class Process:
             assert self.process.poll() is None, self.output
             return re.search(pattern, self.output)
 
-        wait_until(found, f"{pattern} in its output", 30)
+        wait_until(found, f"{pattern} in its output")
         match = found()
         assert match is not None
         return match
@@ -146,7 +146,7 @@ class Process:
         """Send a signal; return the exit code, and the seconds until the process ended."""
         began = time.monotonic()
         self.process.send_signal(number)
-        code = self.process.wait(timeout=20)
+        code = self.process.wait(timeout=HANG_S)
         return code, time.monotonic() - began
 
 
@@ -184,7 +184,7 @@ def test_ctrl_c_and_sigterm_stop_servers_and_nodes_cleanly(recorded: Recorded, t
         for node in nodes:
             node.wait_for("connected to the server")
         for url in urls:
-            assert httpx.get(f"{url}/api/v1/health", timeout=10).status_code == 200
+            assert httpx.get(f"{url}/api/v1/health", timeout=HANG_S).status_code == 200
         ends = [
             process.end(number)
             for process, number in zip((*nodes, *servers), 2 * (signal.SIGTERM, signal.SIGINT), strict=True)

@@ -19,7 +19,7 @@ from livessl.lab import demo
 from livessl.recordings.session import read_session
 from livessl.site.models import Site
 from livessl.wire import Hello
-from small_site import RATE_HZ, running_server, site_of, write_site
+from small_site import HANG_S, RATE_HZ, running_server, site_of, write_site
 
 
 def test_simulate_twice_gives_the_same_bytes(run: Run, recorded: Recorded, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_sessions_of_two_nodes_are_replayed_as_one(tmp_path: Path, capsys: pytes
             [sys.executable, "-m", "livessl", "replay", *map(str, folders), *options],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=HANG_S,
             check=True,
         )
         replayed.append([json.loads(line)["position_m"] for line in done.stdout.splitlines()])

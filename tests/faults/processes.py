@@ -32,7 +32,7 @@ from livessl.simulation.export import write_scene
 from livessl.simulation.scene import make_scene
 from livessl.site import keys
 from livessl.site.load import load_site
-from small_site import RATE_HZ, Changes, hiss, small
+from small_site import HANG_S, RATE_HZ, Changes, hiss, small
 
 Event = dict[str, Any]
 
@@ -221,7 +221,7 @@ class Playing:
 
     def events(self) -> list[Event]:
         """What is stored, oldest first, whether or not a server runs; `at_s` counts from the recordings' start."""
-        with closing(sqlite3.connect(self.directory / "events.db", timeout=10)) as db:
+        with closing(sqlite3.connect(self.directory / "events.db", timeout=HANG_S)) as db:
             rows = db.execute("SELECT json FROM events ORDER BY time_ns").fetchall()
         events = [json.loads(text) for (text,) in rows]
         return [{**event, "at_s": (utc_ns(event["time_utc"]) - self.start_ns) / 1e9} for event in events]
@@ -250,7 +250,7 @@ class Hearer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._socket.close()
-        self._thread.join(timeout=5)
+        self._thread.join(timeout=HANG_S)
 
     def _run(self) -> None:
         for text in self._socket:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+from small_site import HANG_S
+
 
 @dataclass
 class Weather:
@@ -66,7 +68,7 @@ class Proxy:
     ) -> None:
         self._call(self._close())
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(timeout=5)
+        self._thread.join(timeout=HANG_S)
         self._loop.close()
 
     @property
@@ -79,7 +81,7 @@ class Proxy:
         self._call(self._tear())
 
     def _call(self, work: Coroutine[Any, Any, Any]) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(timeout=10)
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(timeout=HANG_S)
 
     async def _close(self) -> None:
         self._server.close()

@@ -41,7 +41,7 @@ from livessl.server.app import Server
 from livessl.server.latency import Arrival
 from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
-from small_site import RATE_HZ, hiss, site_of
+from small_site import HANG_S, RATE_HZ, hiss, site_of
 
 SECOND = 20
 HOUR = 3600 * SECOND
@@ -261,7 +261,7 @@ class Soak(World):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.http.stop()
-        self._thread.join(timeout=10)
+        self._thread.join(timeout=HANG_S)
 
     @property
     def hours(self) -> float:
@@ -383,7 +383,7 @@ class Crowd:
     ) -> None:
         self._ended.set()
         for thread in self._threads:
-            thread.join(timeout=30)
+            thread.join(timeout=HANG_S)
         if self._failures and kind is None:
             raise ExceptionGroup("clients failed", self._failures)
 

@@ -16,7 +16,7 @@ import soundfile
 from processes import NODES, TAIL_S, Playing, wait_for
 
 from livessl.simulation.scene import Scene, make_scene, render
-from small_site import RATE_HZ, hiss, site_of
+from small_site import HANG_S, RATE_HZ, hiss, site_of
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
 
@@ -55,7 +55,7 @@ def record(directory: Path, made: Scene) -> None:
 
 
 def metrics(url: str) -> str:
-    with urllib.request.urlopen(url, timeout=5.0) as answer:
+    with urllib.request.urlopen(url, timeout=HANG_S) as answer:
         return str(answer.read().decode())
 
 

@@ -16,7 +16,7 @@ from livessl.capture.record import record_device
 from livessl.clock import UnpacedClock
 from livessl.core.types import Block, Float32Array
 from livessl.errors import DeviceError
-from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions
+from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions, make_pipelines
 from livessl.recordings.recorder import Recorder, record_playback
 from livessl.recordings.recording import FileRecording, MemoryRecording
 from livessl.recordings.session import read_session
@@ -221,6 +221,57 @@ def test_every_file_that_does_not_fit_is_reported(tmp_path: Path) -> None:
 
 def test_files_begin_together_except_for_their_offset(tmp_path: Path) -> None:
     site = site_of({"arrays.south.wav_offset_s": -0.25})
-    path = write_wav(tmp_path / "hiss.wav", hiss(0.1))
-    parts = assign_files(site, {"north": path, "south": path}, start_ns=START_NS)
+    files = {name: write_wav(tmp_path / f"{name}.wav", hiss(0.1)) for name in BOTH}
+    parts = assign_files(site, files, start_ns=START_NS)
     assert [part.start_ns - START_NS for part in parts] == [0, -250_000_000]
+
+
+def test_unfinished_files_of_a_joint_array_end_together(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A recorder that is killed has written more of one file than of another."""
+    with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ)) as recorder:
+        recorder.push(block(sixteen_bits(hiss(3.0, 8)), 0, 48_000))
+    path = tmp_path / "south-000.flac"
+    path.write_bytes(path.read_bytes()[:-30_000])
+    apart = assign_sessions(SITE, [read_session(tmp_path)])
+    north_s, south_s = (part.recording.duration_s for part in apart)
+    assert north_s == 3.0
+    assert north_s - 1 < south_s < north_s
+    assert [message.partition(": ")[2] for message in caplog.messages] == [
+        f"the file is shorter than its header says; {south_s:.2f} s of sound were found and read"
+    ]
+    caplog.clear()
+    site = site_of({"joint": {"both": ["north", "south"]}})
+    [pipeline], [_] = make_pipelines(site, assign_sessions(site, [read_session(tmp_path)]))
+    assert pipeline.arrays == ["both"]
+    assert caplog.messages[1:] == [
+        f"{tmp_path / 'north-000.flac'}: its last {north_s - south_s:.3f} s are not used, because {path} ends before"
+    ]
+
+
+def test_file_that_was_only_begun_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    samples = hiss(1.0, 8)
+    with Recorder(tmp_path, SITE, BOTH, float(RATE_HZ), "wav") as recorder:
+        recorder.push(block(samples, 0, 8000))
+        recorder.push(block(samples, 9000, 16000))
+    begun = [tmp_path / "north-001.wav", tmp_path / "south-001.wav"]
+    for path in begun:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size - 7000 * 4 * 4])
+    parts = assign_sessions(SITE, [read_session(tmp_path)])
+    assert [part.recording.duration_s for part in parts] == [0.5, 0.5]
+    assert caplog.messages == [f"{path}: it holds no sound and is left out" for path in begun]
+    for path in (tmp_path / "north-000.wav", begun[0]):
+        path.write_bytes(begun[0].read_bytes())
+    with pytest.raises(DeviceError) as caught:
+        assign_sessions(SITE, [read_session(tmp_path)])
+    assert [line.partition(": ")[2] for line in str(caught.value).splitlines()] == [
+        "expected sound, got a file of zero length; record it again"
+    ] * 2
+
+
+def test_wide_file_of_two_arrays_is_noted_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_wav(tmp_path / "wide.wav", hiss(1.0, 8))
+    path.write_bytes(path.read_bytes()[:-4000])
+    parts = assign_files(SITE, {"north": path, "south": path})
+    assert [part.channels for part in parts] == [(1, 2, 3, 4), (5, 6, 7, 8)]
+    assert len(caplog.messages) == 1
+    assert "the file is shorter than its header says; " in caplog.text

@@ -233,7 +233,10 @@ def test_site_without_keys_needs_none() -> None:
     assert keys.node_keys(site_of(), "lab-pc") is None
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "", "lab-pc.local", "127.0.0.1.example"])
+@pytest.mark.parametrize(
+    "host",
+    ["0.0.0.0", "192.168.1.7", "::", "[::]", "fe80::1%eth0", "::ffff:0.0.0.0", "", "lab-pc.local", "127.0.0.1.example"],
+)
 def test_api_open_to_the_network_needs_tokens(host: str) -> None:
     [fault] = unprotected_addresses(site_of({"server.http.host": host}))
     assert fault.where == "server.http.host"
@@ -249,7 +252,7 @@ def test_socket_open_to_the_network_needs_keys(bind: str) -> None:
     assert unprotected_addresses(site_of({"server.bind": bind, "keys": "keys"})) == []
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost", "::1"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost", "::1", "::ffff:127.0.0.1"])
 def test_loopback_addresses_need_no_protection(host: str) -> None:
     endpoint = f"tcp://{f'[{host}]' if ':' in host else host}:5570"
     assert unprotected_addresses(site_of({"server.http.host": host, "server.bind": endpoint})) == []
@@ -265,6 +268,13 @@ def test_unprotected_server_does_not_start_and_reports_all_faults(
     said = capsys.readouterr().err
     assert "server.http.host: '0.0.0.0' can be reached from other machines" in said
     assert "server.bind: 'tcp://*:5570' can be reached from other machines" in said
+
+
+def test_trusted_hosts_without_tokens_are_warned_about() -> None:
+    changes: Changes = {"server.http.trusted_hosts": ["site.example"]}
+    [warning] = site_of(changes).warnings
+    assert warning.startswith("server.http.trusted_hosts: everyone who reaches the proxy may do everything; set")
+    assert site_of(changes | {"server.http.tokens": "tokens.yaml"}).warnings == ()
 
 
 def test_unencrypted_tokens_are_warned_about() -> None:

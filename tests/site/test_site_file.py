@@ -226,6 +226,37 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         "expected tcp://HOST:PORT or ipc://PATH, got 'tcp://127.0.0.1:99999'",
     ),
     "endpoint of no decimal port": ({"server.bind": "tcp://127.0.0.1:5²"}, "server.bind", "expected tcp://HOST:PORT"),
+    "IPv6 endpoint without brackets": (
+        {f"{NODE}.server": "tcp://::1:5570"},
+        f"{NODE}.server",
+        r"expected an IPv6 address in brackets, such as tcp://\[::1\]:5570, got 'tcp://::1:5570'",
+    ),
+    "endpoint in brackets that is no address": (
+        {"server.bind": "tcp://[localhost]:5570"},
+        "server.bind",
+        "expected an IPv6 address in brackets",
+    ),
+    "port in the HTTP host": (
+        {"server.http.host": "127.0.0.1:8000"},
+        "server.http.host",
+        "expected a name or an address without a port, such as lab-pc, 127.0.0.1 or ::1, got '127.0.0.1:8000'",
+    ),
+    "URL among the trusted hosts": (
+        {"server.http.trusted_hosts": ["https://site.example/"]},
+        "server.http.trusted_hosts",
+        r"expected a host name without scheme and port, such as site.example or \*.site.example, got 'https://site",
+    ),
+    "all hosts trusted": ({"server.http.trusted_hosts": ["*"]}, "server.http.trusted_hosts", r"got '\*'"),
+    "root path that is no path": (
+        {"server.http.root_path": "livessl"},
+        "server.http.root_path",
+        "expected a path such as /livessl, got 'livessl'",
+    ),
+    "proxy by its name": (
+        {"server.http.forwarded_allow_ips": ["proxy.example"]},
+        "server.http.forwarded_allow_ips",
+        "expected an address or a network of proxies, such as 127.0.0.1 or 10.0.0.0/8, got 'proxy.example'",
+    ),
     "bad HTTP port": ({"server.http.port": 70000}, "server.http.port", "less than or equal to 65535, got 70000"),
     "speed and temperature": (
         {"speed_of_sound_m_s": 343.0, "temperature_c": 20.0},
@@ -583,7 +614,17 @@ def test_array_may_be_on_a_node_or_on_none() -> None:
     assert site.node_of("south") is None
 
 
-@pytest.mark.parametrize("endpoint", ["tcp://*:5570", "tcp://127.0.0.1:*", "tcp://[::1]:1", "ipc:///run/livessl"])
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp://*:5570",
+        "tcp://127.0.0.1:*",
+        "tcp://[::1]:1",
+        "tcp://[::]:*",
+        "tcp://[fe80::1%eth0]:1",
+        "ipc:///run/livessl",
+    ],
+)
 def test_valid_endpoints_are_accepted(endpoint: str) -> None:
     assert site_of({"server.bind": endpoint}).server.bind == endpoint
 

@@ -8,6 +8,7 @@ import zmq
 
 from livessl import wire
 from livessl.capture.outbox import BACKLOG_FRAMES
+from livessl.site.addresses import needs_ipv6
 from livessl.site.keys import NodeKeys
 
 QUEUED_MESSAGES: Final = 10
@@ -40,6 +41,7 @@ class Dealer:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IPV6, needs_ipv6(endpoint))
         self._socket.setsockopt(zmq.IMMEDIATE, 1)  # while disconnected, frames wait in our spool, not in ZeroMQ's queue
         self._socket.setsockopt(zmq.SNDHWM, max(BACKLOG_FRAMES, QUEUED_MESSAGES * arrays))
         self._socket.setsockopt(zmq.SNDBUF, QUEUED_BYTES)

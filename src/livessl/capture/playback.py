@@ -61,6 +61,10 @@ def node_recordings(
         missing = [array for array in arrays if array not in config.files]
         if missing:
             raise DeviceError(f"nodes.{node}.device.files: expected a file for array {missing[0]!r}; add it")
-        files = {array: site.file(config.files[array]) for array in arrays}
+        named = {array: config.files[array] for array in arrays}
+        files = {
+            array: [site.file(name) for name in ([names] if isinstance(names, str) else names)]
+            for array, names in named.items()
+        }
         recordings = assign_files(site, files, start_ns=start_ns)
     return looped(recordings) if config.loop else recordings

@@ -6,6 +6,7 @@ They are passed to argparse as `type`, and raise `ArgumentTypeError` with what w
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
@@ -23,12 +24,16 @@ MAX_RT60_S: Final = 5.0
 The number of image sources grows with its cube: a longer one would take hours, and few rooms reverberate longer."""
 
 
-def assignment(text: str) -> tuple[str, Path]:
-    """Return the array name and the path of `ARRAY=FILE`."""
-    name, equals, path = text.partition("=")
-    if not (name and equals and path):
+def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
+    """Return the array name and the paths of `ARRAY=FILE` or `ARRAY=FILE,FILE,…`.
+
+    The name of an existing file may have commas in it.
+    """
+    name, equals, paths = text.partition("=")
+    files = (paths,) if os.path.lexists(paths) else tuple(paths.split(","))
+    if not (name and equals and all(files)):
         raise argparse.ArgumentTypeError(f"expected ARRAY=FILE, got {text!r}")
-    return name, Path(path)
+    return name, tuple(map(Path, files))
 
 
 def joint(text: str) -> tuple[str, list[str]]:

@@ -18,6 +18,7 @@ from livessl.cli.options import add_json
 from livessl.cli.output import xyz
 from livessl.clock import SystemClock
 from livessl.lab import demo
+from livessl.server.api.encode import JsonObject
 
 WITHIN_M: Final = 0.5
 """Largest error, in metres, of a sound that counts as located; the paper uses the same limit."""
@@ -54,26 +55,39 @@ def _show(arguments: argparse.Namespace) -> int:
         directory = Path(name)
         site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
         truth = demo.read_truth(directory)
-        with demo.running(directory, site, loop=not arguments.once, clock=clock) as (url, start_ns):
-            print(f"dashboard: {url}", file=sys.stderr)
+        with demo.running(directory, site, loop=not arguments.once, clock=clock) as running:
+            print(f"dashboard: {running.url}", file=sys.stderr)
             if not arguments.once and not arguments.no_browser:
-                threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
-            until_ns = start_ns + round((scene.duration_s + 1.5) * 1e9) if arguments.once else None
-            events = []
+                threading.Thread(target=webbrowser.open, args=(running.url,), daemon=True).start()
             if not arguments.json:
                 print(_HEAD)
-            for event in demo.events_of(url, until_ns, clock):
-                events.append(event)
-                outcome = demo.nearest_source(truth, event, start_ns, scene.duration_s)
+            events: dict[str, JsonObject] = {}
+
+            def outcomes() -> list[demo.Outcome]:
+                return demo.match(truth, list(events.values()), running.start_ns, scene.duration_s)
+
+            def is_over() -> bool:
+                silent_ns = running.silent_ns()
+                return silent_ns > 0 and (all(map(_is_good, outcomes())) or silent_ns > demo.LAST_NS)
+
+            for event in demo.events_of(running.url, is_over):
+                for replaced in event["replaces"]:
+                    events.pop(replaced, None)
+                events[event["id"]] = event
+                outcome = demo.nearest_source(truth, event, running.start_ns, scene.duration_s)
                 print(_as_json(outcome) if arguments.json else _as_row(outcome), flush=True)
                 if not arguments.once:
                     events.clear()
-    outcomes = demo.match(truth, events, start_ns, scene.duration_s)
-    good = [o for o in outcomes if o.located and o.error_m is not None and o.error_m <= WITHIN_M]
-    surplus = len(events) - len({o.event["id"] for o in outcomes if o.event is not None})
-    summary = f"{len(good)} of {len(outcomes)} sounds located within {WITHIN_M:g} m; {surplus} events without a sound"
+    found = outcomes()
+    good = sum(map(_is_good, found))
+    surplus = len(events) - len({outcome.event["id"] for outcome in found if outcome.event is not None})
+    summary = f"{good} of {len(truth)} sounds located within {WITHIN_M:g} m; {surplus} events without a sound"
     print(summary, file=sys.stderr)
-    return OK if len(good) == len(outcomes) else FAILED
+    return OK if good == len(truth) else FAILED
+
+
+def _is_good(outcome: demo.Outcome) -> bool:
+    return outcome.located and outcome.error_m is not None and outcome.error_m <= WITHIN_M
 
 
 def _as_row(outcome: demo.Outcome) -> str:

@@ -66,8 +66,8 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         action="append",
         type=argument.assignment,
         default=[],
-        metavar="ARRAY=FILE",
-        help=text,
+        metavar="ARRAY=FILE[,FILE…]",
+        help=f"{text}; several files are its channels, one after the other",
         required=required,
     )
     parser.add_argument(
@@ -76,7 +76,7 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="channels of the file, from 1, in microphone order",
+        help="channels of that array's files, counted from 1, in the site file's microphone order",
     )
 
 
@@ -90,14 +90,15 @@ def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
     return _each_once(arguments.joint, "--joint")
 
 
-def wavs(arguments: argparse.Namespace) -> tuple[dict[str, Path], dict[str, list[int]]]:
+def wavs(arguments: argparse.Namespace) -> tuple[dict[str, tuple[Path, ...]], dict[str, list[int]]]:
     """Return the files of --wav and the channels of --channels, by array."""
-    return _each_once(arguments.wav, "--wav"), _each_once(arguments.channels, "--channels")
+    each = "; give one file for each microphone as ARRAY=FILE,FILE,…"
+    return _each_once(arguments.wav, "--wav", each), _each_once(arguments.channels, "--channels")
 
 
-def _each_once(pairs: Sequence[tuple[str, T]], option: str) -> dict[str, T]:
+def _each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
     names = [name for name, _ in pairs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; remove one")])
+        raise ConfigError([Fault(option, f"expected each array once, got {twice!r} twice; remove one{hint}")])
     return dict(pairs)

@@ -14,7 +14,7 @@ from livessl.cli.output import complain
 from livessl.errors import ConfigError, Fault
 from livessl.recordings.session import SESSION_FILE
 from livessl.simulation.export import TRUTH_FILE, write_scene
-from livessl.simulation.of_site import scene_of
+from livessl.simulation.of_site import DEFAULT_RATE_HZ, device_rates_hz, scene_of
 from livessl.simulation.scene import read_sounds
 from livessl.site.load import load_site
 
@@ -43,9 +43,8 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument(
         "--sample-rate",
         type=argument.positive,
-        default=44100,
         metavar="HZ",
-        help="sampling rate of the recordings (default 44100)",
+        help="sampling rate of the recordings (default: that of each node's device in the site file, else 44100)",
     )
     parser.add_argument(
         "--seed", type=int, default=0, help="random seed; the same seed gives the same session (default 0)"
@@ -57,7 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
-    rate = float(arguments.sample_rate)
+    rates = {} if arguments.sample_rate else device_rates_hz(site)
+    rate = float(arguments.sample_rate or max(rates.values(), default=DEFAULT_RATE_HZ))
     try:
         sounds = read_sounds(arguments.events, rate) if arguments.events else None
         scene = scene_of(
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
         )
         with progress.counted("simulating the room", "source") as bar:
-            write_scene(arguments.out, site, scene, seed=arguments.seed, progress=bar)
+            write_scene(arguments.out, site, scene, seed=arguments.seed, rates_hz=rates, progress=bar)
     except ValueError as error:
         complain(str(error))
         return WRONG_USE

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import socket
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,6 +34,9 @@ LEAD_NS: Final = 5_000_000_000
 
 MATCH_S: Final = 1.0
 """Longest time, in seconds, between the starts of a source and of its event."""
+
+LAST_NS: Final = 10_000_000_000
+"""Time, in nanoseconds, that a busy server gets for its final results after the nodes have ended."""
 
 RATE_HZ: Final = 44100.0
 SEED: Final = 1
@@ -66,6 +70,36 @@ class Outcome:
         )
 
 
+@dataclass
+class Running:
+    """The demo's processes.
+
+    Parameters
+    ----------
+    url : str
+        The dashboard's address.
+    start_ns : int
+        Site time at which the scene begins, in nanoseconds.
+    nodes : sequence of Popen
+        The capture nodes.
+    clock : Clock
+    """
+
+    url: str
+    start_ns: int
+    nodes: Sequence[subprocess.Popen[bytes]]
+    clock: Clock
+    _ended_ns: int | None = field(default=None, init=False)
+
+    def silent_ns(self) -> int:
+        """Return how long ago all nodes had ended, in nanoseconds; 0 while one plays."""
+        if any(node.poll() is None for node in self.nodes):
+            return 0
+        if self._ended_ns is None:
+            self._ended_ns = self.clock.monotonic_ns()
+        return self.clock.monotonic_ns() - self._ended_ns
+
+
 def prepare(directory: Path, http_port: int, events: int, progress: Callable[[int, int], None]) -> tuple[Site, Scene]:
     """Simulate the demo's scene into a folder, with a site file on free ports."""
     _need_free("127.0.0.1", http_port)
@@ -85,8 +119,8 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
 
 
 @contextmanager
-def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[tuple[str, int]]:
-    """Run server and nodes as processes; yield the dashboard's address and the start of the scene, in nanoseconds.
+def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterator[Running]:
+    """Run server and nodes as processes while the context lasts.
 
     The scene starts when the server is ready, which takes some seconds at the first start on a machine.
 
@@ -98,26 +132,29 @@ def running(directory: Path, site: Site, *, loop: bool, clock: Clock) -> Iterato
     http = site.server.http
     url = f"http://{http.host}:{http.port}"
     common = ["--site", str(directory / "site.yaml")]
-    started = [processes.start("serve", *common)]
+    server = processes.start("serve", *common)
+    nodes: list[subprocess.Popen[bytes]] = []
     try:
-        processes.wait_until_ready(url, started, clock)
+        processes.wait_until_ready(url, [server], clock)
         start_ns = (clock.now_ns() + LEAD_NS) // FRAME_NS * FRAME_NS
         for node in site.nodes:
             extra = ["--loop"] if loop else []
             at = utc_text(start_ns)
-            started.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
-        yield url, start_ns
+            nodes.append(processes.start("capture", *common, "--node", node, "--start-at", at, *extra))
+        yield Running(url, start_ns, nodes, clock)
     finally:
-        processes.end(started)
+        processes.end([server, *nodes])
 
 
-def events_of(url: str, until_ns: int | None, clock: Clock) -> Iterator[JsonObject]:
-    """Yield events from the WebSocket, as any client receives them, until a time or without end."""
+def events_of(url: str, is_over: Callable[[], bool]) -> Iterator[JsonObject]:
+    """Yield events from the WebSocket, as any client receives them; end in a pause in which `is_over()` is true."""
     with connect(f"ws{url.removeprefix('http')}/api/v1/live?kinds=event", open_timeout=10) as live:
-        while until_ns is None or clock.now_ns() < until_ns:
+        while True:
             try:
                 message = json.loads(live.recv(timeout=0.5))
             except TimeoutError:
+                if is_over():
+                    return
                 continue
             except ConnectionClosed as error:
                 raise DemoError("the server ended") from error

@@ -13,8 +13,8 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.errors import RunError
 
-READY_NS: Final = 60_000_000_000
-"""Longest start of a server, in nanoseconds; the first one on a machine compiles kernels."""
+READY_NS: Final = 300_000_000_000
+"""Longest start of a server, in nanoseconds; the first one on a busy machine compiles kernels for minutes."""
 
 POLL_NS: Final = 50_000_000
 """Time, in nanoseconds, between two checks whether a server is ready."""

@@ -11,8 +11,9 @@ from livessl.core.joint_array import require_one_clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.types import FRAME_NS
 from livessl.errors import DeviceError
+from livessl.recordings.open_files import OpenFiles
 from livessl.recordings.recording import (
-    FileRecording,
+    EmptyFileError,
     LoopedRecording,
     Recording,
     SplicedRecording,
@@ -128,15 +129,18 @@ def _require_one_device(site: Site, name: str, members: Sequence[AssignedRecordi
 
 
 def assign_files(
-    site: Site, files: Mapping[str, Path], channels: Mapping[str, Sequence[int]] | None = None, start_ns: int = 0
+    site: Site,
+    files: Mapping[str, Path | Sequence[Path]],
+    channels: Mapping[str, Sequence[int]] | None = None,
+    start_ns: int = 0,
 ) -> list[AssignedRecording]:
     """Return the recordings of arrays from files that begin at `start_ns` plus each array's `wav_offset_s`.
 
     Parameters
     ----------
     site : Site
-    files : mapping of array name to Path
-        WAV or FLAC files.
+    files : mapping of array name to Path or sequence of Path
+        WAV or FLAC files. Several files of one array are its channels, such as one file for each microphone.
     channels : mapping of array name to channels, or None
         Channels counted from 1; `recording_channels` chooses them for arrays that are not named.
     start_ns : int
@@ -154,32 +158,49 @@ def assign_files(
             f"channels of array {unknown[0]!r}: expected an array with a recording ({', '.join(files)}); "
             "give its recording, or leave its channels out"
         )
-    return _assign(
-        site,
-        [(name, path, start_ns + round(_wav_offset_s(site, name) * 1e9)) for name, path in files.items()],
-        wanted,
-    )
+    given = [
+        (name, (paths,) if isinstance(paths, Path) else tuple(paths), start_ns + _wav_offset_ns(site, name))
+        for name, paths in files.items()
+    ]
+    return _assign(site, given, wanted, OpenFiles())
 
 
-def _wav_offset_s(site: Site, array: str) -> float:
+def _wav_offset_ns(site: Site, array: str) -> int:
     """Return an array's offset; all members of a joint array have the same one. 0 for an unknown array."""
     config = site.arrays.get(site.members(array)[0])
-    return config.wav_offset_s if config else 0.0
+    return round(config.wav_offset_s * 1e9) if config else 0
 
 
 def assign_sessions(site: Site, sessions: Iterable[Session]) -> list[AssignedRecording]:
     """Return the recordings of one or more sessions at their original times; each node records a session of its own.
+
+    Files without any sound, as a recorder leaves them that is killed just after a gap, are left out.
 
     Raises
     ------
     DeviceError
         One line for each file that does not fit.
     """
-    return _assign(
-        site,
-        [(piece.array, session.path(piece), piece.start_ns) for session in sessions for piece in session.pieces],
-        {},
-    )
+    files, given, skipped = OpenFiles(), [], []
+    for session in sessions:
+        for piece in session.pieces:
+            path = session.path(piece)
+            try:
+                files.open(path)
+            except EmptyFileError:
+                skipped.append((piece.array, (path,), piece.start_ns))
+                continue
+            except DeviceError:
+                pass  # it is reported together with the faults of the others
+            given.append((piece.array, (path,), piece.start_ns))
+    heard = {array for array, _, _ in given}
+    for array, (path,), _ in skipped:
+        if array in heard:
+            files.notes.append(f"{path}: it holds no sound and is left out")
+    given += [entry for entry in skipped if entry[0] not in heard]
+    joint = {member for name in site.joint for member in site.members(name)}
+    files.match_ends([(path, start_ns) for array, (path,), start_ns in given if array in joint])
+    return _assign(site, given, {}, files)
 
 
 def common_start_ns(now_ns: int, nodes: int) -> int:
@@ -231,14 +252,19 @@ def recording_channels(site: Site, array: str, recording: Recording, wanted: Seq
     if recording.channels < expected:
         raise DeviceError(
             f"{recording.name}: expected {expected} channels, one for each microphone of array {array!r}, "
-            f"got {recording.channels}"
+            f"got {recording.channels}{_several_files(array, expected) if recording.channels == 1 else ''}"
         )
-    if recording.channels > expected and node:
-        captured = site.nodes[node].arrays
-        numbers = [number for member in site.members(array) for number in captured[member]]
-        if max(numbers) <= recording.channels:
-            return numbers
-    return list(range(1, expected + 1))
+    return _node_channels(site, array, recording) or list(range(1, expected + 1))
+
+
+def _node_channels(site: Site, array: str, recording: Recording) -> list[int] | None:
+    """Return an array's channels on its node's device; None if it has no node or the recording lacks channels."""
+    node = site.node_of(array)
+    if node is None or recording.channels <= len(site.array(array).microphones_m):
+        return None
+    captured = site.nodes[node].arrays
+    numbers = [number for member in site.members(array) for number in captured[member]]
+    return numbers if max(numbers) <= recording.channels else None
 
 
 def _check_rate(site: Site, array: str, node: str | None, recording: Recording) -> None:
@@ -256,34 +282,51 @@ def _check_rate(site: Site, array: str, node: str | None, recording: Recording) 
         )
 
 
+def _several_files(array: str, expected: int) -> str:
+    names = ",".join(f"{number}.wav" for number in range(1, expected + 1))
+    return f"; if each microphone has a file of its own, give them all: {array}={names}"
+
+
 def _assign(
-    site: Site, files: Sequence[tuple[str, Path, int]], channels: Mapping[str, Sequence[int]]
+    site: Site,
+    given: Sequence[tuple[str, tuple[Path, ...], int]],
+    channels: Mapping[str, Sequence[int]],
+    files: OpenFiles,
 ) -> list[AssignedRecording]:
-    """Open `files` (array, path, start in ns); several files of one array become one recording with gaps."""
+    """Open `given` (array, its files, start in ns); recordings of one array at several times become one with gaps."""
     segments: dict[str, list[TimedRecording]] = {}
     chosen: dict[str, tuple[int, ...]] = {}
     faults: list[str] = []
-    for array, path, start_ns in files:
+    for array, paths, start_ns in given:
         known = (*site.arrays, *site.joint)
         if array not in known:
-            faults.append(f"{array}={path}: no such array; arrays are {', '.join(known)}")
+            names = ",".join(map(str, paths))
+            faults.append(f"{array}={names}: no such array; arrays are {', '.join(known)}")
             continue
         try:
-            recording = FileRecording(path)
-            chosen[array] = tuple(recording_channels(site, array, recording, channels.get(array)))
+            recording = files.stacked(array, paths)
+            wanted = channels.get(array)
+            chosen[array] = tuple(recording_channels(site, array, recording, wanted))
+            files.use(array, paths, chosen[array])
         except DeviceError as error:
             faults.append(str(error))
             continue
+        if wanted is None and recording.channels > len(chosen[array]) and not _node_channels(site, array, recording):
+            files.notes.append(
+                f"{recording.name}: it has {recording.channels} channels; array {array!r} takes the first "
+                f"{len(chosen[array])}, unless --channels {array}=… or a node of the site file names others"
+            )
         first = segments.setdefault(array, [TimedRecording(recording, start_ns)])[0].recording
         if recording.sample_rate_hz != first.sample_rate_hz:
             faults.append(
-                f"{path}: expected {first.sample_rate_hz:g} Hz as in {first.name}, also of array {array!r}, "
+                f"{recording.name}: expected {first.sample_rate_hz:g} Hz as in {first.name}, also of array {array!r}, "
                 f"got {recording.sample_rate_hz:g} Hz; resample one of them"
             )
         elif recording is not first:
             segments[array].append(TimedRecording(recording, start_ns))
     if faults:
         raise DeviceError("\n".join(faults))
+    files.log_notes()
     whole = {array: _spliced(found) for array, found in segments.items()}
     return [AssignedRecording(array, timed.recording, timed.start_ns, chosen[array]) for array, timed in whole.items()]
 

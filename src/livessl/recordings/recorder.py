@@ -2,36 +2,49 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-import soundfile
 
 from livessl.clock import Clock
 from livessl.core.stream.timeline import Timeline
 from livessl.core.types import Block
+from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import paced_blocks
 from livessl.recordings.session import Piece, piece, write_session
+from livessl.recordings.sound_file import Format, SoundWriter
 from livessl.site.models import Site
 
 FLAC_MAX_CHANNELS: Final = 8
 """Most channels of a FLAC file, by its format."""
 
-Format = Literal["flac", "wav"]
-_WRITTEN: Final = {"flac": ("FLAC", "PCM_24"), "wav": ("RF64", "FLOAT")}
-"""Container and sample format of each kind, as libsndfile names them. RF64 is WAV without its limit of 4 GiB, which
-16 channels reach in 23 minutes at 48 kHz."""
+
+class RecordingError(RunError):
+    """A recording that had to end because its sound could not be stored."""
+
+
+_FULL: Final = ("the disk is full", "free some space")
+_FAILURES: Final = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EFBIG: (
+        "a file has reached the largest size allowed (4 GiB on FAT disks, or `ulimit -f`)",
+        "raise the limit",
+    ),
+}
+"""Reason and cure by the number of the system's error."""
 
 
 @dataclass(slots=True)
 class _Open:
-    file: soundfile.SoundFile
+    file: SoundWriter
     array: str
     name: str
     first_index: int
@@ -75,6 +88,7 @@ class Recorder:
         self._pieces: list[Piece] = [] if pieces is None else pieces
         self._next_index: int | None = None
         self._segment = 0
+        self._kept_s = 0.0
         directory.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Recorder:
@@ -83,7 +97,12 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._close_segment()
+        try:
+            self._close_segment()
+        except OSError as failure:
+            self._rescue()
+            if error is None:
+                raise self._ended(failure) from failure
 
     @property
     def recorded(self) -> bool:
@@ -91,15 +110,25 @@ class Recorder:
         return bool(self._pieces)
 
     def push(self, block: Block) -> None:
-        """Write a block."""
+        """Write a block.
+
+        Raises
+        ------
+        RecordingError
+            If the disk is full, or fails: what is recorded so far is kept and can be read.
+        """
         if block.samples.shape[1] == 0:
             return
-        if block.overflow or block.first_index != self._next_index:
-            self._close_segment()
-            self._open_segment(block)
-        self._timeline.update(block.first_index, block.stamp_ns)
-        for item in self._open:
-            item.file.write(block.samples[self._channels[item.array]].T)
+        try:
+            if block.overflow or block.first_index != self._next_index:
+                self._close_segment()
+                self._open_segment(block)
+            self._timeline.update(block.first_index, block.stamp_ns)
+            for item in self._open:
+                item.file.write(block.samples[self._channels[item.array]])
+        except OSError as error:
+            self._rescue()
+            raise self._ended(error) from error
         self._next_index = block.first_index + int(block.samples.shape[1])
 
     def _open_segment(self, first: Block) -> None:
@@ -108,15 +137,7 @@ class Recorder:
         for array, channels in self._channels.items():
             kind = "wav" if len(channels) > FLAC_MAX_CHANNELS else self._kind
             name = f"{array}-{self._segment:03d}.{kind}"
-            container, subtype = _WRITTEN[kind]
-            file = soundfile.SoundFile(
-                self._directory / name,
-                "w",
-                samplerate=round(self._rate_hz),
-                channels=len(channels),
-                format=container,
-                subtype=subtype,
-            )
+            file = SoundWriter(self._directory / name, round(self._rate_hz), len(channels), kind)
             self._open.append(_Open(file, array, name, first.first_index, len(self._pieces)))
             self._pieces.append(piece(array, name, first.stamp_ns))
         self._segment += 1
@@ -129,8 +150,22 @@ class Recorder:
         for item in self._open:
             item.file.close()
             self._pieces[item.piece] = piece(item.array, item.name, self._timeline.time_ns(item.first_index))
+        self._kept_s += min(item.file.frames for item in self._open) / self._rate_hz
         self._open.clear()
         write_session(self._directory, self._site, self._pieces)
+
+    def _rescue(self) -> None:
+        """Close the open files after an error and make them readable; the session on disk lists them already."""
+        if self._open:
+            self._kept_s += min([item.file.rescue() for item in self._open])
+        self._open.clear()
+
+    def _ended(self, error: OSError) -> RecordingError:
+        reason, cure = _FAILURES.get(error.errno or 0, ((error.strerror or str(error)).lower(), "correct that"))
+        kept = f"the {self._kept_s:.1f} s before are kept and can be replayed" if self._kept_s else "nothing is kept"
+        return RecordingError(
+            f"{self._directory}: {reason}, so recording ended; {kept}; {cure}, or record to another disk"
+        )
 
 
 def record_playback(

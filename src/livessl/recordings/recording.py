@@ -9,17 +9,21 @@ from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
-import soundfile
 
 from livessl.clock import Clock
 from livessl.core.types import MAX_SAMPLE, Block, Float32Array
 from livessl.errors import DeviceError
+from livessl.recordings.sound_file import SoundFile
 
 BLOCK_S: Final = 0.02
 """Length of a recording's blocks in seconds: the default of an audio interface, `device.block_s`."""
 
 _SCAN_SAMPLES: Final = 1 << 18
 """Samples of each channel that are checked at a time, so that a long file does not fill the memory."""
+
+
+class EmptyFileError(DeviceError):
+    """A sound file without a single sample."""
 
 
 class Recording(Protocol):
@@ -53,6 +57,8 @@ class Recording(Protocol):
 class FileRecording:
     """A WAV or FLAC file, in any sample format that libsndfile reads.
 
+    A file that was cut, or whose header was never finished, is read as far as it is complete, and `note` is set.
+
     Parameters
     ----------
     path : Path
@@ -67,35 +73,34 @@ class FileRecording:
     def __init__(self, path: Path) -> None:
         self.name = str(path)
         self._path = path
-        with self._open() as file:
-            self.sample_rate_hz = float(file.samplerate)
-            self.channels = int(file.channels)
-            self.duration_s = file.frames / file.samplerate
+        with SoundFile(path) as file:
+            self.sample_rate_hz = float(file.sample_rate_hz)
+            self.channels = file.channels
+            self.frames = file.frames
+            self.note = file.note
             self._check(file)
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return self.frames / self.sample_rate_hz
+
+    def cut(self, frames: int) -> None:
+        """Read no more than the first `frames` samples of each channel."""
+        self.frames = min(self.frames, frames)
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
         """Yield blocks of `BLOCK_S`, (channels, n) each; `start_ns` is the site time of the first sample."""
-        with self._open() as file:
+        with SoundFile(self._path) as file:
             yield from _blocks(
-                file.blocks(round(BLOCK_S * self.sample_rate_hz), dtype="float32", always_2d=True),
-                self.sample_rate_hz,
-                start_ns,
+                file.pieces(round(BLOCK_S * self.sample_rate_hz), self.frames), self.sample_rate_hz, start_ns
             )
 
-    def _open(self) -> soundfile.SoundFile:
-        try:
-            return soundfile.SoundFile(self._path)
-        except (soundfile.LibsndfileError, OSError, TypeError) as error:
-            reason = getattr(error, "error_string", None) or getattr(error, "strerror", None) or str(error)
-            reason = reason if self._path.exists() else "no such file"
-            raise DeviceError(f"{self._path}: expected a WAV or FLAC file, cannot read it: {reason}") from error
-
-    def _check(self, file: soundfile.SoundFile) -> None:
+    def _check(self, file: SoundFile) -> None:
         if file.frames == 0:
-            raise DeviceError(f"{self.name}: expected sound, got a file of zero length; record it again")
-        may_hold_anything = file.subtype in ("FLOAT", "DOUBLE")
+            raise EmptyFileError(f"{self.name}: expected sound, got a file of zero length; record it again")
         silent, position = True, 0
-        for samples in file.blocks(_SCAN_SAMPLES, dtype="float32", always_2d=True):
+        for samples in file.pieces(_SCAN_SAMPLES, file.frames):
             if not np.isfinite(samples).all():
                 bad, channel = np.argwhere(~np.isfinite(samples))[0]
                 raise DeviceError(
@@ -110,7 +115,7 @@ class FileRecording:
                 )
             silent = silent and not samples.any()
             position += len(samples)
-            if not silent and not may_hold_anything:
+            if not silent and not file.may_hold_anything:
                 return
         if silent:
             raise DeviceError(f"{self.name}: expected sound, got all-zero samples; was the right input recorded?")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -72,10 +73,24 @@ def piece(array: str, file: str, start_ns: int) -> Piece:
 
 
 def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
-    """Write the session file and the site file into the folder of the recordings."""
-    (directory / SITE_FILE).write_text(site_text(site), encoding="utf-8")
+    """Write the session file and the site file into the folder of the recordings.
+
+    Older ones are replaced whole or not at all, so that a full disk and a sudden end leave a session that can be read.
+    """
     described = _SessionFile(version=VERSION, pieces=pieces).model_dump()
-    (directory / SESSION_FILE).write_text(yaml.safe_dump(described, sort_keys=False), encoding="utf-8")
+    _replace(directory / SITE_FILE, site_text(site))
+    _replace(directory / SESSION_FILE, yaml.safe_dump(described, sort_keys=False))
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink()
+        raise
 
 
 def read_session(directory: Path) -> Session:

@@ -1,4 +1,7 @@
-"""States of the arrays: what the API and the log report of each, and which of them an operator has disabled."""
+"""States of the arrays: what the API and the log report of each, and which of them an operator has disabled.
+
+`ArrayHealth.state` decides a state; this module passes on what the nodes and the operator report.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 from livessl.clock import Clock, utc_text
-from livessl.core.stream.array_health import ArrayState, ArrayStatus
+from livessl.core.stream.array_health import ArrayState, ArrayStatus, NodeReport
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
@@ -23,9 +26,6 @@ REPORT_NS: Final = 500_000_000
 
 WATCH_NS: Final = 100_000_000
 """Interval at which the states are compared, nanoseconds; a change is reported at once."""
-
-DISABLED: Final = "disabled"
-"""State of an array that an operator has disabled; it hides the state that the array would have otherwise."""
 
 _log = logging.getLogger(__name__)
 
@@ -101,7 +101,8 @@ class ArrayStates:
         """
         if self._fusion is None:
             return []
-        statuses = self._fusion.status(self._site_time.now_ns(), levels=levels)
+        nodes = {spec.name: self._node_report(spec.name) for spec in self._site.processed}
+        statuses = self._fusion.status(self._site_time.now_ns(), nodes, levels=levels)
         return [self._described(status, self._fusion) for status in statuses]
 
     def watch(self) -> None:
@@ -126,25 +127,16 @@ class ArrayStates:
         self._publish({"kind": "arrays", "now_utc": now_utc, "mode": self._site_time.mode, "arrays": arrays})
 
     def _described(self, status: ArrayStatus, fusion: TwoPassFusion) -> JsonObject:
-        state, reason = self._state(status)
-        enabled = status.name not in self._disabled
-        if not enabled:
-            otherwise = f"{state}: {reason}" if reason else state
-            reason = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
-        status = replace(status, state=state, reason=reason, counters=self._counters(status, fusion))
-        described = {**array_status(status, self._site.node_of(status.name), self._activity), "enabled": enabled}
-        return described if enabled else {**described, "state": DISABLED}
+        status = replace(status, counters=self._counters(status, fusion))
+        described = array_status(status, self._site.node_of(status.name), self._activity)
+        return {**described, "enabled": status.state is not ArrayState.DISABLED}
 
-    def _state(self, status: ArrayStatus) -> tuple[ArrayState, str | None]:
-        """Return state and reason, in view of what the array's node reports of its device."""
-        state, problem = status.state, self._ingest.problem_of(status.name)
-        reason = status.reason if problem is None else problem
-        if problem is not None and state is ArrayState.HEALTHY:
-            state = ArrayState.DEGRADED
-        if state is ArrayState.LOST and self._ingest.is_live(status.name, self._clock.monotonic_ns()):
-            state = ArrayState.QUIET
-            reason = problem or "its node is there, but no sound comes from its device"
-        return state, reason
+    def _node_report(self, array: str) -> NodeReport:
+        return NodeReport(
+            problem=self._ingest.problem_of(array),
+            is_live=self._ingest.is_live(array, self._clock.monotonic_ns()),
+            is_disabled=array in self._disabled,
+        )
 
     def _counters(self, status: ArrayStatus, fusion: TwoPassFusion) -> dict[str, int]:
         name = status.name
@@ -152,7 +144,7 @@ class ArrayStates:
             **status.counters,
             "duplicates": self._ingest.duplicates[name] + fusion.duplicates.get(name, 0),
             "sequence_gaps": self._ingest.sequence_gaps[name],
-            "backfilled": fusion.backfilled.get(name, 0),
+            "backfilled": fusion.backlog_frames.get(name, 0),
             "asked": fusion.asked.get(name, 0),
             "helped": fusion.helped.get(name, 0),
             "too_late": fusion.too_late.get(name, 0),

@@ -16,6 +16,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from livessl.server.refusals import Refusals
+from livessl.site.addresses import plain_address
 from livessl.site.keys import ServerKeys
 
 DOOR: Final = "nodes"
@@ -100,6 +101,6 @@ def _answer(request: list[bytes], names: Mapping[bytes, str], refusals: Refusals
     version, number, _domain, address, _identity, mechanism, *credentials = request
     name = names.get(credentials[0]) if mechanism == b"CURVE" and len(credentials) == 1 else None
     if name is None:
-        refusals.note(DOOR, address.decode("ascii", "replace"), "its key is not enrolled")
+        refusals.note(DOOR, plain_address(address.decode("ascii", "replace")), "its key is not enrolled")
         return [version, number, b"400", b"not enrolled", b"", b""]
     return [version, number, b"200", b"", name.encode(), b""]

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import socket
 import ssl
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
 from fastapi import FastAPI
+from uvicorn._types import ASGISendEvent
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import InvalidState
 
 from livessl.errors import ConfigError, Fault
 from livessl.server.receiver import BindError, address_cure
+from livessl.site.addresses import in_url
 from livessl.site.models import Site
 from livessl.site.server_models import HttpConfig
 
@@ -38,7 +41,16 @@ CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
 
 
 class _WebSocket(WebSocketsSansIOProtocol):
-    """A WebSocket that can be shut down while its client is closing it; uvicorn's own would stop the whole shutdown."""
+    """uvicorn's WebSocket without two of its faults.
+
+    It can be shut down while its client is closing it, and it does not log an error when a handshake is refused with
+    an answer of ours.
+    """
+
+    async def send(self, message: ASGISendEvent) -> None:
+        await super().send(message)
+        if self.initial_response is not None and self.close_sent:
+            self.handshake_complete = True
 
     def shutdown(self) -> None:
         try:
@@ -56,23 +68,30 @@ def listen(host: str, port: int) -> socket.socket:
         If the address is taken, or not one of this machine.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # inherited by the accepted sockets
-    try:
-        listener.bind((host, port))
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        cure = address_cure(error.errno)
-        raise BindError(f"server.http: cannot listen on {host}:{port}: {error.strerror}; {cure}") from error
+    with ExitStack() as undo:
+        try:
+            listener = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # accepted sockets inherit it
+            address: tuple[Any, ...] = (host, port)
+            if family == socket.AF_INET6:
+                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # :: is every IPv4 address as well
+                address = socket.getaddrinfo(host, port, family)[0][4]  # has the number of a link-local interface
+            listener.bind(address)
+            listener.listen(128)
+        except OSError as error:
+            cure = address_cure(error.errno)
+            where = f"{in_url(host)}:{port}"
+            raise BindError(f"server.http: cannot listen on {where}: {error.strerror}; {cure}") from error
+        undo.pop_all()
     return listener
 
 
 def url_of(listener: socket.socket, *, tls: bool) -> str:
     """Return the URL of a listening socket."""
-    host, port = listener.getsockname()[:2]
-    return f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
+    name = listener.getsockname()
+    host, port = socket.getnameinfo(name, socket.NI_NUMERICHOST | socket.NI_NUMERICSERV)  # with its interface
+    return f"{'https' if tls else 'http'}://{in_url(host)}:{port}"
 
 
 def certificate_of(site: Site) -> Path | None:
@@ -113,6 +132,7 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
             ssl_keyfile=None if key is None else site.file(key),
             limit_concurrency=MAX_CONNECTIONS,
             ws_max_size=MAX_INCOMING_BYTES,
+            proxy_headers=False,  # the application reads them, by the site's rules
             ws_per_message_deflate=False,  # small messages hardly shrink, and each would cost time and memory
             timeout_graceful_shutdown=SHUTDOWN_S,
         )

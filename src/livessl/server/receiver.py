@@ -21,6 +21,7 @@ from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrival, Arrivals
 from livessl.server.refusals import Refusals
+from livessl.site.addresses import needs_ipv6
 from livessl.site.keys import server_keys
 from livessl.site.models import Site
 
@@ -47,6 +48,8 @@ def address_cure(number: int | None) -> str:
         return "is another server running? Stop it or choose another port"
     if number == errno.EACCES:
         return "choose a port from 1024 on"
+    if number == errno.EAFNOSUPPORT:
+        return "this machine has no IPv6; write an IPv4 address of it"
     return "write an address of this machine"
 
 
@@ -156,6 +159,7 @@ class Receiver:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IPV6, needs_ipv6(site.server.bind))
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
         if keys is not None:
             guard(self._context, self._socket, keys, self.refusals, self._fail)

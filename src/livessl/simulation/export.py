@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import soundfile
+from scipy.signal import resample_poly
 
+from livessl.core.types import Float32Array
 from livessl.recordings.session import piece, write_session
 from livessl.simulation.of_site import rendered
 from livessl.simulation.scene import Scene, truth
@@ -26,9 +30,22 @@ def write_scene(
     scene: Scene,
     *,
     seed: int,
+    rates_hz: Mapping[str, float] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
+
+    Parameters
+    ----------
+    directory : Path
+    site : Site
+    scene : Scene
+    seed : int
+        Seed of the microphones' own noise.
+    rates_hz : mapping of array name to float, or None
+        Sampling rates of arrays whose files are not written at the scene's rate.
+    progress : callable or None
+        Called with (sources done, sources in all).
 
     Raises
     ------
@@ -38,8 +55,18 @@ def write_scene(
     directory.mkdir(parents=True, exist_ok=True)
     pieces = []
     for spec, samples in rendered(site, scene, seed=seed, progress=progress):
-        soundfile.write(directory / f"{spec.name}.wav", samples.T, round(scene.sample_rate_hz), subtype="PCM_16")
+        rate_hz = (rates_hz or {}).get(spec.name, scene.sample_rate_hz)
+        resampled = _resampled(samples, scene.sample_rate_hz, rate_hz)
+        soundfile.write(directory / f"{spec.name}.wav", resampled.T, round(rate_hz), subtype="PCM_16")
         pieces.append(piece(spec.name, f"{spec.name}.wav", NOMINAL_START_NS))
     lines = "".join(json.dumps(entry) + "\n" for entry in truth(scene))
     (directory / TRUTH_FILE).write_text(lines, encoding="utf-8")
     write_session(directory, site, pieces)
+
+
+def _resampled(samples: Float32Array, from_hz: float, to_hz: float) -> Float32Array:
+    if from_hz == to_hz:
+        return samples
+    ratio = Fraction(round(to_hz), round(from_hz))
+    resampled = resample_poly(samples, ratio.numerator, ratio.denominator, axis=1)
+    return np.asarray(resampled.clip(-1, 1), dtype=np.float32)

@@ -66,7 +66,7 @@ def simulate(
         If there is no such scene: see `make_scene`.
     """
     site = site if isinstance(site, Site) else load_site(site)
-    rate_hz = sample_rate_hz or _device_rate_hz(site)
+    rate_hz = sample_rate_hz or next(iter(device_rates_hz(site).values()), DEFAULT_RATE_HZ)
     scene = scene_of(site, rt60_s=rt60_s, sounds=sounds, count=count, sample_rate_hz=rate_hz, seed=seed)
     recordings = {spec.name: samples for spec, samples in rendered(site, scene, seed=seed)}
     return Simulation(scene, recordings, rate_hz)
@@ -117,6 +117,11 @@ def rendered(
         yield spec, render(scene, spec.microphones_m, seed=seed + 1 + number, progress=report)
 
 
-def _device_rate_hz(site: Site) -> float:
-    rates = (node.device.sample_rate_hz for node in site.nodes.values())
-    return next((rate for rate in rates if rate is not None), DEFAULT_RATE_HZ)
+def device_rates_hz(site: Site) -> dict[str, float]:
+    """Return the sampling rate of each array's device, hertz; arrays whose device has none in the site are left out."""
+    return {
+        array: node.device.sample_rate_hz
+        for node in site.nodes.values()
+        if node.device.sample_rate_hz is not None
+        for array in node.arrays
+    }

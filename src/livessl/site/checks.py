@@ -216,6 +216,11 @@ def _privacy_gaps(site: Site) -> Iterator[str]:
             "server.http: tokens and positions travel unencrypted; set certificate and private_key, or listen on "
             "127.0.0.1 behind a proxy that has them"
         )
+    if http.trusted_hosts and http.tokens is None:
+        yield (
+            "server.http.trusted_hosts: everyone who reaches the proxy may do everything; set server.http.tokens, "
+            "unless the proxy itself asks for a password"
+        )
     if days is not None and site.server.sinks:
         yield f"store.retention_days: {days:g} days do not reach server.sinks; rotate those files yourself"
 

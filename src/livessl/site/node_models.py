@@ -30,10 +30,10 @@ class SoundDeviceConfig(Model):
 
 
 class WavDeviceConfig(Model):
-    """The fake device: recorded files, played at real speed."""
+    """The fake device: recorded files, played at real speed; an array has one, or several that are its channels."""
 
     type: Literal["wav"]
-    files: dict[str, FileName]
+    files: dict[str, FileName | Annotated[list[FileName], Field(min_length=1)]]
     sample_rate_hz: Positive | None = None
     loop: bool = False
 

@@ -6,19 +6,42 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from livessl.site.addresses import check_endpoint
+from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
 from livessl.site.fields import FileName, Model, Positive
 from livessl.site.sink_types import check_sink_type
 
 
 class HttpConfig(Model):
-    """Address, access tokens and certificate of the API and the dashboard."""
+    """Address, names, access tokens and certificate of the API and the dashboard."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    trusted_hosts: tuple[str, ...] = ()
+    root_path: str = ""
+    forwarded_allow_ips: tuple[str, ...] = ("127.0.0.1", "::1")
     tokens: FileName | None = None
     certificate: FileName | None = None
     private_key: FileName | None = None
+
+    @field_validator("host")
+    @classmethod
+    def _host(cls, host: str) -> str:
+        return check_host(host)
+
+    @field_validator("trusted_hosts")
+    @classmethod
+    def _trusted(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_trusted_host(host) for host in hosts)
+
+    @field_validator("root_path")
+    @classmethod
+    def _root(cls, path: str) -> str:
+        return check_root_path(path)
+
+    @field_validator("forwarded_allow_ips")
+    @classmethod
+    def _proxies(cls, networks: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_network(network) for network in networks)
 
     @model_validator(mode="after")
     def _pair(self) -> HttpConfig:

@@ -85,7 +85,7 @@ def test_array_that_is_away_delays_no_early_event_and_corrects_the_final_one() -
     (late,) = settled_events(said)
     assert (late.heard_by, late.late) == (NAMES, True)
     assert late.latency_s == pytest.approx((111 - 46) * 0.05)
-    assert into.backfilled == {"north": 0, "south": len(kept)}
+    assert into.backlog_frames == {"north": 0, "south": len(kept)}
 
 
 def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:

@@ -316,7 +316,7 @@ def test_event_of_too_few_arrays_is_refused() -> None:
     arrivals = node("north", range(10, 15), range(30)) + node("south", (), range(30))
     event = only_event(play(fusion_of(scripted, min_arrays=2, updates=True), arrivals, 30))
     assert (event.status, event.estimate, event.contributions) == (Status.REFUSED, None, ())
-    assert event.reason == "detected by 1 of at least 2 arrays"
+    assert event.reason == "detected by 1 array; fusion.min_arrays is 2"
     assert event.heard_by == ("north",)
     assert scripted.calls == []
 
@@ -652,7 +652,7 @@ def test_dead_microphone_is_reported_after_a_second(powers: tuple[float, ...], s
     ("trouble", "said"),
     [
         ({"overflows": 3}, "its device loses samples; use larger blocks or a less busy machine"),
-        ({"lost_frames": 3}, "frames were torn by a gap in the sound"),
+        ({"lost_frames": 3}, "the device skipped samples; frames at the gap were dropped"),
         ({"clock": ClockState.STEPPED}, "its clock has stepped"),
     ],
 )

@@ -171,7 +171,7 @@ def test_index_is_the_inverse_of_time() -> None:
 def test_time_before_the_first_stamp_is_an_error() -> None:
     timeline = Timeline(RATE_HZ)
     assert not timeline.started
-    with pytest.raises(RuntimeError, match="before the first stamp"):
+    with pytest.raises(RuntimeError, match="expected a stamp before the first query"):
         timeline.time_ns(0)
     timeline.update(0, START_NS)
     assert timeline.started

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -19,6 +18,7 @@ from livessl.cli.main import main
 from livessl.lab.evaluate import campaign
 from livessl.lab.evaluate.campaign import run_campaign
 from livessl.lab.evaluate.job import read_clips
+from small_site import HANG_S, started, wait_until
 
 POSITIONS = 16
 
@@ -41,6 +41,10 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+def finished(folder: Path) -> list[Path]:
+    return list((folder / "parts").glob("*.parquet"))
+
+
 def alive(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
@@ -53,23 +57,16 @@ def alive(pid: int) -> bool:
 def test_a_killed_and_resumed_campaign_gives_the_same_bytes(tmp_path: Path) -> None:
     sounds = write_sounds(tmp_path / "sounds")
     cut, whole = tmp_path / "cut", tmp_path / "whole"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "livessl", *arguments(sounds, cut)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 60.0
-    while len(list((cut / "parts").glob("*.parquet"))) < 3:
-        assert process.poll() is None, "the campaign ended before it could be killed"
-        assert time.monotonic() < deadline, "no position was finished in a minute"
-        time.sleep(0.01)
-    workers = children(process.pid)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    command = [sys.executable, "-m", "livessl", *arguments(sounds, cut)]
+    with started(*command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: len(finished(cut)) >= 3 or process.poll() is not None, "three positions")
+        workers = children(process.pid)
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL, "the campaign ended before it could be killed"
+        wait_until(lambda: not any(map(alive, workers)), f"the end of the workers {workers} of the killed command")
     kept = {path: path.read_bytes() for path in (cut / "parts").glob("*.parquet")}
     assert 3 <= len(kept) < POSITIONS
     assert not (cut / "results.parquet").exists()
-    while any(alive(worker) for worker in workers):
-        assert time.monotonic() < deadline, f"workers {workers} outlive the killed command"
-        time.sleep(0.05)
 
     stamps = {path: path.stat().st_mtime_ns for path in kept}
     assert main(arguments(sounds, cut)) == 0
@@ -85,18 +82,11 @@ def test_a_killed_and_resumed_campaign_gives_the_same_bytes(tmp_path: Path) -> N
 @pytest.mark.processes
 def test_an_interrupted_campaign_ends_soon(tmp_path: Path) -> None:
     sounds, out = write_sounds(tmp_path / "sounds"), tmp_path / "out"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "livessl", *arguments(sounds, out), "--positions", "5000"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 60.0
-    while not list((out / "parts").glob("*.parquet")):
-        assert process.poll() is None, "the campaign ended before it could be interrupted"
-        assert time.monotonic() < deadline, "no position was finished in a minute"
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30.0) == 130  # thousands of positions are minutes
+    command = [sys.executable, "-m", "livessl", *arguments(sounds, out), "--positions", "5000"]
+    with started(*command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: finished(out) or process.poll() is not None, "a position")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=HANG_S) == 130  # thousands of positions are minutes
     assert len(list((out / "parts").glob("*.parquet"))) < 1000
 
 

@@ -1,8 +1,8 @@
 """Activity detection on 50 ms frames: the paper's rule, exact over a finished event and causal for live use.
 
 The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active where its mean power is at
-least a tenth of the reference power. Exact, the reference is the event's maximum; live, a decaying maximum, never so
-low that the background could reach a tenth of it.
+least a tenth of the reference power. Over a finished event the reference is the event's maximum. Live it is a decaying
+maximum, with a lower limit of which the background stays below a tenth.
 """
 
 from __future__ import annotations

@@ -1,28 +1,41 @@
-"""Aligns the frames of all arrays on one frame index: what has come, who is awaited, what may close. It reads no clock.
+"""Aligns the frames of all arrays on one frame index, and decides what to do with late frames. It reads no clock.
 
-A frame index closes when every array that is awaited has reached it, or at its deadline; what is late or missing then
-contributes nothing. An array is awaited while it sends, keeps up, and is not excluded.
+A frame index closes when every array that is awaited has reached it, or at its deadline. A frame that comes later is
+counted as late, and contributes nothing to windows and events that have been located; the final pass (`final_pass`)
+uses it. An array is awaited while it sends, keeps up, and is not excluded.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from livessl.core.stream.array_health import LOST_NS, ArrayHealth, ArrayStatus
+from livessl.core.stream.array_health import ArrayHealth, ArrayStatus, NodeReport, is_connected
 from livessl.core.stream.array_stream import ArrayStream
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, Frame, Message
 
 EARLIEST_NS: Final = -30_000_000_000
-"""Least difference, in nanoseconds, of a frame's time from the server's; older sound exceeds a node's buffer."""
+"""Least difference, in nanoseconds, of a frame's time from the server's; older sound counts only as
+backlog."""
 
 LATEST_NS: Final = 500_000_000
 """Greatest difference, in nanoseconds, of a frame's time from the server's; two clocks set by NTP differ by less."""
 
 JUMP_FRAMES: Final = 1200
 """Gap, in frames, that is skipped instead of being closed one frame index after the other: a minute."""
+
+
+def is_ahead_of_clock(frame_index: int, now_ns: int) -> bool:
+    """Return whether a joint frame index lies in the future of the server's clock, by more than clocks may differ."""
+    return frame_index * FRAME_NS - now_ns > LATEST_NS
+
+
+def is_too_old(frame_index: int, now_ns: int) -> bool:
+    """Return whether a joint frame index lies so far in the past that only backlog may have it."""
+    return frame_index * FRAME_NS - now_ns < EARLIEST_NS
 
 
 class Alignment:
@@ -58,7 +71,7 @@ class Alignment:
         """The last frame index that was closed; None before the first."""
         return None if self.next is None else self.next - 1
 
-    def first_of(self, start: int) -> int:
+    def pre_roll_start(self, start: int) -> int:
         """Return the first frame index, pre-roll included, of a sound that became active at `start`."""
         first = start - self._state.parameters.activity.pre_roll_frames
         return first if self.reported_until is None else max(first, self.reported_until)
@@ -70,7 +83,7 @@ class Alignment:
         self.now_ns = now_ns
 
     def on_joint_index(self, message: Message) -> Message | None:
-        """Return a message with the joint frame index instead of its array's own; None where the array is unknown."""
+        """Return a message with the joint frame index instead of its array's own; None if the array is unknown."""
         stream = self.streams.get(message.array)
         if stream is None:
             self.unknown_arrays += 1
@@ -79,12 +92,12 @@ class Alignment:
         return replace(message, frame_index=message.frame_index - ahead) if ahead else message
 
     def accept(self, message: Message) -> bool:
-        """Take in a message on the joint frame index; return whether it is an active frame that comes too late."""
+        """Take in a message on the joint frame index; return whether it is an active frame that came too late."""
         stream, now_ns, is_late = self.streams[message.array], self.now_ns, False
-        ahead_ns = message.frame_index * FRAME_NS - now_ns
-        if not EARLIEST_NS <= ahead_ns <= LATEST_NS:
-            side = "ahead of" if ahead_ns > 0 else "behind"
-            fault = f"its clock is {abs(ahead_ns) / 1e9:.1f} s {side} the server's; set both by NTP"
+        is_ahead = is_ahead_of_clock(message.frame_index, now_ns)
+        if is_ahead or is_too_old(message.frame_index, now_ns):
+            off_s = abs(message.frame_index * FRAME_NS - now_ns) / 1e9
+            fault = f"its clock is {off_s:.1f} s {'ahead of' if is_ahead else 'behind'} the server's; set both by NTP"
             stream.health.reject(now_ns, fault)
             return False
         if isinstance(message, Frame):
@@ -100,7 +113,7 @@ class Alignment:
         return is_late
 
     def advance(self, frame_index: int) -> None:
-        """Take it that every array has sent all up to a frame index."""
+        """Record that every array has sent everything up to a frame index."""
         for stream in self.streams.values():
             self._reach(stream, frame_index)
 
@@ -109,7 +122,7 @@ class Alignment:
         if is_late:
             stream.health.note_late(self.now_ns, frames=1)
         stream.add(frame)
-        stream.health.counters["frames"] += 1
+        stream.health.count_frame()
         if self._watches_health and stream.is_newest(frame.frame_index):
             stream.health.take_frame(frame, self.now_ns)
         return is_late
@@ -126,30 +139,30 @@ class Alignment:
     # --- closing
 
     def gap_ends_at(self) -> int | None:
-        """Return the newest frame index where a gap lies before it that is to be skipped; else None."""
+        """Return the newest frame index if a gap longer than `JUMP_FRAMES` lies before it; otherwise None."""
         if self.next is None:
             return None
         newest = self._newest()
         return newest if newest - self.next > JUMP_FRAMES else None
 
     def note_reported(self, until: int) -> None:
-        """Take it that all sound before a frame index has been reported."""
+        """Record that all sound before a frame index has been reported."""
         self.reported_until = until
 
     def skip_to(self, frame_index: int) -> None:
-        """Go on with a frame index, without closing those before it."""
+        """Continue with a frame index, without closing those before it."""
         self.next = frame_index
 
     def close_next(self) -> int | None:
-        """Close the next frame index and return it; None where it has to wait for an array."""
+        """Close the next frame index and return it; return None if it has to wait for an array."""
         frame_index = self.next
         if frame_index is None or frame_index > self._newest() or not self._may_close(frame_index):
             return None
         self.next = frame_index + 1
         return frame_index
 
-    def await_nobody(self) -> None:
-        """Take it that no array catches up: at the end of a recording."""
+    def stop_waiting(self) -> None:
+        """Treat all arrays as not keeping up, so that none is awaited: at the end of a recording."""
         for stream in self.streams.values():
             stream.fall_behind()
 
@@ -165,7 +178,7 @@ class Alignment:
             stream.prune(oldest)
 
     def _newest(self) -> int:
-        return max(stream.watermark for stream in self.streams.values() if stream.watermark is not None)
+        return max(stream.complete_until for stream in self.streams.values() if stream.complete_until is not None)
 
     def _may_close(self, frame_index: int) -> bool:
         while self._reached and self._reached[0][0] < frame_index:
@@ -182,21 +195,21 @@ class Alignment:
         return True
 
     def _is_awaited(self, stream: ArrayStream, frame_index: int) -> bool:
-        if stream.watermark is None or stream.last_message_ns is None or stream.has_left:
+        if stream.complete_until is None or stream.has_left:
             return False
-        if self._state.is_excluded(stream.spec.name) or stream.watermark >= frame_index:
+        if self._state.is_excluded(stream.spec.name) or stream.complete_until >= frame_index:
             return False
-        return stream.keeps_up and self.now_ns - stream.last_message_ns < LOST_NS
+        return stream.keeps_up and is_connected(stream.last_message_ns, self.now_ns)
 
     # --- clocks
 
     def is_set_back(self, now_ns: int) -> bool:
-        """Return whether the server's clock was set back: what was closed lies in its future."""
+        """Return whether the server's clock was set back, so that frame indices that were closed lie in its future."""
         closed = self.closed
-        return closed is not None and closed * FRAME_NS - now_ns > LATEST_NS
+        return closed is not None and is_ahead_of_clock(closed, now_ns)
 
     def start_over(self) -> None:
-        """Discard all frames and begin anew: after the server's clock was set back they would make all else late."""
+        """Discard all frames and begin anew: after the server's clock was set back, new frames would be late."""
         self.streams = {name: stream.renewed() for name, stream in self.streams.items()}
         self._reached.clear()
         self.next = self.reported_until = None
@@ -204,8 +217,8 @@ class Alignment:
     def correct_clocks(self) -> bool:
         """Align the arrays by the known offsets of their clocks from here on; return whether any frame index moved.
 
-        It must not happen during a sound, which would be torn. Sound that has been reported is not reported again where
-        its array moves on in time.
+        Call it only between sounds: it would tear one. If an array's frame indices grow, sound that was already
+        reported is not reported again.
         """
         clocks, moved, onward = self._state.clock_offsets, False, 0
         if clocks is None:
@@ -220,14 +233,20 @@ class Alignment:
         return moved
 
     def leave(self, array: str) -> None:
-        """Wait no longer for an array whose node has ended on purpose."""
+        """Stop waiting for an array whose node has ended on purpose."""
         if array in self.streams:
             self.streams[array].leave()
 
-    def status(self, now_ns: int, *, levels: bool) -> list[ArrayStatus]:
+    def status(self, now_ns: int, nodes: Mapping[str, NodeReport], *, levels: bool) -> list[ArrayStatus]:
         """Return the status of every array; without `levels` it has no channel powers. Any thread may call it."""
         clocks, votes = self._state.clock_offsets, self._state.votes
         return [
-            stream.status(now_ns, votes.of(name), None if clocks is None else clocks.of(name), levels=levels)
+            stream.status(
+                now_ns,
+                votes.of(name),
+                None if clocks is None else clocks.of(name),
+                nodes.get(name, NodeReport()),
+                levels=levels,
+            )
             for name, stream in self.streams.items()
         ]

@@ -1,4 +1,7 @@
-"""Array health: what is wrong with an array, in words, and the figures that people look at. It reads no clock."""
+"""Array health: the state of an array, the reason for it, and the figures that people look at. It reads no clock.
+
+`ArrayHealth.state` is the only place where the state is decided.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import dead_channels
-from livessl.core.stream.clock_offsets import ClockOffset
+from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off
 from livessl.core.stream.outlier_votes import Votes, is_suspect
-from livessl.core.types import ClockState, Float32Array, Frame, Mark
+from livessl.core.types import FRAME_S, ClockState, Float32Array, Frame, Mark
 
 LOST_NS: Final = 1_500_000_000
 """Time, in nanoseconds, without a message after which an array is lost. Messages come every 50 ms, and clients are to
@@ -21,14 +24,15 @@ know of a loss within 2 s."""
 TROUBLE_NS: Final = 10_000_000_000
 """Time, in nanoseconds, for which a fault keeps an array degraded after it was last seen."""
 
-SILENT_NS: Final = 1_000_000_000
+DEAD_CHANNEL_NS: Final = 1_000_000_000
 """Time, in nanoseconds, after which a channel of all-zero samples is a dead microphone; every live one has noise."""
 
 WEAK_FRAMES: Final = 4
-"""One active frame in this many is examined for channels without sound. They are reported after a second."""
+"""Channels are checked for missing sound in one active frame out of this many; a fault is reported after a second."""
 
 _ZERO_STRIDE: Final = 64
-"""One sample in this many is enough to see that a live channel is not all zeros; only the others are examined whole."""
+"""One sample in this many shows that a live channel is not all zeros; channels that look silent are then examined
+completely."""
 
 
 class ArrayState(StrEnum):
@@ -39,6 +43,26 @@ class ArrayState(StrEnum):
     QUIET = "quiet"
     DEGRADED = "degraded"
     LOST = "lost"
+    DISABLED = "disabled"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeReport:
+    """What else is known of an array: by its node's messages that are not sound, and by the operator.
+
+    Parameters
+    ----------
+    problem : str or None
+        Fault of its device that the node reports.
+    is_live : bool
+        Whether the node has sent anything lately, with or without sound.
+    is_disabled : bool
+        Whether an operator has disabled the array.
+    """
+
+    problem: str | None = None
+    is_live: bool = False
+    is_disabled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +111,7 @@ class ArrayHealth:
         self.fault_ns, self.fault = now_ns, fault
 
     def reject(self, now_ns: int, fault: str) -> None:
-        """Count a message that is not used, and note why."""
+        """Count a message that is not used, and note the reason."""
         self.counters["rejected"] += 1
         self.note(now_ns, fault)
 
@@ -95,6 +119,10 @@ class ArrayHealth:
         """Note that frames are late, and count those of them that have come."""
         self.counters["late"] += frames
         self.note(now_ns, "its frames come after their deadline")
+
+    def count_frame(self) -> None:
+        """Count a frame that is used."""
+        self.counters["frames"] += 1
 
     def take_frame(self, frame: Frame, now_ns: int) -> None:
         """Take in the newest frame."""
@@ -110,7 +138,7 @@ class ArrayHealth:
             if mark.overflows > self.mark.overflows:
                 self.note(now_ns, "its device loses samples; use larger blocks or a less busy machine")
             elif mark.lost_frames > self.mark.lost_frames:
-                self.note(now_ns, "frames were torn by a gap in the sound")
+                self.note(now_ns, "the device skipped samples; frames at the gap were dropped")
         if mark.clock is ClockState.STEPPED:
             self.note(now_ns, "its clock has stepped")
         self.counters["overflows"], self.counters["lost_frames"] = mark.overflows, mark.lost_frames
@@ -118,18 +146,46 @@ class ArrayHealth:
             self.mark, self.power, self.active = mark, mark.power, False
             self._find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
 
-    def state(self, age_ns: int | None, now_ns: int, votes: Votes, *, has_left: bool) -> tuple[ArrayState, str | None]:
-        """Return the array's state and the reason for it.
+    def state(
+        self,
+        now_ns: int,
+        *,
+        age_ns: int | None,
+        has_left: bool,
+        votes: Votes,
+        clock_offset: ClockOffset | None,
+        node: NodeReport,
+    ) -> tuple[ArrayState, str | None]:
+        """Decide the array's state; return it and the reason for it.
 
         Parameters
         ----------
+        now_ns : int
         age_ns : int or None
             Time since its last message; None before the first.
-        now_ns : int
-        votes : Votes
         has_left : bool
             Whether its node has ended on purpose.
+        votes : Votes
+        clock_offset : ClockOffset or None
+            Offset of its node's clock, if it is known.
+        node : NodeReport
         """
+        state, reason = self._state_by_messages(now_ns, age_ns, votes, has_left=has_left)
+        if state is ArrayState.HEALTHY and clock_offset is not None and abs(clock_offset.offset_s) > FRAME_S:
+            state, reason = ArrayState.DEGRADED, clock_is_off(clock_offset)
+        if node.problem is not None:
+            state, reason = ArrayState.DEGRADED if state is ArrayState.HEALTHY else state, node.problem
+        if state is ArrayState.LOST and node.is_live:
+            state, reason = ArrayState.QUIET, node.problem or "its node is there, but no sound comes from its device"
+        if node.is_disabled:
+            otherwise = f"{state}: {reason}" if reason else state
+            reason = f"an operator has disabled it, and its sound is not used; otherwise {otherwise}"
+            state = ArrayState.DISABLED
+        return state, reason
+
+    def _state_by_messages(
+        self, now_ns: int, age_ns: int | None, votes: Votes, *, has_left: bool
+    ) -> tuple[ArrayState, str | None]:
         troubled = self.fault_ns is not None and now_ns - self.fault_ns < TROUBLE_NS
         if age_ns is None:
             return (ArrayState.DEGRADED, self.fault) if troubled else (ArrayState.STARTING, "no message yet")
@@ -142,10 +198,10 @@ class ArrayHealth:
         return (ArrayState.HEALTHY, None) if reason is None else (ArrayState.DEGRADED, reason)
 
     def _channel_fault(self, now_ns: int) -> str | None:
-        if self.dead and now_ns - self.dead_since_ns >= SILENT_NS:
+        if self.dead and now_ns - self.dead_since_ns >= DEAD_CHANNEL_NS:
             which = "all channels are" if len(self.dead) == self.microphones else f"microphone {list(self.dead)} is"
             return f"{which} dead: all-zero samples; check cable, gain and channel numbers"
-        if self.weak and now_ns - self.weak_since_ns >= SILENT_NS:
+        if self.weak and now_ns - self.weak_since_ns >= DEAD_CHANNEL_NS:
             which = f"microphone {list(self.weak)} receives next to nothing of what the others receive, and is excluded"
             return f"{which}; check cable, gain and channel numbers"
         return None
@@ -161,6 +217,11 @@ class ArrayHealth:
         if weak and not self.weak:
             self.weak_since_ns = now_ns
         self.weak = weak
+
+
+def is_connected(last_message_ns: int | None, now_ns: int) -> bool:
+    """Return whether the last message came less than `LOST_NS` ago."""
+    return last_message_ns is not None and now_ns - last_message_ns < LOST_NS
 
 
 def _disagreement(votes: Votes) -> str | None:

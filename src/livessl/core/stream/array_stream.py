@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from livessl.core.correlate.band import band_power
-from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
-from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off
+from livessl.core.stream.array_health import LOST_NS, ArrayHealth, ArrayStatus, NodeReport
+from livessl.core.stream.clock_offsets import ClockOffset
 from livessl.core.stream.correlation_cache import Correlations
 from livessl.core.stream.outlier_votes import Votes
-from livessl.core.types import FRAME_S, ArraySpec, Frame
+from livessl.core.types import ArraySpec, Frame
 
 
 @dataclass(slots=True)
@@ -22,7 +22,7 @@ class ArrayStream:
     frames_ahead: int = 0  # whole frames that its clock is ahead, subtracted from its frame indices
     rest_ns: int = 0  # the rest of its clock's offset, subtracted from the times of events
     frames: dict[int, Frame] = field(default_factory=dict)
-    watermark: int | None = None  # all up to this frame index has come
+    complete_until: int | None = None  # all up to this frame index has come
     last_message_ns: int | None = None
     keeps_up: bool = True  # False after it missed a deadline, until it has caught up
     has_left: bool = False
@@ -37,27 +37,27 @@ class ArrayStream:
 
     def is_newest(self, frame_index: int) -> bool:
         """Return whether no message of a later frame index has come."""
-        return self.watermark is None or frame_index >= self.watermark
+        return self.complete_until is None or frame_index >= self.complete_until
 
     def advance(self, frame_index: int, now_ns: int) -> None:
-        """Take it that all up to a frame index has come."""
+        """Record that everything up to a frame index has come."""
         self.last_message_ns, self.has_left = now_ns, False
-        self.watermark = frame_index if self.watermark is None else max(self.watermark, frame_index)
+        self.complete_until = frame_index if self.complete_until is None else max(self.complete_until, frame_index)
 
     def catch_up(self) -> None:
-        """Take it that the array keeps up with the others, and can be awaited."""
+        """Record that the array keeps up with the others and can be awaited."""
         self.keeps_up = True
 
     def fall_behind(self) -> None:
-        """Take it that the array does not keep up, and await it no longer."""
+        """Record that the array does not keep up; it is no longer awaited."""
         self.keeps_up = False
 
     def leave(self) -> None:
-        """Take it that the array's node has ended on purpose."""
+        """Record that the array's node has ended on purpose."""
         self.has_left = True
 
     def add(self, frame: Frame) -> None:
-        """Add a frame. If its sampling rate is new, it comes from another device, and what came before is discarded."""
+        """Add a frame. A new sampling rate means another device, and discards all earlier frames."""
         if frame.sample_rate_hz != self.sample_rate_hz:
             self.frames.clear()
             self.discard_correlations()
@@ -70,7 +70,7 @@ class ArrayStream:
         return frame is not None and frame.active
 
     def segments(self, frame_indices: Iterable[int]) -> tuple[list[list[Frame]], list[int]]:
-        """Return the frames at ascending frame indices, cut where one is missing; and the indices that are there."""
+        """Return the frames at ascending frame indices, split where one is missing, and the indices present."""
         segments: list[list[Frame]] = []
         there: list[int] = []
         for frame_index in frame_indices:
@@ -90,7 +90,7 @@ class ArrayStream:
                 self.frames[frame_index] = replace(frame, samples=frame.samples[:, :0].copy())
 
     def has_samples(self, frame_indices: Iterable[int]) -> bool:
-        """Return whether the samples of none of the frames at these frame indices were released."""
+        """Return whether all frames at these indices still have their samples."""
         return all(self.frames[frame_index].samples.size for frame_index in frame_indices if frame_index in self.frames)
 
     def correct_clock(self, frames_ahead: int, rest_ns: int) -> int:
@@ -100,8 +100,8 @@ class ArrayStream:
         if more:
             self.frames_ahead = frames_ahead
             self.frames = {k - more: replace(frame, frame_index=k - more) for k, frame in self.frames.items()}
-            if self.watermark is not None:
-                self.watermark -= more
+            if self.complete_until is not None:
+                self.complete_until -= more
             self.discard_correlations()
         return more
 
@@ -125,18 +125,21 @@ class ArrayStream:
         while onsets and (first := next(iter(onsets))) < oldest:
             del onsets[first]
 
-    def status(self, now_ns: int, votes: Votes, offset: ClockOffset | None, *, levels: bool) -> ArrayStatus:
+    def status(
+        self, now_ns: int, votes: Votes, offset: ClockOffset | None, node: NodeReport, *, levels: bool
+    ) -> ArrayStatus:
         """Return the array's status; without `levels` it has no channel powers. Any thread may call it."""
         health, mark = self.health, self.health.mark
         age_ns = None if self.last_message_ns is None else max(0, now_ns - self.last_message_ns)
-        state, reason = health.state(age_ns, now_ns, votes, has_left=self.has_left)
-        if state is ArrayState.HEALTHY and offset is not None and abs(offset.offset_s) > FRAME_S:
-            state, reason = ArrayState.DEGRADED, clock_is_off(offset)
+        is_lost = age_ns is not None and (self.has_left or age_ns >= LOST_NS)
+        state, reason = health.state(
+            now_ns, age_ns=age_ns, has_left=self.has_left, votes=votes, clock_offset=offset, node=node
+        )
         return ArrayStatus(
             name=self.spec.name,
             state=state,
             reason=reason,
-            active=health.active and state is not ArrayState.LOST,
+            active=health.active and not is_lost,
             age_s=None if age_ns is None else age_ns / 1e9,
             power=health.power,
             noise_power=mark.noise_power if mark else None,
@@ -153,7 +156,7 @@ class ArrayStream:
 
     def _channel_power(self) -> tuple[float, ...]:
         """Return the channels' powers at the newest frame index, from its frame or mark."""
-        newest = self.frames.get(self.watermark) if self.watermark is not None else None
+        newest = self.frames.get(self.complete_until) if self.complete_until is not None else None
         if newest is not None:
             return tuple(float(power) for power in band_power(newest.samples, newest.sample_rate_hz, self.spec.band_hz))
         return self.health.mark.channel_power if self.health.mark else ()

@@ -1,7 +1,7 @@
-"""Backfill: frames requested from arrays that did not detect an event, and whether its results are better with them.
+"""Backfill: requests frames of an event from arrays that did not detect it, and decides whether to use them.
 
-Frames are requested where the results of the arrays that detected the event are not sure: the very frames that a node
-would have sent with it. They are used if the results are then better. Evidence is not normalised, so that an array that
+If the detecting arrays' result is unsure, the frames that other nodes would have sent are requested. They are used only
+if they improve the result. Evidence is not normalised, so that an array that
 received none of the sound adds next to nothing.
 """
 
@@ -22,10 +22,10 @@ from livessl.core.stream.site_state import SiteState
 from livessl.core.stream.verdict import Verdicts
 from livessl.core.types import FRAME_S, ArraySpec, Event, Frame, Status
 
-SURE: Final = 0.95
-"""Confidence from which on nothing is requested."""
+SURE_WITHOUT_BACKFILL: Final = 0.95
+"""Confidence at and above which no frames are requested."""
 
-MOST_ARRAYS: Final = 4
+MOST_REQUESTED_ARRAYS: Final = 4
 """Most arrays from which frames are requested for one event; the nearest to those that detected it come first."""
 
 MOST_REQUESTED_S: Final = 3.0
@@ -33,22 +33,23 @@ MOST_REQUESTED_S: Final = 3.0
 the rest of a longer one."""
 
 SHARE: Final = 0.25
-"""Share of an array's sound that may be requested in the long run, beyond the first `RECENT_S`."""
+"""Long-run limit on requested frames, as a share of elapsed time, after an initial `RECENT_S`."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
 
 class Backfill:
-    """Chooses what to request for an event, and reconsiders its results with what has come.
+    """Chooses what to request for an event, and reconsiders its results with the frames that have come.
 
     Parameters
     ----------
     state : SiteState
+    verdicts : Verdicts
     """
 
-    def __init__(self, state: SiteState) -> None:
+    def __init__(self, state: SiteState, verdicts: Verdicts) -> None:
         self._state = state
-        self._verdicts = Verdicts(state)
+        self._verdicts = verdicts
         self._allowances: dict[str, Allowance] = {}
 
     def choose(self, event: PendingEvent, span: range, present: Collection[str]) -> dict[str, RequestedFrames]:
@@ -66,7 +67,7 @@ class Backfill:
         excerpt = event.excerpt
         if excerpt is None or is_sure(event.results[0]) or not excerpt.sounds.has_onsets:
             return {}  # without onsets the estimator gives every array the same weight, whatever it received
-        silent = [name for name in present if self._state.answers_requests(name) and name not in excerpt.sounds]
+        silent = [name for name in present if self._state.may_request(name) and name not in excerpt.sounds]
         if not silent:
             return {}
         span = span[: round(MOST_REQUESTED_S / FRAME_S)]
@@ -78,17 +79,17 @@ class Backfill:
         }
 
     def take(self, event: PendingEvent, frame: Frame) -> None:
-        """Take in a requested frame; it is dropped where the event has not requested it, or not that many channels."""
+        """Take in a requested frame, unless the event has not requested it or its number of channels is wrong."""
         requested = event.requested.get(frame.array)
         if requested is not None and len(frame.samples) == len(self._state.arrays[frame.array].microphones_m):
             requested.take(frame)
 
     def is_over(self, event: PendingEvent, now_ns: int) -> bool:
-        """Return whether all requested frames have come that still can, or the time to wait for them is over."""
+        """Return whether every frame that can still come has come, or the wait has timed out."""
         if now_ns - event.requested_ns >= self._state.parameters.backfill_wait_s * 1e9:
             return True
-        can_backfill = self._state.can_backfill
-        return all(frames.is_complete or name not in can_backfill for name, frames in event.requested.items())
+        requested = event.requested.items()
+        return all(frames.is_complete or not self._state.answers(name) for name, frames in requested)
 
     def reconsidered(self, event: PendingEvent, now_ns: int) -> Sequence[Event]:
         """Return the best results of an event: without the requested frames, with all of them, or with one array's."""
@@ -99,7 +100,7 @@ class Backfill:
         useful = {name: sound for name, sound in sounds.items() if sound is not None}
         attempts = [useful, *({name: useful[name]} for name in useful if len(useful) > 1)] if useful else []
         for backfilled in attempts:
-            verdict = self._verdicts.event(event, excerpt, now_ns, backfilled)
+            verdict = self._verdicts.locate_event(event, excerpt, now_ns, backfilled)
             if is_better(verdict.events[0], best[0]):
                 best = verdict.events
                 self._verdicts.count_votes(event, excerpt, verdict)
@@ -131,16 +132,16 @@ class Allowance:
 
 
 def nearest(silent: Sequence[ArraySpec], detecting: Sequence[ArraySpec]) -> list[ArraySpec]:
-    """Return the `MOST_ARRAYS` silent arrays that are nearest to one that detected the event, the nearest first."""
+    """Return the `MOST_REQUESTED_ARRAYS` silent arrays nearest to one that detected the event, nearest first."""
     apart_m = [min(float(np.linalg.norm(spec.centre_m - other.centre_m)) for other in detecting) for spec in silent]
-    return [silent[k] for k in np.argsort(apart_m, kind="stable")[:MOST_ARRAYS]]
+    return [silent[k] for k in np.argsort(apart_m, kind="stable")[:MOST_REQUESTED_ARRAYS]]
 
 
 def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: int) -> BackfilledSound | None:
     """Correlate the requested frames of an event that began at frame index `start`.
 
-    Only the last consecutive ones are used. None where there are none of the event itself, or where the estimator does
-    not correlate frames.
+    Use only the last consecutive frames. Return None if none belongs to the event itself, if their sampling rates
+    differ, or if the estimator does not correlate frames.
     """
     indices = list(takewhile(lambda frame_index: frame_index in requested.frames, reversed(requested.span)))[::-1]
     frames = [requested.frames[frame_index] for frame_index in indices]
@@ -156,8 +157,12 @@ def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: in
 
 
 def is_sure(event: Event) -> bool:
-    """Return whether an event is located with a confidence of at least `SURE`."""
-    return event.status is Status.LOCATED and event.estimate is not None and event.estimate.confidence >= SURE
+    """Return whether an event is located with a confidence of at least `SURE_WITHOUT_BACKFILL`."""
+    return (
+        event.status is Status.LOCATED
+        and event.estimate is not None
+        and event.estimate.confidence >= SURE_WITHOUT_BACKFILL
+    )
 
 
 def is_better(event: Event, than: Event) -> bool:

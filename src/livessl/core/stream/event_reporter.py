@@ -21,24 +21,34 @@ class EventReporter:
     state : SiteState
     alignment : Alignment
     collector : EvidenceCollector
+    verdicts : Verdicts
     learns_clocks : bool
         Whether the offsets of the arrays' clocks are learned from the events.
     """
 
     def __init__(
-        self, state: SiteState, alignment: Alignment, collector: EvidenceCollector, *, learns_clocks: bool
+        self,
+        state: SiteState,
+        alignment: Alignment,
+        collector: EvidenceCollector,
+        verdicts: Verdicts,
+        *,
+        learns_clocks: bool,
     ) -> None:
         self._state = state
         self._alignment = alignment
         self._collector = collector
         self._learns_clocks = learns_clocks
-        self._verdicts = Verdicts(state)
-        self._backfill = Backfill(state)
+        self._verdicts = verdicts
+        self._backfill = Backfill(state, verdicts)
         self._reported_elsewhere: int | None = None
         self._closing_elsewhere: int | None = None
 
     def skip(self, reported_until: int | None, closing_until: int | None) -> None:
-        """Report no event that another pass reports: of sound before a frame index, or that ends by another."""
+        """Skip events that another pass reports.
+
+        Those are events whose sound ended before `reported_until`, and those that close by `closing_until`.
+        """
         self._reported_elsewhere, self._closing_elsewhere = reported_until, closing_until
 
     def end(self, event: PendingEvent, *, became_quiet: bool) -> list[BackfillRequest]:
@@ -47,7 +57,7 @@ class EventReporter:
         self._locate(event)
         if event.excerpt is None:
             return []
-        span = range(self._alignment.first_of(event.start), event.last_active + 1)
+        span = range(self._alignment.pre_roll_start(event.start), event.last_active + 1)
         streams = self._alignment.streams
         requested = self._backfill.choose(event, span, [name for name in streams if not streams[name].has_left])
         if requested:
@@ -57,7 +67,7 @@ class EventReporter:
         return [BackfillRequest(name, span[0] + ahead[name], span[-1] + ahead[name]) for name, span in spans.items()]
 
     def take(self, event: PendingEvent, frame: Frame) -> None:
-        """Take in a frame that answers a request; it is dropped where the event did not request it."""
+        """Take in a frame that answers a request; it is dropped if the event did not request it."""
         self._backfill.take(event, frame)
 
     def is_waiting(self, event: PendingEvent) -> bool:
@@ -67,7 +77,7 @@ class EventReporter:
     def report(self, event: PendingEvent) -> Sequence[Event]:
         """Return the results of an event with the frames that have come, one for each source; its life ends.
 
-        There are none where another pass reports the event.
+        There are none if another pass reports the event.
         """
         if event.state is EventState.OPEN:
             self._locate(event)  # it was cut short
@@ -79,7 +89,7 @@ class EventReporter:
         return event.results
 
     def start_over(self) -> None:
-        """Forget what was requested before, for the server's clock was set back."""
+        """Forget what was requested before, because the server's clock was set back."""
         self._backfill.start_over()
 
     def _is_skipped(self, event: PendingEvent) -> bool:
@@ -92,11 +102,11 @@ class EventReporter:
         """Locate an event by the arrays that detected it, unless another pass does."""
         if self._is_skipped(event):
             return
-        span = range(self._alignment.first_of(event.start), event.closed + 1)
+        span = range(self._alignment.pre_roll_start(event.start), event.closed + 1)
         excerpt = self._collector.event(span)
         if not excerpt.sounds:
             return
-        verdict = self._verdicts.event(event, excerpt, self._alignment.now_ns)
+        verdict = self._verdicts.locate_event(event, excerpt, self._alignment.now_ns)
         event.set_results(verdict.events, excerpt)
         if event.became_quiet and len(verdict.events) == 1:
             self._learn(verdict.events[0], span)

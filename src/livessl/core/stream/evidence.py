@@ -1,7 +1,7 @@
 """Collects what an event or a window is located from: sounds, correlations, and the powers of their frames.
 
-It also decides which samples are kept while a sound goes on, and correlates frames in quiet so that a sound that begins
-soon does not have to wait for its pre-roll.
+It also decides which samples are kept while a sound goes on, and correlates frames before a sound begins, so that the
+sound does not have to wait for its pre-roll.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, Float
 
 KEPT_ARRAYS: Final = 24
 """Number of arrays whose samples are kept while a sound goes on: those with the greatest onset strength so far, half as
-many again as an estimator uses. Of the others only the correlations stay, for 64 arrays send 45 MB a second."""
+many again as an estimator uses. Only correlations are kept for the others, because 64 arrays send 45 MB/s."""
 
 RELEASE_FRAMES: Final = 10
-"""Number of frames between two choices of these arrays."""
+"""Number of frames between two updates of that choice."""
 
 
 class Segments(Sequence[Float32Array]):
-    """Segments of one array's samples, each (K, n), joined from frames when it is read.
+    """Segments of one array's samples, each (K, n), which are joined from frames when they are read.
 
     Samples are thus never copied for all arrays at once, and not at all if they are not used. Frames whose samples were
     released, which are the first ones, are left out.
@@ -62,7 +62,7 @@ class Sounds(Mapping[str, Sound]):
     suspects : collection of str
         Names of the suspect arrays.
     ended : bool
-        Whether the sound has ended, so that these are whole.
+        Whether the sound has ended, so that each array's sound is complete.
     """
 
     def __init__(self, sources: int, suspects: Collection[str] = (), *, ended: bool = True) -> None:
@@ -85,7 +85,7 @@ class Sounds(Mapping[str, Sound]):
 
     @property
     def has_onsets(self) -> bool:
-        """True where the estimator correlates every frame, and so weighs each array by what it received."""
+        """True if the estimator correlates every frame, and thus weights each array by what it received."""
         return any(self._onsets.values())
 
     def __getitem__(self, array: str) -> Sound:
@@ -132,6 +132,17 @@ class Excerpt:
     end_ns: int = -(2**63)
     powers: dict[str, FloatArray] = field(default_factory=dict)
 
+    def add(
+        self, array: str, segments: Sequence[Sequence[Frame]], onsets: tuple[OnsetGCC, ...], powers: FloatArray
+    ) -> None:
+        """Add the sound of an array: see `Sounds.add`; `powers` (n,) are those of its frames, full scale squared."""
+        self.sounds.add(array, segments, onsets)
+        self.powers[array] = powers
+
+    def extend(self, start_ns: int, end_ns: int) -> None:
+        """Let the excerpt begin at `start_ns` at the latest, and end at `end_ns` at the earliest."""
+        self.start_ns, self.end_ns = min(self.start_ns, start_ns), max(self.end_ns, end_ns)
+
     @property
     def middle_ns(self) -> int:
         """Site time of its middle."""
@@ -146,8 +157,8 @@ class Excerpt:
         """Return this excerpt with the sounds of requested frames added; the times stay."""
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
         for name, sound in backfilled.items():
-            joined.sounds.add(name, [sound.frames], sound.onsets)
-            joined.powers[name] = np.array([frame.power for frame in sound.frames])
+            powers = np.array([frame.power for frame in sound.frames])
+            joined.add(name, [sound.frames], sound.onsets, powers)
         return joined
 
 
@@ -160,7 +171,7 @@ class EvidenceCollector:
     alignment : Alignment
         The arrays' frames on the joint frame index.
     correlates_ahead : bool
-        Whether frames are correlated in quiet. With many arrays there is no time for it once the sound has begun.
+        Whether frames are correlated before a sound begins. With many arrays there is no time for it afterwards.
     """
 
     def __init__(self, state: SiteState, alignment: Alignment, *, correlates_ahead: bool) -> None:
@@ -177,11 +188,11 @@ class EvidenceCollector:
     def begin_event(self, start: int) -> None:
         """Correlate the pre-roll of an event that became active at `start`.
 
-        The correlations begin anew, so that an event is the same whatever came before it; where a sound was split for
-        its length they continue.
+        The correlations begin anew, so that an event is the same whatever came before it. If a sound was split
+        because of its length, they continue.
         """
         self._onset_strength = {}
-        span, streams = range(self._alignment.first_of(start), start), self._alignment.streams.values()
+        span, streams = range(self._alignment.pre_roll_start(start), start), self._alignment.streams.values()
         if start != self._alignment.reported_until:
             is_ready = self._ahead == span and all(
                 stream.upcoming.has(k for k in span if k in stream.frames) for stream in streams
@@ -196,8 +207,8 @@ class EvidenceCollector:
         """Correlate the frames of all arrays at a frame index that belongs to an event."""
         self._correlate(self._alignment.streams.values(), [frame_index])
 
-    def correlate_what_is_here(self, frame_index: int) -> None:
-        """Correlate the frames that have come of a frame index which still waits for other arrays."""
+    def correlate_arrived(self, frame_index: int) -> None:
+        """Correlate the frames that have arrived of a frame index that still waits for other arrays."""
         streams = self._alignment.streams.values()
         here = [s for s in streams if frame_index in s.frames and frame_index not in s.correlations.onsets]
         self._correlate(here, [frame_index])
@@ -211,7 +222,7 @@ class EvidenceCollector:
             The quiet frame index.
         begin : int or None
             First frame index after the last sound. The pre-roll of the next sound begins there if that sound comes
-            soon; later it begins at a frame index that is not known yet.
+            soon; otherwise its start is not known yet.
         """
         if not self._correlates_ahead or begin is None:
             return
@@ -236,9 +247,9 @@ class EvidenceCollector:
     # --- samples
 
     def release_samples(self, frame_index: int) -> None:
-        """Release the samples of the arrays with the least onset strength, but for those that a window may need.
+        """Release the samples of the arrays with the least onset strength, except those that a window may need.
 
-        To be called every `RELEASE_FRAMES` of an event.
+        Call it every `RELEASE_FRAMES` of an event.
         """
         streams = self._alignment.streams
         if len(streams) <= KEPT_ARRAYS:
@@ -263,8 +274,8 @@ class EvidenceCollector:
         for name, stream in self._alignment.streams.items():
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
             if segments and not self._votes.is_suspect(name):
-                sounds.add(name, segments, stream.correlations.at(window))
-                excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
+                powers = np.array([stream.frames[k].power for k in there])
+                excerpt.add(name, segments, stream.correlations.at(window), powers)
         return excerpt
 
     def whole_sounds(self, arrays: Iterable[str], span: range) -> list[tuple[ArraySpec, list[Frame]]]:
@@ -295,8 +306,6 @@ class EvidenceCollector:
         if not stream.correlations.has(there) and stream.has_samples(there):  # some frames came late
             stream.begin_correlations()
             self._correlate([stream], span)
-        name, end = stream.spec.name, frame_indices[-1] + 1
-        excerpt.sounds.add(name, segments, stream.correlations.at(range(span.start, end)))
-        excerpt.powers[name] = power[mask]
-        excerpt.start_ns = min(excerpt.start_ns, frame_indices[0] * FRAME_NS - stream.rest_ns)
-        excerpt.end_ns = max(excerpt.end_ns, end * FRAME_NS - stream.rest_ns)
+        start, end = frame_indices[0], frame_indices[-1] + 1
+        excerpt.add(stream.spec.name, segments, stream.correlations.at(range(span.start, end)), power[mask])
+        excerpt.extend(start * FRAME_NS - stream.rest_ns, end * FRAME_NS - stream.rest_ns)

@@ -1,29 +1,29 @@
-"""Early results now, final ones when all sound is in: two passes over the same messages, behind one door.
+"""Early and final results: two passes over the same messages in one class.
 
 The early pass closes a frame index at its deadline, whatever is missing. The final pass closes it when every array has
-sent all that it has of it, however late and in whatever order that came; its events replace the early ones. While
+sent all its frames of it, however late and in whatever order they came; its events replace the early ones. While
 nothing is late both keep in step, and only the final pass reports events. It reads no clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Final
 
 from livessl.core.locate.estimator import PowerMaps
-from livessl.core.stream.alignment import EARLIEST_NS, LATEST_NS
-from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.stream.alignment import is_ahead_of_clock, is_too_old
+from livessl.core.stream.array_health import ArrayStatus, NodeReport
 from livessl.core.stream.fusion import Fusion, Role
 from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
-from livessl.core.stream.reception import Reception, earlier, later
+from livessl.core.stream.reception import FinalReception, earlier, later
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Mark, Message, Output, Window
 
 STRIDE: Final = 40
-"""Number of frame indices that the final pass closes at a time: two seconds. After a stride with events the early pass
-has its turn."""
+"""Number of frame indices that the final pass closes at a time: two seconds. After a stride with events, the early pass
+runs again before the next one."""
 
 FINAL: Final = Role(updates=False, watches_health=False)
 """Role of the final pass. It receives all frames in order, and so it is the one that learns the clocks' offsets."""
@@ -31,7 +31,7 @@ FINAL: Final = Role(updates=False, watches_health=False)
 
 @dataclass(frozen=True, slots=True)
 class FinalResults:
-    """Final events in order of time, and the frame index before which all sound has become such."""
+    """Final events in order of time, and the frame index before which all events are final."""
 
     events: tuple[Event, ...]
     until: int
@@ -67,10 +67,13 @@ class TwoPassFusion:
         self._state = state
         self._limits = hold_ns, hold_bytes
         self._early = Fusion(state, Role(newest_only=newest_only, learns_clocks=False))
-        self._receptions = {name: Reception() for name in arrays}
+        self._receptions = {name: FinalReception() for name in arrays}
         self.duplicates = dict.fromkeys(self._receptions, 0)
-        self.backfilled = dict.fromkeys(self._receptions, 0)
+        """Number of frames of each array that had come before."""
+        self.backlog_frames = dict.fromkeys(self._receptions, 0)
+        """Number of frames of each array that came as backlog."""
         self.too_late = dict.fromkeys(self._receptions, 0)
+        """Number of new frames of each array that came after the results of their time were final."""
         self.asked = dict.fromkeys(self._receptions, 0)
         """Number of backfill requests to each array."""
         self.helped = dict.fromkeys(self._receptions, 0)
@@ -106,9 +109,11 @@ class TwoPassFusion:
         """Return the estimator's maps of a window that it located. Any thread may call it."""
         return self._early.power_maps(window, separately)
 
-    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
+    def status(
+        self, now_ns: int, nodes: Mapping[str, NodeReport] | None = None, *, levels: bool = True
+    ) -> list[ArrayStatus]:
         """Return the status of every array: see `Fusion.status`."""
-        return self._early.status(now_ns, levels=levels)
+        return self._early.status(now_ns, nodes, levels=levels)
 
     def greet(self, array: str, backlog: tuple[int, int] | None, now_ns: int, *, answers: bool = False) -> None:
         """Take in the greeting of an array's node.
@@ -117,7 +122,7 @@ class TwoPassFusion:
         ----------
         array : str
         backlog : (int, int) or None
-            The oldest frame that it kept, and the first live one; None where all that it kept has come.
+            Frame indices of the oldest kept frame and of the first live one; None if no backlog is left.
         now_ns : int
         answers : bool
             Whether the node answers backfill requests.
@@ -125,13 +130,13 @@ class TwoPassFusion:
         reception = self._receptions.get(array)
         if reception is None:
             return
-        (self._state.can_backfill.add if answers else self._state.can_backfill.discard)(array)
+        self._state.set_answers(array, answers)
         reception.greet(backlog, now_ns)
 
     def leave(self, array: str) -> None:
-        """Wait no longer for an array whose node has ended on purpose."""
+        """Stop waiting for an array whose node has ended on purpose."""
         self._early.leave(array)
-        self._state.can_backfill.discard(array)
+        self._state.set_answers(array, False)
         if array in self._receptions:
             self._receptions[array].leave()
 
@@ -142,8 +147,8 @@ class TwoPassFusion:
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output | FinalResults]:
         """Take in messages, in any order between arrays; return what there is to report."""
         settled = self.settled
-        if settled is not None and settled * FRAME_NS - now_ns > LATEST_NS:
-            self._begin(None)  # the server's clock was set back: what was settled lies in the future now
+        if settled is not None and is_ahead_of_clock(settled, now_ns):
+            self._begin(None)  # the server's clock was set back: final results lie in the future now
             self._early.skip_events(None, None)
         live: list[Message] = []
         requested: list[Message] = []
@@ -164,7 +169,7 @@ class TwoPassFusion:
     def flush(self, now_ns: int) -> list[Output | FinalResults]:
         """Report everything without waiting for any array, at the end of a recording."""
         end = self._end()
-        self._state.can_backfill.clear()
+        self._state.stop_answers()
         self._early.skip_events(end, end)
         outputs: list[Output | FinalResults] = [*self._early.flush(now_ns)]
         while end is not None and (self._position is None or self._position < end):
@@ -187,14 +192,13 @@ class TwoPassFusion:
     # --- what comes in
 
     def _take(self, message: Message, now_ns: int) -> bool:
-        """Take in a message for the final pass; return whether the early pass shall have it, too."""
+        """Take in a message for the final pass; return whether the early pass takes it as well."""
         reception = self._receptions.get(message.array)
         if reception is None:
             return True
         own = message.frame_index
         frame_index, is_backlog = own - self._ahead(message.array), reception.is_backlog(own)
-        ahead_ns = frame_index * FRAME_NS - now_ns
-        if ahead_ns > LATEST_NS or (ahead_ns < EARLIEST_NS and not is_backlog):
+        if is_ahead_of_clock(frame_index, now_ns) or (not is_backlog and is_too_old(frame_index, now_ns)):
             return True  # the early pass rejects it, and notes why
         reception.touch(now_ns)
         self._newest = frame_index if self._newest is None else max(self._newest, frame_index)
@@ -205,13 +209,13 @@ class TwoPassFusion:
             reception.take_backlog(own)
         settled = self.settled
         if own in reception.seen or (settled is not None and frame_index < settled):
-            (self.too_late if reception.is_passed(own) else self.duplicates)[message.array] += 1
+            (self.too_late if reception.is_new(own) else self.duplicates)[message.array] += 1
             return False
         reception.add(own)
         self._held.push(message, frame_index, now_ns)
-        self.backfilled[message.array] += is_backlog
+        self.backlog_frames[message.array] += is_backlog
         closed = self._early.closed
-        is_in_time = not is_backlog or -ahead_ns < self._state.parameters.deadline_s * 1e9
+        is_in_time = not is_backlog or now_ns - frame_index * FRAME_NS < self._state.parameters.deadline_s * 1e9
         if message.active and (not is_in_time or (closed is not None and frame_index <= closed)):
             self._late.add(frame_index)
         return is_in_time
@@ -221,7 +225,7 @@ class TwoPassFusion:
         return self._final.frames_ahead(array)
 
     def _frontier(self, now_ns: int) -> int | None:
-        """Return the frame index up to which all awaited arrays have sent everything; None where one has sent nothing.
+        """Return the frame index up to which all awaited arrays have sent everything; None if one has sent nothing.
 
         Arrays that are away are awaited until the frames of the others are overdue.
         """
@@ -238,7 +242,7 @@ class TwoPassFusion:
         return later(reduce(earlier, connected) if connected else self._end(), self._held.forced_until)
 
     def _end(self) -> int | None:
-        """Return the frame index at which all sound that has come has surely ended."""
+        """Return the frame index at which all sound so far has certainly ended; None before the first message."""
         return None if self._newest is None else self._newest + self._state.parameters.activity.hang_over_frames + 1
 
     # --- the final pass
@@ -273,7 +277,10 @@ class TwoPassFusion:
         return outputs
 
     def _stride_end(self, position: int, frontier: int) -> int:
-        """Return up to which frame index the final pass closes at once: far, while there is no sound."""
+        """Return the frame index up to which the final pass closes in one go.
+
+        During silence this is the frontier, or the frame index before the first held frame.
+        """
         stride, first = position + STRIDE, self._held.first
         if not self._final.is_in_event and (first is None or first > stride):
             stride = frontier if first is None else first - 1

@@ -1,18 +1,18 @@
 """Fusion: the frames of all arrays become updates, events and tracks. It reads no clock.
 
-`Fusion.step(messages, now_ns)` is the only door, live and replayed. It composes the stages: `Alignment` puts the frames
-on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, `Verdicts` locates and
-judges these, `EventReporter` decides when an event is reported, and `Tracker` follows the sources.
+`Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It composes the stages: `Alignment`
+puts the frames on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, `Verdicts`
+locates and judges these, `EventReporter` decides when an event is reported, and `Tracker` follows the sources.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from livessl.core.locate.estimator import PowerMaps
 from livessl.core.stream.alignment import Alignment
-from livessl.core.stream.array_health import ArrayStatus
+from livessl.core.stream.array_health import ArrayStatus, NodeReport
 from livessl.core.stream.event_reporter import EventReporter
 from livessl.core.stream.evidence import RELEASE_FRAMES, EvidenceCollector
 from livessl.core.stream.pending_event import EventState, PendingEvent
@@ -32,7 +32,7 @@ class Role:
         It locates windows while a sound goes on.
     newest_only : bool
         It keeps up with live sound: of several windows that are due at once only the newest is located, and frames are
-        correlated in quiet.
+        correlated before a sound begins.
     learns_clocks : bool
         The offsets of the arrays' clocks are learned from its events. A pass that does not learn takes over, before
         every sound, what another has learned.
@@ -65,79 +65,17 @@ class Fusion:
         self._role = role or Role()
         self._parameters = state.parameters
         self._alignment = Alignment(state, watches_health=self._role.watches_health)
-        self._collector = EvidenceCollector(state, self._alignment, correlates_ahead=self._role.newest_only)
-        self._reporter = EventReporter(state, self._alignment, self._collector, learns_clocks=self._role.learns_clocks)
         self._verdicts = Verdicts(state)
+        self._collector = EvidenceCollector(state, self._alignment, correlates_ahead=self._role.newest_only)
+        self._reporter = EventReporter(
+            state, self._alignment, self._collector, self._verdicts, learns_clocks=self._role.learns_clocks
+        )
         self._tracker = Tracker()
         self._event: PendingEvent | None = None
         self._due: int | None = None  # last frame index of the window that is to be located in this step
         self.updates_left_out = 0
         """Number of windows that were not located, because newer ones were due."""
         self._correct_clocks()
-
-    # --- what other passes and people look at
-
-    @property
-    def can_backfill(self) -> set[str]:
-        """Arrays whose nodes answer backfill requests."""
-        return self._state.can_backfill
-
-    @property
-    def unknown_arrays(self) -> int:
-        """Number of messages of arrays that the site does not have."""
-        return self._alignment.unknown_arrays
-
-    @property
-    def closed(self) -> int | None:
-        """The last frame index that was closed; None before the first."""
-        return self._alignment.closed
-
-    @property
-    def is_in_event(self) -> bool:
-        """True while an event has begun and has not been reported."""
-        return self._event is not None
-
-    @property
-    def needed_from(self) -> int | None:
-        """First frame index whose frames may be needed yet; None before the first message."""
-        following = self._alignment.next
-        if following is None:
-            return None
-        return self._alignment.first_of(following if self._event is None else self._event.start)
-
-    def frames_ahead(self, array: str) -> int:
-        """Return by how many frames an array's own frame indices are ahead of the joint ones."""
-        stream = self._alignment.streams.get(array)
-        return 0 if stream is None else stream.frames_ahead
-
-    def status(self, now_ns: int, *, levels: bool = True) -> list[ArrayStatus]:
-        """Return the status of every array. Any thread may call it.
-
-        Without `levels` it has no channel powers, which cost a transform for each array.
-        """
-        return self._alignment.status(now_ns, levels=levels)
-
-    def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
-        """Return the estimator's maps of a window that it located. Any thread may call it."""
-        return self._state.estimator.power_maps(window.evidence, separately)
-
-    # --- what comes in besides messages
-
-    def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute what an array's sound will need, so that its first event does not wait for it."""
-        self._state.estimator.prepare(array, sample_rate_hz)
-
-    def begin(self, frame_index: int) -> None:
-        """Take it that all sound before a frame index has been reported."""
-        self._alignment.note_reported(frame_index)
-
-    def leave(self, array: str) -> None:
-        """Wait no longer for an array whose node has ended on purpose."""
-        self._alignment.leave(array)
-
-    def skip_events(self, reported_until: int | None, closing_until: int | None) -> None:
-        """Report no event that another pass reports: of sound before a frame index, or that ends by another."""
-        self._reporter.skip(reported_until, closing_until)
 
     # --- steps
 
@@ -160,7 +98,7 @@ class Fusion:
         if complete_until is not None:
             self._alignment.advance(complete_until)
         if self._event is not None and self._alignment.next is not None:
-            self._collector.correlate_what_is_here(self._alignment.next)
+            self._collector.correlate_arrived(self._alignment.next)
         outputs += self._close_ready()
         if self._event is not None and self._alignment.is_everyone_silent():
             outputs += self._report(self._event)
@@ -170,9 +108,85 @@ class Fusion:
     def flush(self, now_ns: int) -> list[Output]:
         """Report everything without waiting for any array, at the end of a recording."""
         self._alignment.begin_step(now_ns)
-        self._alignment.await_nobody()
+        self._alignment.stop_waiting()
         outputs = self._close_ready()
         return outputs if self._event is None else outputs + self._report(self._event)
+
+    # --- other input
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Compute what an array's sound will need, so that its first event does not wait for it."""
+        self._state.estimator.prepare(array, sample_rate_hz)
+
+    def begin(self, frame_index: int) -> None:
+        """Record that all sound before a frame index has been reported."""
+        self._alignment.note_reported(frame_index)
+
+    def leave(self, array: str) -> None:
+        """Stop waiting for an array whose node has ended on purpose."""
+        self._alignment.leave(array)
+
+    def skip_events(self, reported_until: int | None, closing_until: int | None) -> None:
+        """Skip events that another pass reports.
+
+        Those are events whose sound ended before `reported_until`, and those that close by `closing_until`.
+        """
+        self._reporter.skip(reported_until, closing_until)
+
+    def set_answers(self, array: str, answers: bool) -> None:
+        """Record whether the node of an array answers backfill requests; at first none does."""
+        self._state.set_answers(array, answers)
+
+    # --- views
+
+    @property
+    def unknown_arrays(self) -> int:
+        """Number of messages of arrays that the site does not have."""
+        return self._alignment.unknown_arrays
+
+    @property
+    def closed(self) -> int | None:
+        """The last frame index that was closed; None before the first."""
+        return self._alignment.closed
+
+    @property
+    def is_in_event(self) -> bool:
+        """True while an event has begun and has not been reported."""
+        return self._event is not None
+
+    @property
+    def needed_from(self) -> int | None:
+        """First frame index whose frames may be needed yet; None before the first message."""
+        following = self._alignment.next
+        if following is None:
+            return None
+        return self._alignment.pre_roll_start(following if self._event is None else self._event.start)
+
+    def frames_ahead(self, array: str) -> int:
+        """Return by how many frames an array's own frame indices are ahead of the joint ones."""
+        stream = self._alignment.streams.get(array)
+        return 0 if stream is None else stream.frames_ahead
+
+    def status(
+        self, now_ns: int, nodes: Mapping[str, NodeReport] | None = None, *, levels: bool = True
+    ) -> list[ArrayStatus]:
+        """Return the status of every array. Any thread may call it.
+
+        Parameters
+        ----------
+        now_ns : int
+        nodes : mapping of array to NodeReport, optional
+            What a server knows of the arrays besides their messages.
+        levels : bool
+            Whether it has channel powers, which cost a transform for each array.
+        """
+        return self._alignment.status(now_ns, nodes or {}, levels=levels)
+
+    def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
+        """Return the estimator's maps of a window that it located. Any thread may call it."""
+        return self._state.estimator.power_maps(window.evidence, separately)
+
+    # --- messages and frame indices
 
     def _take(self, messages: Iterable[Message]) -> None:
         for own in messages:
@@ -196,26 +210,23 @@ class Fusion:
         return outputs
 
     def _close_ready(self) -> list[Output]:
-        outputs: list[Output] = []
-        newest = self._alignment.gap_ends_at()
-        if newest is not None:
-            outputs += [] if self._event is None else self._report(self._event)
-            self._alignment.skip_to(newest)
+        """Close all frame indices that need not wait; return what there is to report."""
+        outputs = self._skip_gap()
         while True:
-            event = self._event
-            if event is not None and event.state is EventState.AWAITING_BACKFILL:
-                if self._reporter.is_waiting(event):
-                    break
-                outputs += self._report(event)
-            frame_index = self._alignment.close_next()
+            outputs += self._report_backfilled()
+            frame_index = None if self._is_waiting() else self._alignment.close_next()
             if frame_index is None:
                 break
             outputs += self._close(frame_index)
             self._prune()
-        due, self._due = self._due, None
-        event = self._event
-        if due is not None and event is not None and event.state is EventState.OPEN and due >= event.start:
-            outputs += self._update(event, due)
+        return outputs + self._update_due()
+
+    def _skip_gap(self) -> list[Output]:
+        newest = self._alignment.gap_ends_at()
+        if newest is None:
+            return []
+        outputs = [] if self._event is None else self._report(self._event)
+        self._alignment.skip_to(newest)
         return outputs
 
     def _close(self, frame_index: int) -> list[Output]:
@@ -252,6 +263,13 @@ class Fusion:
 
     # --- updates
 
+    def _update_due(self) -> list[Output]:
+        """Locate the window that is due in this step, if its event still goes on."""
+        due, self._due, event = self._due, None, self._event
+        if due is None or event is None or event.state is not EventState.OPEN or due < event.start:
+            return []
+        return self._update(event, due)
+
     def _update_now_or_later(self, event: PendingEvent) -> list[Output]:
         if not self._role.newest_only:
             return self._update(event, event.closed)
@@ -263,7 +281,7 @@ class Fusion:
         excerpt = self._collector.window(last)
         if len(excerpt.sounds) < self._parameters.min_arrays:
             return []
-        update, found = self._verdicts.update(event, excerpt)
+        update, found = self._verdicts.locate_window(event, excerpt)
         trusted = [*([] if update.status is Status.REFUSED else [update.estimate]), *update.others]
         tracks = self._tracker.step(excerpt.middle_ns, trusted, probable=found.features is not None)
         return [update, Window(excerpt.middle_ns, found.evidence), *tracks]
@@ -274,6 +292,17 @@ class Fusion:
         """End an event: report it, unless frames are requested for it first."""
         requests = self._reporter.end(event, became_quiet=became_quiet)
         return [*requests] if requests else self._report(event)
+
+    def _is_waiting(self) -> bool:
+        """Return whether an event has to wait for requested frames; no frame index closes meanwhile."""
+        return self._event is not None and self._reporter.is_waiting(self._event)
+
+    def _report_backfilled(self) -> list[Output]:
+        """Report an event that no longer has to wait for requested frames."""
+        event = self._event
+        if event is None or event.state is not EventState.AWAITING_BACKFILL or self._reporter.is_waiting(event):
+            return []
+        return self._report(event)
 
     def _report(self, event: PendingEvent) -> list[Output]:
         """Report an event now, with the frames that have come."""

@@ -19,7 +19,7 @@ HOLD_BYTES: Final = 256 * 1024 * 1024
 
 
 class HeldFrames:
-    """The frames that are held, and the frame indices up to which missing arrays are passed.
+    """The frames that are held, and the frame indices up to which missing arrays are no longer awaited.
 
     Parameters
     ----------
@@ -37,13 +37,14 @@ class HeldFrames:
         self.nbytes = 0
         """Memory of the samples that are held, in bytes."""
         self.overdue_until: int | None = None
-        """Last frame index of the frames that have been held for too long; arrays that are away are passed up to it."""
+        """Last frame index of the frames that have been held for too long; up to it, arrays that are away are no longer
+        awaited."""
         self.forced_until: int | None = None
-        """Last frame index of the frames that there is no more memory for; every array is passed up to it."""
+        """Last frame index of the frames for which there is no memory left; up to it, arrays are no longer awaited."""
 
     @property
     def first(self) -> int | None:
-        """The first frame index of which a frame is held."""
+        """The first frame index of which a frame is held; None if none is held."""
         return self._waiting[0][0] if self._waiting else None
 
     def push(self, frame: Frame, frame_index: int, now_ns: int) -> None:

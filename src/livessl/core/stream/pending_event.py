@@ -2,12 +2,12 @@
 
 | state | entered when | left for |
 |---|---|---|
-| `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` where it is cut short |
+| `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` if it is cut short |
 | `ENDED` | the sound was quiet for a hang-over, or has reached the greatest length | `AWAITING_BACKFILL`, `REPORTED` |
 | `AWAITING_BACKFILL` | frames were requested from arrays that did not detect the sound | `REPORTED` |
 | `REPORTED` | its results were handed over, or another pass reports it | |
 
-An event is cut short where nothing more comes: at the end of a recording, before a gap, when all arrays are silent, and
+An event is cut short if no more frames come: at the end of a recording, before a gap, when all arrays are silent, and
 when the server's clock is set back.
 """
 
@@ -31,7 +31,7 @@ class EventState(StrEnum):
     REPORTED = "reported"
 
 
-_FOLLOWS: Final[Mapping[EventState, frozenset[EventState]]] = {
+_PREDECESSORS: Final[Mapping[EventState, frozenset[EventState]]] = {
     EventState.OPEN: frozenset(),
     EventState.ENDED: frozenset({EventState.OPEN}),
     EventState.AWAITING_BACKFILL: frozenset({EventState.ENDED}),
@@ -73,18 +73,18 @@ class PendingEvent:
         self.closed = start
         """The last frame index that was closed in it; frames beyond it are no part of the event."""
         self.became_quiet = False
-        """True where it ended with a quiet hang-over, not by its length."""
+        """True if it ended with a quiet hang-over, not by its length."""
         self.late_frames = 0
         self.excerpt: Excerpt | None = None
-        """The part of the arrays' sound that it was located from; None before, and where another pass reports it."""
+        """Sound that it was located from; None until it is located, and if another pass reports it."""
         self.results: Sequence[Event] = ()
-        """Its results, one for each source; none before it was located, and where another pass reports it."""
+        """Its results, one for each source; empty until it is located, and if another pass reports it."""
         self.requested: Mapping[str, RequestedFrames] = {}
         self.requested_ns = 0
 
     @property
     def has_ended(self) -> bool:
-        """True where the sound has ended, by a quiet hang-over or by its length; False where it was cut short."""
+        """True if the sound has ended, by a quiet hang-over or by its length; False if it was cut short."""
         return self.state in (EventState.ENDED, EventState.AWAITING_BACKFILL)
 
     @property
@@ -126,8 +126,8 @@ class PendingEvent:
         self._go_to(EventState.REPORTED)
 
     def _go_to(self, state: EventState) -> None:
-        if self.state not in _FOLLOWS[state]:
-            expected = " or ".join(repr(str(before)) for before in EventState if before in _FOLLOWS[state])
+        if self.state not in _PREDECESSORS[state]:
+            expected = " or ".join(repr(str(before)) for before in EventState if before in _PREDECESSORS[state])
             raise RuntimeError(
                 f"event at frame index {self.start}: expected {expected} before {str(state)!r}, got {str(self.state)!r}"
             )

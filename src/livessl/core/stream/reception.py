@@ -1,20 +1,20 @@
-"""Reception of one array: how much of its sound has come, live and as backlog, in frame indices of its own clock.
+"""Reception of one array for the final pass (`final_pass`); the early pass uses `ArrayStream`.
 
-A node that was away sends the frames that it kept meanwhile, its backlog, in order of time between its live frames.
-Until all of the backlog has come, the array's sound is known only up to the last backlog frame, however far its live
-frames have come.
+It records how much of the array's sound has come, live and as backlog, in frame indices of the array's own clock. A
+node that reconnects sends its backlog between live frames. Until the backlog is complete, frames are certain only up to
+its last one, even if later live frames have come.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from livessl.core.stream.array_health import LOST_NS
+from livessl.core.stream.array_health import is_connected
 
 
 @dataclass(slots=True)
-class Reception:
-    """The frames of one array that have come."""
+class FinalReception:
+    """The frames of one array that have come for the final pass."""
 
     live_until: int | None = None
     backlog_until: int | None = None  # None while there is no backlog
@@ -29,11 +29,11 @@ class Reception:
         return self.live_until if self.backlog_until is None else self.backlog_until
 
     def is_connected(self, now_ns: int) -> bool:
-        """Return whether its node has sent something lately."""
-        return self.last_message_ns is not None and now_ns - self.last_message_ns < LOST_NS
+        """Return whether its node has sent anything in the last `LOST_NS`."""
+        return is_connected(self.last_message_ns, now_ns)
 
     def is_backlog(self, frame_index: int) -> bool:
-        """Return whether a frame is one that the node has kept since before its connection."""
+        """Return whether a frame belongs to the backlog, which the node kept from before its connection."""
         return self.backlog_until is not None and self.live_from is not None and frame_index < self.live_from
 
     def greet(self, backlog: tuple[int, int] | None, now_ns: int) -> None:
@@ -42,7 +42,7 @@ class Reception:
         Parameters
         ----------
         backlog : (int, int) or None
-            The oldest frame that it kept, and the first live one; None where all that it kept has come.
+            Frame indices of the oldest kept frame and of the first live one; None if no backlog is left.
         now_ns : int
         """
         self.touch(now_ns)
@@ -70,8 +70,8 @@ class Reception:
         """Take in the index of a backlog frame, new or not: all of the backlog up to it has come."""
         self.backlog_until = later(self.backlog_until, frame_index)
 
-    def is_passed(self, frame_index: int) -> bool:
-        """Return whether a frame that has not been seen comes after all that is known of the array's live sound."""
+    def is_new(self, frame_index: int) -> bool:
+        """Return whether a frame has not come before and is newer than all live sound of the array so far."""
         return frame_index not in self.seen and self.live_until is not None and self.live_until < frame_index
 
     def add(self, frame_index: int) -> None:
@@ -86,7 +86,7 @@ class Reception:
             self.seen = {frame_index for frame_index in self.seen if frame_index >= before}
 
     def start_over(self) -> None:
-        """Forget all frames, for the server's clock was set back."""
+        """Forget all frames, because the server's clock was set back."""
         self.seen.clear()
         self.live_until = None
 

@@ -46,8 +46,7 @@ class SiteState:
         self.clock_offsets = clock_offsets
         self.cache = CorrelationCache(estimator, for_each)
         self.votes = OutlierVotes(self.arrays)
-        self.can_backfill: set[str] = set()
-        """Arrays whose nodes answer backfill requests."""
+        self._answering: set[str] = set()
         self._excluded: Collection[str] = ()
 
     def exclude(self, arrays: Collection[str]) -> None:
@@ -67,9 +66,21 @@ class SiteState:
             return replace(message, active=False)
         return message
 
-    def answers_requests(self, array: str) -> bool:
-        """Return whether frames may be requested from an array."""
-        return array in self.can_backfill and array not in self._excluded
+    def set_answers(self, array: str, answers: bool) -> None:
+        """Record whether the node of an array answers backfill requests; at first none does."""
+        (self._answering.add if answers else self._answering.discard)(array)
+
+    def stop_answers(self) -> None:
+        """Record that no node answers backfill requests any more."""
+        self._answering.clear()
+
+    def answers(self, array: str) -> bool:
+        """Return whether the node of an array answers backfill requests."""
+        return array in self._answering
+
+    def may_request(self, array: str) -> bool:
+        """Return whether frames may be requested from an array: its node answers, and it is not excluded."""
+        return self.answers(array) and not self.is_excluded(array)
 
     def specs(self, arrays: Sequence[str]) -> list[ArraySpec]:
         """Return the specifications of the arrays named."""

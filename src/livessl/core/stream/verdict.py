@@ -1,4 +1,7 @@
-"""Turns what an estimator found into results: status, reason, and what each array contributed. It keeps no state."""
+"""Turns what an estimator found into results: status, reason, and what each array contributed. It keeps no state.
+
+`locate/confidence.py` decides the refusal by confidence.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ RANGE_UNKNOWN: Final = 0.25
 reported."""
 
 RANGE_APERTURES: Final = 2.0
-"""Ratio of the distance to the aperture beyond which a single array determines no distance. Reverberation changes its
-delays, which the covariance does not include, and moves the position along the line of sight by metres."""
+"""Ratio of distance to aperture beyond which one array gives no distance: reverberation shifts its delays, which can
+move the position by metres along the line of sight and is not in the covariance."""
 
 
 def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
@@ -36,7 +39,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     Returns
     -------
     Status, str or None
-        The status, and the reason for it in words; None where there is nothing to add.
+        The status, and the reason for it; None if there is nothing to add.
     """
     spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
     nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
@@ -51,7 +54,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The events of a sound, one for each source, and the location they were made from; None without one."""
+    """The events of a sound, one for each source, and their localization; `found` is None if nothing was located."""
 
     events: list[Event]
     found: Localization | None
@@ -68,7 +71,7 @@ class Verdicts:
     def __init__(self, state: SiteState) -> None:
         self._state = state
 
-    def event(
+    def locate_event(
         self,
         event: PendingEvent,
         excerpt: Excerpt,
@@ -89,7 +92,8 @@ class Verdicts:
         """
         backfilled = backfilled or {}
         used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
-        first = self._refused(event, excerpt, now_ns, f"detected by {len(used.sounds)} of at least {least} arrays")
+        count = "1 array" if len(used.sounds) == 1 else f"{len(used.sounds)} arrays"
+        first = self._refused(event, excerpt, now_ns, f"detected by {count}; fusion.min_arrays is {least}")
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
@@ -129,7 +133,7 @@ class Verdicts:
             complete_ns=(event.closed + 1) * FRAME_NS,
         )
 
-    def update(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
+    def locate_window(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
         """Locate a window of an event that goes on; return the update, and the location that it was made from."""
         found = self._state.estimator.locate(excerpt.sounds)
         estimate = _estimate(found, excerpt)
@@ -150,7 +154,7 @@ class Verdicts:
             self._state.votes.count(event.start, verdict.found, excerpt.sounds)
 
     def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Estimate, ...]:
-        """Return the estimates of further sources of the same sound, those that are positions."""
+        """Return the estimates of those further sources of the same sound that are positions."""
         estimates = ((_estimate(other, excerpt), other) for other in found.others)
         return tuple(estimate for estimate, other in estimates if self._judged(estimate, other)[0] is Status.LOCATED)
 
@@ -209,7 +213,7 @@ def _contribution(
 
 
 def _dissent(found: Localization) -> str | None:
-    """Return a reason that names the outliers; None where there are none."""
+    """Return a reason that names the outliers; None if there are none."""
     if not found.outliers:
         return None
     each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outliers.items()))

@@ -18,5 +18,5 @@ BoolArray = NDArray[np.bool_]
 
 
 def read_only(array: NDArray[Any]) -> None:
-    """Make `array` refuse writes, so that it can be shared without copies."""
+    """Make `array` read-only in place, so that it can be shared without copies."""
     array.setflags(write=False)

@@ -36,10 +36,10 @@ class Estimate:
     position_m : (3,) float64
         Metres, room corner at the origin.
     covariance_m2 : (3, 3) float64
-        Square metres. An axis that the search volume fixes has zeros.
+        Square metres. Rows and columns are zero along an axis on which the search volume is flat.
     confidence : float
-        0 to 1. By `onset` the probability that the position is right to within 0.5 m; by other methods the margin of
-        the map's peak over the next best place, which is no probability.
+        0 to 1. With `onset`, the probability that the position is right to within 0.5 m. With other methods, the margin
+        of the map's peak over the next best place; it is not a probability.
     arrays : tuple of str
         Arrays from which the position was computed.
 
@@ -85,7 +85,7 @@ class Contribution:
     off_deg : float or None
         Angle between an outlier's own direction and the position; None if it agrees.
     asked : bool
-        Whether the array did not detect the sound itself, and its frames came by a backfill request.
+        True if the array did not detect the sound and its frames came by a backfill request.
     """
 
     array: str
@@ -131,11 +131,11 @@ class Event:
     id : str
         Stable name of the event.
     start_ns, end_ns : int
-        Site time of the outer edges of its first and last active frame, in nanoseconds.
+        Site time at which its first active frame begins and its last one ends, in nanoseconds.
     status : Status
         Whether `estimate` is a position, a direction only, or missing.
     reason : str or None
-        Why it is not simply located, in words.
+        Why the status is not `located`, or which outliers were excluded; None otherwise.
     estimate : Estimate or None
         None if it was refused.
     power : float
@@ -147,13 +147,13 @@ class Event:
     heard_by : tuple of str
         All arrays that detected it, used or not.
     late_frames : int
-        Frames that arrived after their window had closed.
+        Active frames that arrived after their frame index had closed.
     latency_s : float
         Time from the end of the sound to this answer, in seconds.
     late : bool
-        Whether the answer uses sound that arrived after its windows had closed.
+        Whether the answer uses active frames that arrived after their frame index had closed.
     complete_ns : int
-        Site time from which the answer could be computed: the end of the sound and of the quiet that ends it.
+        Site time at which the last sound needed for the answer ended: the end of the hang-over.
     source : int
         1, or 2 for the second of two sources that sounded at the same time, each of which has an event.
     """

@@ -9,7 +9,6 @@ from typing import Any, Final
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
@@ -18,11 +17,12 @@ from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.parts import Parts
-from livessl.site.addresses import is_loopback
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""
@@ -34,13 +34,13 @@ Where in the room a sound happened: events, live estimates, tracks, arrays and p
 
 `HEAD` works wherever `GET` does. The WebSockets `/api/v1/live` and `/api/v1/map` are described in
 `/api/v1/asyncapi.json`. Two answers are plain text and can come from any path: 400 for a request to a host name that is
-not the server's own, where it uses no tokens, and 503 when too many connections are open.
+not the server's own, where it uses no tokens or has a list of names, and 503 when too many connections are open.
 """
 
 
 def create_app(parts: Parts, access: Access) -> FastAPI:
     """The application around a running server's parts, open to everyone or to clients that have a token."""
-    site = parts.site
+    site, names = parts.site, ServerNames(parts.site.server.http)
     app = FastAPI(
         title="livessl",
         version=__version__,
@@ -52,13 +52,9 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     )
     app.add_middleware(_HeadAsGet)
     app.add_middleware(Gate, access=access, refusals=parts.refusals)
-    if not access.wanted and is_loopback(site.server.http.host):
-        # otherwise any web page could point its own host name at this server and read the answers as its own
-        app.add_middleware(
-            TrustedHostMiddleware,
-            allowed_hosts=["127.0.0.1", "localhost", "[::1]", site.server.http.host],
-        )
+    app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
     app.middleware("http")(_with_safe_headers)
+    app.add_middleware(BehindProxy, http=site.server.http)
 
     strict = [Depends(refuse_unknown_parameters)]
     for router in (
@@ -70,7 +66,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))
-    app.include_router(live_routes(parts))
+    app.include_router(live_routes(parts, names))
     app.include_router(asyncapi_route(site, access))
     documentation.add_documentation(app)
 

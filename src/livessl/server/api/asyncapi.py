@@ -11,6 +11,7 @@ from pydantic.json_schema import models_json_schema
 from livessl import __version__
 from livessl.server.api.auth import PROTOCOL, TOKEN_PROTOCOL, Access
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.hosts import public_host
 from livessl.server.api.live import LIVE, MAP
 from livessl.server.api.queries import LiveParameters, MapParameters
 from livessl.server.api.routes import as_json
@@ -42,14 +43,14 @@ def asyncapi_route(site: Site, access: Access) -> APIRouter:
 
     @router.get(ASYNCAPI, include_in_schema=False)
     def get_asyncapi(request: Request) -> Response:
-        url = request.url
-        protocol = "wss" if url.scheme == "https" else "ws"
-        return as_json(describe(site.site, url.netloc, protocol, tokens=access.wanted))
+        protocol = "wss" if request.url.scheme == "https" else "ws"
+        host, root = public_host(request.headers), request.scope["root_path"]
+        return as_json(describe(site.site, host, protocol, root, tokens=access.wanted))
 
     return router
 
 
-def describe(site: str, host: str, protocol: str, *, tokens: bool) -> JsonObject:
+def describe(site: str, host: str, protocol: str, root_path: str = "", *, tokens: bool) -> JsonObject:
     """The AsyncAPI 3.0 document of a server.
 
     Parameters
@@ -60,6 +61,8 @@ def describe(site: str, host: str, protocol: str, *, tokens: bool) -> JsonObject
         Host and port that the WebSockets are reached at.
     protocol : str
         `ws` or `wss`.
+    root_path : str
+        Path that the proxy puts before every address; empty without one.
     tokens : bool
         Whether clients need a token.
     """
@@ -67,6 +70,8 @@ def describe(site: str, host: str, protocol: str, *, tokens: bool) -> JsonObject
         [(model, "serialization") for model in MESSAGES], ref_template="#/components/schemas/{model}"
     )
     server: JsonObject = {"host": host, "protocol": protocol, "description": f"The server of site {site}."}
+    if root_path:
+        server["pathname"] = root_path
     components: JsonObject = {
         "schemas": schemas["$defs"],
         "messages": {**{model.__name__: _message(model) for model in MESSAGES}, "Picture": _picture()},

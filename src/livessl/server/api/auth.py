@@ -144,7 +144,7 @@ class Gate:
         refusal = _refusal(scope, client)
         if refusal is not None:
             status, reason = refusal
-            self._refusals.note(DOOR, (scope["client"] or ("a local socket",))[0], reason)
+            self._refusals.note(DOOR, caller(scope), reason)
             if scope["type"] == "websocket":  # before it is accepted: the handshake is answered with 403
                 await send({"type": "websocket.close"})
                 return
@@ -160,6 +160,11 @@ class Gate:
                     await _close_revoked(send)
         else:
             await self._app(scope, receive, _choosing_protocol(scope, send))
+
+
+def caller(scope: Scope) -> str:
+    """Address of the client, for the list of refusals."""
+    return str((scope["client"] or ("a local socket",))[0])
 
 
 async def _close_revoked(send: Send) -> None:
@@ -198,7 +203,7 @@ def needed_role(method: str, path: str) -> Role | None:
 
 def _refusal(scope: Scope, client: Client | None) -> tuple[int, str] | None:
     """Status and reason of a refusal, or None. The text repeats nothing of the request: it is a label of a metric."""
-    needed = needed_role(scope.get("method", "GET"), scope["path"])
+    needed = needed_role(scope.get("method", "GET"), scope["path"].removeprefix(scope.get("root_path", "")))
     if needed is not None and client is None:
         return 401, "expected a valid token; send it as Authorization: Bearer TOKEN"
     if needed is not None and client is not None and client.role < needed:

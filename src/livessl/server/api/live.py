@@ -10,10 +10,13 @@ from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from livessl.clock import utc_text
 from livessl.server.api import queries
+from livessl.server.api.auth import DOOR, caller
 from livessl.server.api.encode import API_VERSION, JsonObject
+from livessl.server.api.hosts import OTHER_PAGE, ServerNames, other_page
 from livessl.server.fanout import Numbered, Subscription
 from livessl.server.maps import FUSED
 from livessl.server.parts import Parts
+from livessl.server.refusals import Refusals
 
 LIVE: Final = "/api/v1/live"
 MAP: Final = "/api/v1/map"
@@ -28,7 +31,7 @@ POLICY_VIOLATION: Final = 1008
 """Close code of RFC 6455 for a request that the server refuses."""
 
 
-def live_routes(parts: Parts) -> APIRouter:
+def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
     """The WebSocket of messages and the WebSocket of power maps."""
     site, fanout, router = parts.site, parts.fanout, APIRouter()
 
@@ -42,7 +45,7 @@ def live_routes(parts: Parts) -> APIRouter:
     ) -> None:
         await socket.accept()  # only a connected client can receive a reason
         try:
-            _refuse_other_pages(socket)
+            _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.LiveParameters)
             wanted = queries.live_filter(site, kinds, min_confidence, zone)
             since = queries.message_number("since_seq", since_seq)
@@ -61,7 +64,7 @@ def live_routes(parts: Parts) -> APIRouter:
     async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
         await socket.accept()
         try:
-            _refuse_other_pages(socket)
+            _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.MapParameters)
             chosen = queries.chosen_views(site, array, views)
         except ValueError as error:
@@ -93,11 +96,11 @@ def _hello(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
     }
 
 
-def _refuse_other_pages(socket: WebSocket) -> None:
+def _refuse_other_pages(socket: WebSocket, names: ServerNames, refusals: Refusals) -> None:
     """Raise ValueError if a page of another server opened the WebSocket: browsers do not prevent that themselves."""
-    origin = socket.headers.get("origin")
-    if origin is not None and origin.partition("://")[2] != socket.headers.get("host"):
-        raise ValueError("origin: expected a page of this server; pages of other servers may not connect")
+    if not names.may_open(socket.headers):
+        refusals.note(DOOR, caller(socket.scope), OTHER_PAGE)
+        raise ValueError(other_page(socket.headers))
 
 
 async def _refuse(socket: WebSocket, error: ValueError) -> None:

@@ -19,6 +19,9 @@ const FIRST_EVENTS = 50;
 /** Attempts to load a resource, and the wait between them in milliseconds. */
 const ATTEMPTS = 6;
 const RETRY_MS = 1500;
+/** Attempts to open the WebSocket, while requests are answered, before the page blames the proxy. */
+const SURE_FAILURES = 2;
+const NO_WEBSOCKET = "requests are answered, but the WebSocket is not; a reverse proxy must pass on Upgrade and Connection";
 /** Least time, in milliseconds, between two events that a screen reader announces. */
 const ANNOUNCE_MS = 2500;
 /** How often, in milliseconds, everything that depends on time is shown anew. */
@@ -99,13 +102,38 @@ const live = new Live(liveUrl(), {
     redraw();
   },
   onState: showLink,
-  onRejected: () => getJson("site").catch(() => {}), // if a token is missing, the answer opens the dialog
+  onRejected: explain,
 });
 
 function liveUrl() {
   const url = new URL("live?kinds=update,event,track,arrays", API);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   return url;
+}
+
+/**
+ * Find out why the WebSocket does not open, for the banner. `reason` is the server's, empty if it refused the
+ * handshake, which browsers hide from the page; a request then shows the cause, and opens the dialog for the token.
+ */
+async function explain(reason, failures) {
+  if (reason) {
+    header.cause = reason;
+    return;
+  }
+  try {
+    const response = await get(new URL("site", API));
+    if (response.ok) header.cause = failures < SURE_FAILURES ? null : NO_WEBSOCKET;
+    else header.cause = response.status === 401 ? "access token needed" : await refusal(response);
+  } catch {
+    header.cause = null;
+  }
+}
+
+/** What a server or proxy says when it refuses a request. */
+async function refusal(response) {
+  const type = response.headers.get("Content-Type") ?? "";
+  const text = type.startsWith("text/plain") ? (await response.text()).trim() : "";
+  return text || `the server answered ${response.status}`;
 }
 
 async function getJson(path) {

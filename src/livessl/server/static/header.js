@@ -14,6 +14,8 @@ export class Header {
   constructor() {
     this.skipped = 0;
     this.noticeTimer = null;
+    /** Why there is no connection, if that is known. */
+    this.cause = null;
     find("gap-close").addEventListener("click", () => this.#closeNotice());
   }
 
@@ -50,11 +52,13 @@ export class Header {
   }
 
   showLink(link, silentMs) {
+    if (link === "live") this.cause = null;
     document.body.dataset.link = link;
     find("connection").dataset.state = link;
     write(find("connection-word"), link === "down" && silentMs === null ? "connecting" : LINK_WORDS[link]);
     find("banner").hidden = link === "live" || (silentMs === null && performance.now() < FIRST_CONTACT_MS);
-    write(find("banner-text"), link === "stale" ? "No message from the server" : "Server unreachable; reconnecting");
+    const unreachable = this.cause === null ? "Server unreachable; reconnecting" : `No connection: ${this.cause}`;
+    write(find("banner-text"), link === "stale" ? "No message from the server" : unreachable);
     const silence = silentMs === null ? null : duration(silentMs / 1000);
     const suffix = link === "stale" ? ` for ${silence}` : ` (last contact ${silence} ago)`;
     write(find("banner-for"), silence === null ? "" : suffix);

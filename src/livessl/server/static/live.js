@@ -15,8 +15,9 @@ const BACK_OFF_MS = [500, 800, 1300, 2100, 3400, 5000];
  * One WebSocket that reconnects for ever.
  *
  * `onMessage(message)` gets each parsed message. `onState(state, silentMs)` is called at every tick and change; `state`
- * is "live", "stale" (open, but silent) or "down", and `silentMs` is null before the first message ever. `onRejected()`
- * is called when a connection closes before its first message; browsers do not reveal why.
+ * is "live", "stale" (open, but silent) or "down", and `silentMs` is null before the first message ever.
+ * `onRejected(reason, failures)` is called when a connection closes before its first message, with the reason that the
+ * server gave, empty if it refused the handshake, and the number of such attempts in a row.
  */
 export class Live {
   constructor(url, { onMessage, onState, onRejected }) {
@@ -74,9 +75,9 @@ export class Live {
     socket.onmessage = ({ data }) => {
       if (socket === this.socket) this.#take(data);
     };
-    socket.onclose = () => {
+    socket.onclose = ({ reason }) => {
       if (socket !== this.socket) return;
-      if (!this.#answered) this.onRejected();
+      if (!this.#answered) this.onRejected(reason, this.failures + 1);
       this.#drop();
     };
   }
