@@ -67,29 +67,29 @@ def compare(
                     Evidence(s, make([x])) for s, make, x in zip(specs, gcc, blocks.sound(kind, number), strict=True)
                 ]
                 maps = [mapper(one.gcc) for mapper, one in zip(mappers, heard, strict=True)]
-                for count, node, value in _peaks(maps, counts):
+                for count, point, value in _peaks(maps, counts):
                     (free,) = search.among(heard[:count], UNBOUNDED)(1)
                     (limited,) = search.among(heard[:count])(1)
                     case = cases.setdefault(
                         (spacing_m, count, kind), {"maps": 0, "same": 0, "given_up": 0, "right_all_the_same": 0}
                     )
                     case["maps"] += 1
-                    case["same"] += (free.node, free.power, free.proven) == (node, value, True)
+                    case["same"] += (free.point, free.power, free.proven) == (point, value, True)
                     case["given_up"] += not limited.proven
-                    case["right_all_the_same"] += not limited.proven and limited.node == node
+                    case["right_all_the_same"] += not limited.proven and limited.point == point
                 progress(done := done + 1, total)
     names = ("spacing_m", "arrays", "kind")
     return [dict(zip(names, key, strict=True)) | found for key, found in cases.items()]
 
 
 def _peaks(maps: Sequence[Float32Array], counts: Sequence[int]) -> Iterator[tuple[int, int, float]]:
-    """Highest node, and its value, of the fused maps of the first so many arrays; fused one after the other."""
+    """Highest point, and its value, of the fused maps of the first so many arrays; fused one after the other."""
     fused = maps[0].copy()
     for count, one in enumerate(maps[1:], start=2):
         fused += one
         if count in counts:
-            node = int(fused.argmax())
-            yield count, node, float(fused[node])
+            point = int(fused.argmax())
+            yield count, point, float(fused[point])
 
 
 def main() -> int:
@@ -120,7 +120,7 @@ def main() -> int:
                 f"{case['spacing_m']:g} m, {case['arrays']} arrays, {case['kind']}: {case['same']} of "
                 f"{case['maps']} the same; the default limit gives up {case['given_up']}"
             )
-    print(f"{same} of {maps} maps: the search finds the same node and value; the default limit gives up {given_up}")
+    print(f"{same} of {maps} maps: the search finds the same point and value; the default limit gives up {given_up}")
     return 0 if same == maps else 1
 
 

@@ -92,15 +92,15 @@ STEERING_BYTES: Final = 2 * 6 * 2 * 4 * (HIGH - LOW)
 """Memory of the steering product's matrices per grid point, in bytes: two arrays, six pairs, complex float32."""
 
 
-def reference(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+def reference(specs: Sequence[ArraySpec], points_m: FloatArray) -> Power:
     """The plain formula in double precision: 2/K sum_{i<k} 1/B sum_f Re[conj(X_i) X_k / |X_i X_k| e^{j 2 pi f tau}]."""
 
     def power(sounds: Sounds) -> RealArray:
-        total = np.zeros(len(nodes_m))
+        total = np.zeros(len(points_m))
         for spec, samples in zip(specs, sounds, strict=True):
             whitened = _whitened(samples.astype(np.float64))
             pairs = microphone_pairs(len(samples))
-            delays_s = steering_delays_s(nodes_m, spec.microphones_m, pairs, bench.C_M_S)
+            delays_s = steering_delays_s(points_m, spec.microphones_m, pairs, bench.C_M_S)
             for (i, k), tau_s in zip(pairs, delays_s, strict=True):
                 steering = np.exp(2j * np.pi * tau_s[:, None] * FREQUENCY_HZ)
                 terms = steering @ (np.conj(whitened[i]) * whitened[k])
@@ -110,20 +110,20 @@ def reference(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
     return power
 
 
-def steering_product(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+def steering_product(specs: Sequence[ArraySpec], points_m: FloatArray) -> Power:
     """The obvious code: whitened cross-spectra times a stored steering matrix, (N, bins) for each pair, float32."""
     matrices: list[Float32Array] = []
     for spec in specs:
         pairs = microphone_pairs(len(spec.microphones_m))
-        delays_s = steering_delays_s(nodes_m, spec.microphones_m, pairs, bench.C_M_S)
-        matrix = np.empty((len(nodes_m), len(pairs), 2, len(FREQUENCY_HZ)), np.float32)
+        delays_s = steering_delays_s(points_m, spec.microphones_m, pairs, bench.C_M_S)
+        matrix = np.empty((len(points_m), len(pairs), 2, len(FREQUENCY_HZ)), np.float32)
         for pair, tau_s in enumerate(delays_s):
             phase = 2.0 * np.pi * tau_s[:, None] * FREQUENCY_HZ
             matrix[:, pair, 0], matrix[:, pair, 1] = np.cos(phase), -np.sin(phase)
-        matrices.append(matrix.reshape(len(nodes_m), -1))
+        matrices.append(matrix.reshape(len(points_m), -1))
 
     def power(sounds: Sounds) -> RealArray:
-        total = np.zeros(len(nodes_m), np.float32)
+        total = np.zeros(len(points_m), np.float32)
         for matrix, samples in zip(matrices, sounds, strict=True):
             whitened = _whitened(samples)
             first, second = microphone_pairs(len(samples)).T
@@ -138,16 +138,16 @@ def steering_product(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
 class _Nodes:
     """Arbitrary positions (N, 3), as the grid that pyroomacoustics expects."""
 
-    def __init__(self, nodes_m: FloatArray) -> None:
-        self.x, self.y, self.z = np.ascontiguousarray(nodes_m.T)
-        self.n_points = len(nodes_m)
+    def __init__(self, points_m: FloatArray) -> None:
+        self.x, self.y, self.z = np.ascontiguousarray(points_m.T)
+        self.n_points = len(points_m)
         self.values = np.zeros(self.n_points)
 
     def set_values(self, values: FloatArray) -> None:
         self.values = values
 
 
-def pyroomacoustics_srp(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+def pyroomacoustics_srp(specs: Sequence[ArraySpec], points_m: FloatArray) -> Power:
     """`doa.SRP` of pyroomacoustics with its own loop, adapted to positions instead of directions.
 
     As it comes its near field cannot be used: several distances raise an error, the grid is the unit sphere whatever
@@ -161,14 +161,14 @@ def pyroomacoustics_srp(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Powe
     for spec in specs:
         place_m = spec.microphones_m.T
         localizer = SRP(place_m, bench.RATE_HZ, N_FFT, c=bench.C_M_S, azimuth=np.zeros(1))
-        localizer.grid = _Nodes(nodes_m)
+        localizer.grid = _Nodes(points_m)
         localizer.mode_vec = ModeVector(place_m, bench.RATE_HZ, N_FFT, bench.C_M_S, localizer.grid, mode="near")
         localizer.mode_vec.tau = -localizer.mode_vec.tau
         localizer.num_snap, localizer.freq_bins, localizer.num_freq = 1, np.arange(LOW, HIGH), HIGH - LOW
         localizers.append(localizer)
 
     def power(sounds: Sounds) -> RealArray:
-        total = np.zeros(len(nodes_m))
+        total = np.zeros(len(points_m))
         for localizer, samples in zip(localizers, sounds, strict=True):
             localizer._process(np.fft.rfft(samples, N_FFT)[:, :, None])
             total += localizer.grid.values
@@ -177,7 +177,7 @@ def pyroomacoustics_srp(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Powe
     return power
 
 
-def acoular_beamformer(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power:
+def acoular_beamformer(specs: Sequence[ArraySpec], points_m: FloatArray) -> Power:
     """`BeamformerBase` of acoular on the cross-spectral matrix of phases alone, summed over the band."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that it keeps to one thread beside OpenBLAS, as all do here
@@ -187,7 +187,7 @@ def acoular_beamformer(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power
     beamformers = []
     for spec in specs:
         steering = acoular.SteeringVector(
-            grid=acoular.ImportGrid(pos=np.ascontiguousarray(nodes_m.T)),
+            grid=acoular.ImportGrid(pos=np.ascontiguousarray(points_m.T)),
             mics=acoular.MicGeom(pos_total=spec.microphones_m.T),
             env=acoular.Environment(c=bench.C_M_S),
             steer_type="classic",
@@ -195,7 +195,7 @@ def acoular_beamformer(specs: Sequence[ArraySpec], nodes_m: FloatArray) -> Power
         beamformers.append(acoular.BeamformerBase(steer=steering, r_diag=False, cached=False))
 
     def power(sounds: Sounds) -> RealArray:
-        total = np.zeros(len(nodes_m))
+        total = np.zeros(len(points_m))
         for beamformer, samples in zip(beamformers, sounds, strict=True):
             whitened = _whitened(samples.astype(np.float64))
             matrix = np.einsum("if,kf->fik", whitened, np.conj(whitened))
@@ -276,7 +276,7 @@ class Ours:
         """Return the highest grid point, without the map."""
         with using(self._form):
             (found,) = self._search.among(self.evidence(sounds))(1)
-        return found.node
+        return found.point
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) 
     grid = room_grid(spacing_m)
     rng = np.random.default_rng(0)
     which = np.arange(grid.size) if part is None else np.sort(rng.choice(grid.size, part, replace=False))
-    nodes_m = grid.nodes_m()[which]
+    points_m = grid.points_m()[which]
 
     def at_part(ours: Ours) -> Power:
         return lambda sounds: ours.power(sounds)[which]
@@ -313,7 +313,7 @@ def _contenders(specs: Sequence[ArraySpec], spacing_m: float, part: int | None) 
         yield _Contender(f"livessl, map, {label}", spacing_m, grid.size, grid.size, to_peak(ours.power), at_part(ours))
         yield _Contender(f"livessl, search, {label}", spacing_m, grid.size, grid.size, ours.peak, None)
     for name, make in {**PEERS, REFERENCE: reference}.items():
-        power = make(specs, nodes_m)
+        power = make(specs, points_m)
         yield _Contender(name, spacing_m, grid.size, len(which), to_peak(power), power)
 
 

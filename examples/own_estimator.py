@@ -25,7 +25,7 @@ class Product(livessl.MapEstimator):
         evidence = self.evidence(sounds)  # the GCC-PHAT of each array
         maps = self.power_maps(evidence)  # the power at each grid point, (G,), of each array and of their sum
         product = np.prod([np.maximum(power, 0.0) for power in maps.arrays.values()], axis=0)
-        position_m = maps.grid.node_m(int(product.argmax()))
+        position_m = maps.grid.point_m(int(product.argmax()))
         covariance_m2 = np.diag(maps.grid.cell_m**2)  # a position is known to one cell of the grid
         return livessl.Localization(position_m, covariance_m2, confidence=0.5, evidence=evidence)
 

@@ -48,9 +48,9 @@ def test_kernels_are_timed_beside_bare_look_ups() -> None:
 def test_peer_maps_what_the_formula_does(name: str, sounds: peers.Sounds) -> None:
     if name in ("acoular", "pyroomacoustics"):
         pytest.importorskip(name)
-    specs, nodes_m = kernels.array_specs(2), GRID.nodes_m()
-    truth = peers.reference(specs, nodes_m)(sounds)
-    power = peers.PEERS[name](specs, nodes_m)(sounds)
+    specs, points_m = kernels.array_specs(2), GRID.points_m()
+    truth = peers.reference(specs, points_m)(sounds)
+    power = peers.PEERS[name](specs, points_m)(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.99
     assert power.argmax() == truth.argmax()
 
@@ -59,7 +59,7 @@ def test_peer_maps_what_the_formula_does(name: str, sounds: peers.Sounds) -> Non
 def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds) -> None:
     """Nearest of eight lags a sample: an error of 1/28 sample RMS, 0.03 rad at 6 kHz; 1e-3 of the power."""
     specs = kernels.array_specs(2)
-    truth = peers.reference(specs, GRID.nodes_m())(sounds)
+    truth = peers.reference(specs, GRID.points_m())(sounds)
     ours = peers.Ours(specs, GRID, form)
     power = ours.power(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.999
@@ -78,7 +78,7 @@ def test_a_search_that_is_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> N
 
     def wrong(self: PeakSearch, evidence: Sequence[Evidence], *most: int) -> FindPeaks:
         find = among(self, evidence, *most)
-        return lambda count, *rest: [replace(peak, node=peak.node + 1) for peak in find(count, *rest)]
+        return lambda count, *rest: [replace(peak, point=peak.point + 1) for peak in find(count, *rest)]
 
     monkeypatch.setattr(PeakSearch, "among", wrong)
     cases = exactness.compare(spacings_m=(0.5,), counts=(2,), sounds=1)

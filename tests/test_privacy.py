@@ -14,7 +14,7 @@ from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.errors import ConfigError
-from livessl.server import app
+from livessl.server import retention
 from livessl.server.store import Query, Store
 from messages import event_message
 from small_site import running_server, scene_recordings, site_of, wait_until, write_site
@@ -31,7 +31,7 @@ def event(number: int) -> dict[str, Any]:
 def test_record_is_refused_with_positions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, out = write_site(tmp_path, PRIVATE), tmp_path / "session"
     assert main(["record", "--site", str(path), "--node", "lab-pc", "--out", str(out)]) == 2
-    assert "privacy: positions-only: no sound may be stored, so nothing is recorded" in capsys.readouterr().err
+    assert "privacy: expected recording, got positions-only, which forbids storing sound" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -105,7 +105,7 @@ def test_database_file_holds_no_trace_of_deleted_events(tmp_path: Path) -> None:
 
 
 def test_running_server_deletes_old_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(app, "EXPIRE_S", 0.05)
+    monkeypatch.setattr(retention, "EXPIRE_S", 0.05)
     path = tmp_path / "events.db"
     site = site_of({"store": {"retention_days": 2.0}, "server.events_db": str(path)})
     now_ns = CLOCK.now_ns()

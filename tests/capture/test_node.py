@@ -183,7 +183,7 @@ def test_session_is_not_played_far_ahead_of_the_settled_time() -> None:
     """The server can thus still request frames; but the replay continues if the server settles nothing."""
     clock, reached = Stuck(), dict[int, int]()
     with server() as there:
-        there.receiver.ingest.final_until = dict.fromkeys(ARRAYS, FIRST + 20)
+        there.receiver.ingest.note_final(dict.fromkeys(ARRAYS, FIRST + 20))
 
         def note(end_ns: int) -> None:
             reached[clock.waited_ns] = end_ns - START_NS

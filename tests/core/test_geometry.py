@@ -122,15 +122,15 @@ def test_no_point_is_further_than_half_a_cell_from_a_grid_point(
     bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]], spacing_m: float, seed: int
 ) -> None:
     grid = Grid(bounds_m, spacing_m)
-    nodes_m = grid.nodes_m()
+    points_m = grid.points_m()
     point_m = np.random.default_rng(seed).uniform(grid.lower_m, grid.upper_m)
-    offset_m = np.abs(nodes_m - point_m)
+    offset_m = np.abs(points_m - point_m)
     # half a cell along every axis at once, so half its diagonal; 1e-12: rounding of coordinates up to 29 m
     nearest = int((offset_m**2).sum(axis=1).argmin())
     assert (offset_m[nearest] <= grid.cell_m / 2 + 1e-12).all()
     # the cells fill the box exactly
-    np.testing.assert_allclose(nodes_m.min(axis=0) - grid.cell_m / 2, grid.lower_m, atol=1e-12)
-    np.testing.assert_allclose(nodes_m.max(axis=0) + grid.cell_m / 2, grid.upper_m, atol=1e-12)
+    np.testing.assert_allclose(points_m.min(axis=0) - grid.cell_m / 2, grid.lower_m, atol=1e-12)
+    np.testing.assert_allclose(points_m.max(axis=0) + grid.cell_m / 2, grid.upper_m, atol=1e-12)
     # as near to the wanted spacing as possible: n cells instead of n +- 1 are off by at most half a cell in all
     assert (np.abs(np.array(grid.shape) * spacing_m - (grid.upper_m - grid.lower_m)) <= spacing_m * (1.0 + 1e-9)).all()
     several = np.array(grid.shape) > 1
@@ -141,15 +141,15 @@ def test_no_point_is_further_than_half_a_cell_from_a_grid_point(
 def test_grid_points_are_numbered_z_fastest() -> None:
     grid = Grid(BOUNDS_M, 0.3)
     assert grid.shape == (11, 12, 9)
-    assert grid.size == 11 * 12 * 9 == len(grid.nodes_m())
-    nodes_m = grid.nodes_m()
+    assert grid.size == 11 * 12 * 9 == len(grid.points_m())
+    points_m = grid.points_m()
     for index in (0, 1, 9, 108, 777, grid.size - 1):
-        np.testing.assert_allclose(grid.node_m(index), nodes_m[index])
+        np.testing.assert_allclose(grid.point_m(index), points_m[index])
         cell = [int(i) for i in np.unravel_index(index, grid.shape)]
         along = [float(grid.axis_m(axis)[cell[axis]]) for axis in range(3)]
-        np.testing.assert_allclose(along, nodes_m[index])
-    np.testing.assert_allclose(nodes_m[0], [-0.85, 0.65, 0.35])
-    np.testing.assert_allclose(nodes_m[1] - nodes_m[0], [0.0, 0.0, 0.3], atol=1e-12)
+        np.testing.assert_allclose(along, points_m[index])
+    np.testing.assert_allclose(points_m[0], [-0.85, 0.65, 0.35])
+    np.testing.assert_allclose(points_m[1] - points_m[0], [0.0, 0.0, 0.3], atol=1e-12)
 
 
 def test_equal_bounds_make_a_plane() -> None:
@@ -157,7 +157,7 @@ def test_equal_bounds_make_a_plane() -> None:
     assert grid.shape == (11, 12, 1)
     assert grid.free_axes == (0, 1)
     assert grid.cell_m[2] == 0.0
-    assert (grid.nodes_m()[:, 2] == 1.2).all()
+    assert (grid.points_m()[:, 2] == 1.2).all()
     assert Grid(BOUNDS_M, 0.3).free_axes == (0, 1, 2)
 
 

@@ -245,7 +245,7 @@ def test_client_that_reconnects_gets_a_gap_for_what_is_no_longer_kept() -> None:
     assert (gap["kind"], gap["missed"], len(rest)) == ("gap", None, PAST)
     (gap,) = drained(fanout.subscribe(Filter(), since_seq=10**6))
     assert gap["missed"] is None
-    assert "number 1000000 has not been told" in gap["reason"]
+    assert "number 1000000 was not published" in gap["reason"]
 
 
 def test_kept_messages_of_many_arrays_are_small_and_unchanged() -> None:

@@ -258,9 +258,10 @@ def test_request_from_a_node_is_refused() -> None:
 
 def test_final_frame_index_is_acknowledged_by_each_nodes_own_clock() -> None:
     into = joined()
-    into.final_until = {"north": 103, "south": 100}
+    final = {"north": 103, "south": 100}
+    into.note_final(final)
     (_, ack), *_ = into.acknowledgements(NOW + ACK_NS)
-    assert ack.settled == min(into.final_until[array] for array in HELLO.arrays)
-    into.final_until = {}
+    assert ack.settled == min(final[array] for array in HELLO.arrays)
+    into.note_final({})
     (_, ack), *_ = into.acknowledgements(NOW + 2 * ACK_NS)
     assert ack.settled is None

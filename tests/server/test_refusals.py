@@ -20,7 +20,7 @@ def test_each_refusal_is_counted_and_logged_once(caplog: pytest.LogCaptureFixtur
     assert refusals.counts() == {("http", "no token"): 3, ("http", "too long"): 1, ("nodes", "no token"): 1}
     assert (refusals.count("http"), refusals.count("nodes"), refusals.count("cellar")) == (4, 1, 0)
     assert [record.getMessage() for record in caplog.records] == [
-        f"{door}: 192.0.2.1 was refused: {reason} (told once, counted in /metrics)"
+        f"{door}: 192.0.2.1 was refused: {reason} (logged once, counted in /metrics)"
         for door, reason in (("http", "no token"), ("http", "too long"), ("nodes", "no token"))
     ]
     newest = refusals.known()[0]

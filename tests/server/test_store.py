@@ -154,8 +154,8 @@ def test_file_that_another_program_holds_is_an_error(tmp_path: Path) -> None:
             store.add(event(1), START_NS + NS)
         other.rollback()
     said = str(caught.value)
-    assert said.startswith("server.events_db: event 'e-1' was not kept: database is locked;")
-    assert said.endswith("; free space or release the file")
+    assert said.startswith("server.events_db: cannot store event 'e-1': database is locked;")
+    assert said.endswith("; free space on its disk, or close the program that locks the file")
     store.add(event(2), START_NS + 2 * NS)
     assert ids(store) == [2, 0]
     store.close()
@@ -268,7 +268,7 @@ def test_finalize_is_all_or_nothing(tmp_path: Path) -> None:
     large = {**event(6), "note": "x" * 500_000}
     pages = store._writing.rows("PRAGMA page_count")[0][0]
     store._writing.rows(f"PRAGMA max_page_count = {pages + 3}")  # the disk is as good as full
-    with pytest.raises(StoreError, match="2 events were not kept: database or disk is full; free space"):
+    with pytest.raises(StoreError, match="cannot store 2 events: database or disk is full; free space"):
         store.finalize("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
     assert ids(store) == [0]
     assert store.finalized("lab") == (None, None)

@@ -423,7 +423,7 @@ def test_one_faulty_array_causes_no_other_faults() -> None:
         ("site: 2026-02-31\n", "site.yaml", "not valid YAML"),
         ("site: !!bool perhaps\n", "site.yaml", "not valid YAML"),
         ("site: !!python/object:os.system {}\n", "site.yaml:1", "not valid YAML"),
-        ("site: &a [*a]\n", "site.yaml", "it holds itself"),
+        ("site: &a [*a]\n", "site.yaml", "an alias contains itself"),
         ("[" * 2000, "site.yaml", "not valid YAML"),
     ],
     ids=lambda value: str(value)[:20],
@@ -549,7 +549,7 @@ def test_search_volume_is_the_room_or_the_bounds() -> None:
     plane = search_grid(site_of({"grid.bounds_m": [[0, 4], [0, 5], [1.2, 1.2]]}))
     assert plane.shape == (16, 20, 1)
     assert plane.free_axes == (0, 1)
-    assert plane.nodes_m()[:, 2] == pytest.approx(1.2)
+    assert plane.points_m()[:, 2] == pytest.approx(1.2)
 
 
 def test_array_may_have_a_band_of_its_own() -> None:

@@ -1,7 +1,7 @@
 """A node's link to the server: greeting, acknowledgements and reconnection. It never blocks.
 
-Live sound goes first. Frames that were kept while the server was away follow in order of time in the bandwidth that is
-left, a few frames ahead of the server's acknowledgements.
+Live sound goes first. Kept frames follow in order of time in the remaining bandwidth, only a few frames beyond the last
+acknowledgement.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SILENT_NS: Final = 2_000_000_000
 """Silence of the server, in ns, after which it is taken to be gone; it acknowledges four times a second."""
 
 CONNECT_TIMEOUT_NS: Final = 10_000_000_000
-"""Longest wait of `wait_connected`, in ns: a replay gives up then, because a person waits for it."""
+"""Longest wait of `wait_connected`, in ns. A replay gives up after it, because a person is waiting."""
 
 _BYE_TRIES: Final = 25
 _BYE_WAIT_MS: Final = 20

@@ -18,13 +18,25 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--live", action="store_true", help="measure a server under load instead of the kernels alone")
     only = parser.add_argument_group("with --live")
     only.add_argument(
-        "--arrays", type=argument.positive, default=4, help="arrays that send sound all the time (default 4)"
+        "--arrays",
+        type=argument.positive,
+        default=4,
+        metavar="N",
+        help="number of arrays that send sound continuously (default 4)",
     )
     only.add_argument(
-        "--clients", type=argument.positive, default=4, help="clients that subscribe to events and updates (default 4)"
+        "--clients",
+        type=argument.positive,
+        default=4,
+        metavar="N",
+        help="number of clients that subscribe to events and updates (default 4)",
     )
     only.add_argument(
-        "--watchers", type=argument.count, default=0, help="clients that subscribe to the power map (default 0)"
+        "--watchers",
+        type=argument.count,
+        default=0,
+        metavar="N",
+        help="number of clients that subscribe to the power map (default 0)",
     )
     only.add_argument(
         "--seconds", type=argument.above_zero, default=20.0, help="seconds to measure, after a warm-up (default 20)"
@@ -39,7 +51,7 @@ def add_arguments(parser: Any) -> None:
         metavar="S",
         help="reverberation time of the simulated room (default 0.3)",
     )
-    only.add_argument("--spin", action="store_true", help="keep each core busy with another process meanwhile")
+    only.add_argument("--spin", action="store_true", help="run a busy process on every core during the measurement")
     add_json(parser, "print one JSON object")
 
 

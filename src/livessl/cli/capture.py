@@ -19,13 +19,14 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     parser.add_argument("--node", required=True, help="name of the node in the site file")
     add_joint(parser)
-    add_wav(parser, "play FILE at real speed instead of the device; give one for each array of the node")
+    add_wav(parser, "play FILE in real time instead of using the device; repeat for each array of the node")
     parser.add_argument("--loop", action="store_true", help="repeat the files until Ctrl-C")
     parser.add_argument(
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="start of the files, RFC 3339 (default: now; in a site of several nodes, the next multiple of 5 s)",
+        help="time stamp of the files' first sample, RFC 3339 (default: now; with several nodes the next multiple of "
+        "5 s, so that they agree)",
     )
 
 

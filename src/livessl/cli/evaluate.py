@@ -45,7 +45,7 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         default=[],
         metavar="DIR",
-        help="--out of another experiment, to be reported together; may be repeated",
+        help="results folder (`--out`) of another experiment to include in the report; repeatable",
     )
     add("--jobs", type=argument.positive, help="worker processes (default: one for each core)")
     add("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")

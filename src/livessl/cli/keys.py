@@ -36,7 +36,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "node", _node, "make a node's key pair; run it on the node", "node lab-pc --site site.yaml --server 4f8a…"
     )
-    sub.add_argument("name", help="name of the node in the site file; `replay` for sending sessions to a server")
+    sub.add_argument("name", help="name of the node in the site file; use `replay` for the key of `livessl replay`")
     sub.add_argument(
         "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` printed it"
     )

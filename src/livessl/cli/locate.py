@@ -19,7 +19,12 @@ from livessl.server.api.encode import Messages
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
-    add_wav(parser, "recording of an array, WAV or FLAC; give one for each array; all begin together", required=True)
+    add_wav(
+        parser,
+        "recording of an array, WAV or FLAC; repeat for each array; all files must begin at the same moment, or set "
+        "wav_offset_s in the site file",
+        required=True,
+    )
     add_method(parser)
     add_joint(parser)
     add_json(parser)

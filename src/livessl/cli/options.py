@@ -76,7 +76,7 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="channels of the file or files, from 1, in microphone order",
+        help="channels of that array's files, counted from 1, in the site file's microphone order",
     )
 
 

@@ -19,13 +19,17 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
     parser.add_argument(
-        "--rt60", type=argument.not_negative, default=0.7, metavar="S", help="reverberation time, seconds (default 0.7)"
+        "--rt60",
+        type=argument.not_negative,
+        default=0.7,
+        metavar="S",
+        help="reverberation time, seconds; 0 is anechoic (default 0.7)",
     )
     parser.add_argument(
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5 if the search volume holds it)",
+        help="height of the sounds, metres (default 1.5, or the middle of a lower search volume)",
     )
     parser.add_argument(
         "--calibration",

@@ -29,11 +29,9 @@ def add_arguments(parser: Any) -> None:
         "--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV (default flac)"
     )
     parser.add_argument(
-        "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: on Ctrl-C)"
+        "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: until Ctrl-C)"
     )
-    add_wav(
-        parser, "record FILE at real speed instead of the device, as a rehearsal; give one for each array of the node"
-    )
+    add_wav(parser, "record FILE in real time instead of using the device; repeat for each array of the node")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -41,7 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if site.privacy == "positions-only":
         what = (
-            "positions-only: sound must not be stored, so nothing is recorded; change it if everyone in the room agrees"
+            "expected recording, got positions-only, which forbids storing sound; "
+            "change it only if everyone in the room agrees"
         )
         raise ConfigError([Fault(f"{arguments.site}: privacy", what)])
     config = node_config(site, arguments.node, arguments.site)

@@ -185,12 +185,12 @@ class Grid:
         """Coordinates of the points along one axis, metres."""
         return np.asarray(self.lower_m[axis] + (np.arange(self.shape[axis]) + 0.5) * self.cell_m[axis])
 
-    def nodes_m(self, which: slice = slice(None)) -> FloatArray:
+    def points_m(self, which: slice = slice(None)) -> FloatArray:
         """Points (G, 3), metres, all or some, z fastest: point g is at `numpy.unravel_index(g, shape)`."""
         cells = np.unravel_index(np.arange(self.size)[which], self.shape)
         return np.stack([self.axis_m(axis)[cell] for axis, cell in enumerate(cells)], axis=1)
 
-    def node_m(self, index: int) -> FloatArray:
+    def point_m(self, index: int) -> FloatArray:
         """Position (3,) of one point, metres."""
         cell = np.array(np.unravel_index(index, self.shape), dtype=np.float64)
         return np.asarray(self.lower_m + (cell + 0.5) * self.cell_m)

@@ -27,16 +27,16 @@ from livessl.server.maps import Maps
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
+from livessl.server.retention import delete_old_events
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
-from livessl.server.store import Store, StoreError
+from livessl.server.store import Store
 from livessl.server.tracks import Tracks
 from livessl.site.checks import unprotected_addresses
 from livessl.site.models import Site
-from livessl.site.tokens import file_stamp, read_tokens
 
 SWITCH_S: Final = 0.0005
-"""Longest time, in seconds, that a thread keeps the interpreter while another one waits for it. The fusion thread
+"""Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
 releases it thousands of times a second; by Python's default it would wait 5 ms each time to get it back."""
 
 NOTICE_S: Final = 2.0
@@ -44,14 +44,6 @@ NOTICE_S: Final = 2.0
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
-
-REFRESH_S: Final = 1.0
-"""Interval, in seconds, at which the file of tokens is checked for changes: they take effect without a restart."""
-
-EXPIRE_S: Final = 600.0
-"""Interval, in seconds, at which events older than `store.retention_days` are deleted."""
-
-DAY_NS: Final = 86_400_000_000_000
 
 _log = logging.getLogger(__name__)
 
@@ -64,6 +56,7 @@ def assemble(
     fanout: Fanout,
     publish: Callable[[JsonObject], None],
     receiver: Inbox | None = None,
+    on_event: Callable[[JsonObject], None] | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -73,12 +66,21 @@ def assemble(
         Gets every message for subscribers; called on the fusion thread.
     receiver : Inbox or None
         Stands in for the nodes' socket.
+    on_event : callable or None
+        Gets every event after the sinks and before `publish`; called on the fusion thread.
 
     Raises
     ------
     BindError, ConfigError
-        As `Receiver` does.
+        See `Receiver`.
     """
+
+    def publish_event(event: JsonObject) -> None:
+        sinks.take(event)
+        if on_event is not None:
+            on_event(event)
+        publish(event)
+
     with ExitStack() as undo:
         if receiver is None:
             receiver = Receiver(site, clock)
@@ -86,7 +88,7 @@ def assemble(
         site_time = SiteTime(clock)
         latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, publish)
-        event_log = EventLog(site.site, clock, store, latency, publish)
+        event_log = EventLog(site.site, clock, store, latency, publish_event)
         publisher = Publisher(publish, receiver.request, site_time, event_log, tracks, maps, latency)
         engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher)
         undo.pop_all()
@@ -150,16 +152,15 @@ class Server:
         if method is not None:
             site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
         http = site.server.http
-        self._tokens_file = None if http.tokens is None else site.file(http.tokens)
-        self._tokens_stamp = None if self._tokens_file is None else file_stamp(self._tokens_file)
-        self._access = Access(None if self._tokens_file is None else read_tokens(self._tokens_file))
+        self._access = Access(None if http.tokens is None else site.file(http.tokens))
         certificate = certificate_of(site)
-        self._on_event = on_event
         self._clock = clock
         self._stepped = stepped
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        first_seq = clock.now_ns() // 1_000_000  # fewer than a message a millisecond, so no number comes twice
+        # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
+        # per millisecond
+        first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
@@ -168,7 +169,7 @@ class Server:
             store = Store(site.file(site.server.events_db) if site.server.events_db else None)
             undo.callback(store.close)
             _compile_kernels()
-            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver)
+            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
         """The HTTP server."""
@@ -210,7 +211,8 @@ class Server:
         self.parts.maps.start()
         if not self._stepped:
             self.parts.engine.start()
-        tasks = [asyncio.create_task(work) for work in (self._watch(), self._expire(), self._refresh())]
+        retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
+        tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
@@ -225,39 +227,9 @@ class Server:
             await asyncio.sleep(WATCH_S)
         self.stop()
 
-    async def _refresh(self) -> None:
-        """Take over the file of tokens whenever it changes; if it cannot be used, the former tokens stay valid."""
-        while (path := self._tokens_file) is not None:
-            await asyncio.sleep(REFRESH_S)
-            stamp = await asyncio.to_thread(file_stamp, path)
-            if stamp == self._tokens_stamp:
-                continue
-            self._tokens_stamp = stamp
-            try:
-                self._access.replace(await asyncio.to_thread(read_tokens, path, missing_ok=True))
-                _log.info("%s has changed: %d tokens are in force", path, len(self._access.clients))
-            except ConfigError as error:
-                _log.error("%s; the former tokens stay in force", error)
-
-    async def _expire(self) -> None:
-        """Delete events that are older than `store.retention_days`, again and again."""
-        days, store = self.parts.site.store.retention_days, self.parts.store
-        while days is not None:
-            before_ns = self._clock.now_ns() - round(days * DAY_NS)
-            try:
-                if gone := await asyncio.to_thread(store.expire, before_ns):
-                    _log.info("%d events older than %g days were deleted", gone, days)
-            except StoreError as error:
-                _log.error("%s", error)
-            await asyncio.sleep(EXPIRE_S)
-
     def _publish(self, message: JsonObject) -> None:
-        """Hand a message to sinks and subscribers; on the fusion thread."""
+        """Hand a message to subscribers; on the fusion thread."""
         published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
-        if message["kind"] == "event":
-            self.parts.sinks.take(message)
-            if self._on_event is not None:
-                self._on_event(message)
         loop = self.loop
         if loop is None:
             return

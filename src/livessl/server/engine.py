@@ -10,7 +10,6 @@ from typing import Final
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Message
-from livessl.server.api.encode import Messages
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
@@ -128,9 +127,9 @@ class Engine:
         self._maps.clear()
 
     def _switch(self, run: Run) -> None:
-        """Begin another run; nodes must not forget frames because the run before it had made them final."""
+        """Begin another run, and replace the acknowledged final indices: those of the previous run do not apply."""
         self._begin(run)
-        self._receiver.ingest.final_until = run.fusion.settled_of
+        self._receiver.ingest.note_final(run.fusion.settled_of)
 
     def _handle(self, item: Joined | Greeted | Left) -> None:
         """Take in that a node has joined, greeted again, or left."""
@@ -183,9 +182,9 @@ class Engine:
                 return
             recorded_ns = min(message.frame_index for message in batch) * FRAME_NS
             origin_ns = recorded_ns if self._site_time.is_replay else self._site_time.started_ns
-            run.messages = Messages(self._site, origin_ns, utc=True)
+            run.begin(origin_ns)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
-            self._receiver.ingest.final_until = run.fusion.settled_of
+            self._receiver.ingest.note_final(run.fusion.settled_of)

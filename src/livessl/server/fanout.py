@@ -195,7 +195,7 @@ class Fanout:
         """Yield the kept messages after a number; before them a `gap` if older ones are no longer kept."""
         oldest = self.last_seq - len(self._past) + 1
         if since_seq > self.last_seq:
-            yield _gap(None, f"number {since_seq} has not been told; the last one is {self.last_seq}")
+            yield _gap(None, f"number {since_seq} was not published; the last one is {self.last_seq}")
         elif since_seq < oldest - 1:
             missed = oldest - 1 - since_seq if since_seq >= self._first_seq else None
             gone = "" if missed is None else f"{missed} messages "

@@ -21,7 +21,7 @@ beyond what is acknowledged."""
 GONE_NS: Final = 2_000_000_000
 """Silence, in nanoseconds, after which another node may take a node's name and arrays."""
 
-THERE_NS: Final = 1_400_000_000
+NODE_ALIVE_NS: Final = 1_400_000_000
 """Silence, in nanoseconds, after which a node counts as dead: longer than the second between two greetings, shorter
 than the time after which its array is lost."""
 
@@ -49,7 +49,7 @@ class Peer:
         return message.array in self.hello.backlog and message.frame_index < self.hello.backlog[message.array][1]
 
     def greet(self, hello: wire.Hello) -> None:
-        """Take in which frames the node has kept: none older than it states, and none at all if it states none."""
+        """Record the node's backlog: older frames are lost; without one, all frames before live sound have come."""
         for array, (oldest, _) in hello.backlog.items():
             self.received[array] = max(self.received.get(array, oldest - 1), oldest - 1)
         for array in self.live.keys() - hello.backlog.keys():
@@ -57,7 +57,7 @@ class Peer:
         self.hello = hello
 
     def take(self, frame: Frame) -> None:
-        """Note that a frame is here, and with it all earlier frames of its backlog or of live sound."""
+        """Record a frame; all earlier frames of the same stream, backlog or live, have come."""
         waits = frame.array in self.hello.backlog and not self.is_backlog(frame)
         known = self.live if waits else self.received
         known[frame.array] = max(known.get(frame.array, frame.frame_index), frame.frame_index)
@@ -67,8 +67,8 @@ class Peer:
 class Received:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known one that has kept other frames than before. `offer` informs a
-    node that the server may request frames; it is sent before the reply.
+    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `offer` informs a node that the server
+    may request frames; it is sent before the reply.
     """
 
     message: Message | None = None
@@ -91,8 +91,7 @@ class Ingest:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
-        self.final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
-        """Frame index, by each array's own clock, before which all events are final: nodes may forget those frames."""
+        self._final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
         """Malformed messages since the start."""
@@ -100,14 +99,24 @@ class Ingest:
         self.duplicates = dict.fromkeys(names, 0)
         self.sequence_gaps = dict.fromkeys(names, 0)
 
+    def note_final(self, until: Mapping[str, int]) -> None:
+        """Acknowledge from now on that nodes may delete the frames before these.
+
+        Parameters
+        ----------
+        until : mapping of array to int
+            Frame index, by the array's own clock, before which all events are final.
+        """
+        self._final_until = until
+
     def problem_of(self, array: str) -> str | None:
         """Return what an array's node reports to be wrong with its device, None if nothing is."""
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
     def is_live(self, array: str, now_ns: int) -> bool:
-        """Return whether an array's node has sent anything in the last `THERE_NS`."""
+        """Return whether an array's node has sent anything in the last `NODE_ALIVE_NS`."""
         return any(
-            array in peer.hello.arrays and not peer.ended and now_ns - peer.last_ns < THERE_NS
+            array in peer.hello.arrays and not peer.ended and now_ns - peer.last_ns < NODE_ALIVE_NS
             for peer in self._peers.values()
         )
 
@@ -142,7 +151,7 @@ class Ingest:
         if wrong is not None:
             return self._reject(wire.WireError(wrong), now_ns)
         if isinstance(message, Frame) and message.requested:
-            return Received(message=message)  # it stands outside the node's own count of frames
+            return Received(message=message)  # requested frames have no sequence number
         if isinstance(message, Frame) and peer.is_backlog(message):
             peer.take(message)
             return Received(message=message)
@@ -178,7 +187,7 @@ class Ingest:
         return 0 if last is None else max(0, number - last - is_frame)
 
     def acknowledgements(self, now_ns: int, *, soon: bool = True) -> list[tuple[bytes, wire.Ack]]:
-        """Return the acknowledgements that are due, with `soon` also those that hurry; forget long silent nodes."""
+        """Return the acknowledgements that are due, with `soon` also the fast ones; forget long silent nodes."""
         self._peers = {
             key: peer for key, peer in self._peers.items() if now_ns - peer.last_ns < 30 * GONE_NS and not peer.ended
         }
@@ -206,7 +215,7 @@ class Ingest:
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.last_ns < GONE_NS]
 
     def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Received:
-        refusal = self._pretence(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
+        refusal = self._key_fault(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
         if refusal is not None:
             return Received(reply=wire.Ack(hello.run_id, {}, refused=refusal))
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
@@ -235,11 +244,11 @@ class Ingest:
         return Received(greeted=hello if news else None, reply=reply, offer=offer)
 
     def _ack(self, peer: Peer) -> wire.Ack:
-        final = [self.final_until[array] for array in peer.hello.arrays if array in self.final_until]
+        final = [self._final_until[array] for array in peer.hello.arrays if array in self._final_until]
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
-    def _pretence(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """Return why a key does not fit its greeting; it is valid for its node, and for the arrays of that node."""
+    def _key_fault(self, hello: wire.Hello, enrolled: str | None) -> str | None:
+        """Return why the node may not use this key, which is valid for one node and its arrays; None if it may."""
         if enrolled is None:
             return None
         if hello.node != enrolled:

@@ -1,4 +1,4 @@
-"""The nodes' socket, and the thread that moves what they send, in order, into one bounded queue."""
+"""The nodes' socket and its thread. `ingest` decides what is accepted and acknowledged."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ QUEUE_MESSAGES: Final = 1000
 """Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
 
 BUSY_MESSAGES: Final = 100
-"""While as many messages wait, acknowledgements do not hurry, so that live sound does not wait behind backlogs."""
+"""Queue length from which the fast acknowledgements (`ingest.SOON_NS`) pause, so that backlogs do not delay live
+sound."""
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +62,7 @@ class Joined:
 
 @dataclass(frozen=True, slots=True)
 class Greeted:
-    """A node has greeted again with another backlog: more after an interruption, none once all of it is sent."""
+    """A node has greeted again because its backlog changed: larger after an interruption, empty once it was sent."""
 
     hello: wire.Hello
 

@@ -57,7 +57,7 @@ class Refusals:
             count = 1 if before is None else before.count + 1
             self._known[key] = Refused(door, who, reason, count, self._clock.now_ns())
         if before is None:
-            _log.warning("%s: %s was refused: %s (told once, counted in /metrics)", door, who, reason)
+            _log.warning("%s: %s was refused: %s (logged once, counted in /metrics)", door, who, reason)
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Return the number of refusals by door and reason."""

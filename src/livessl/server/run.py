@@ -20,6 +20,7 @@ class Run:
 
     Parameters
     ----------
+    site : Site
     fusion : TwoPassFusion
     clock_offsets : ClockOffsets
         What the fusion learns of the arrays' clocks.
@@ -27,9 +28,14 @@ class Run:
         Encodes what is published; None before the first message, from whose time a replay counts.
     """
 
+    site: Site
     fusion: TwoPassFusion
     clock_offsets: ClockOffsets
     messages: Messages | None = None
+
+    def begin(self, origin_ns: int) -> None:
+        """Start to encode messages, with their `start_s` counted from `origin_ns` of site time."""
+        self.messages = Messages(self.site, origin_ns, utc=True)
 
 
 def live_run(site: Site, done: Finalized, for_each: ForEach) -> Run:
@@ -47,4 +53,4 @@ def _run(site: Site, arrays: Iterable[str], done: Finalized, for_each: ForEach, 
     if done.clocks is not None:
         clock_offsets.restore(done.clocks)
     fusion = make_two_pass_fusion(site, arrays, done.until, live=live, clock_offsets=clock_offsets, for_each=for_each)
-    return Run(fusion, clock_offsets)
+    return Run(site, fusion, clock_offsets)

@@ -1,16 +1,18 @@
-"""Sinks: further places that get every event. Each kind has a name in `SINKS`, chosen in the site file."""
+"""Sinks: further places that get every event. `livessl.site.sink_types.SINKS` names the type of each."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from pkgutil import resolve_name
+from typing import Protocol, cast
 
 from livessl.errors import RunError
 from livessl.server.api.encode import JsonObject
 from livessl.site.server_models import SinkConfig
+from livessl.site.sink_types import SINKS
 
 _log = logging.getLogger(__name__)
 
@@ -50,15 +52,11 @@ class JsonLines:
         self._file.close()
 
 
-SINKS: Final[dict[str, Callable[[SinkConfig], Sink]]] = {"jsonl": JsonLines}
-"""Factory of each kind of sink, by its name in the site file."""
-
-
 class Sinks:
     """All sinks of a site; one that fails is logged and counted, and does not hinder the others."""
 
     def __init__(self, configs: Sequence[SinkConfig]) -> None:
-        self._sinks = [(config.type, SINKS[config.type](config)) for config in configs]
+        self._sinks = [(config.type, _opened(config)) for config in configs]
         self.failures = 0
         """Events that a sink did not take."""
 
@@ -78,3 +76,9 @@ class Sinks:
                 sink.close()
             except OSError as error:
                 _log.error("sink %r was not closed cleanly: %s", name, error)
+
+
+def _opened(config: SinkConfig) -> Sink:
+    factory = SINKS[config.type]
+    make = resolve_name(factory) if isinstance(factory, str) else factory
+    return cast(Sink, make(config))

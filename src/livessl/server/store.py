@@ -20,7 +20,11 @@ MAX_EVENTS_IN_MEMORY: Final = 10_000
 """Most events kept in memory, about 10 MB; a file has no such limit."""
 
 BUSY_S: Final = 0.2
-"""Longest wait, in seconds, for a file that another program holds; the fusion thread waits as long."""
+"""Longest wait, in seconds, for a file that another program has locked; it can delay the fusion thread by as much."""
+
+UNLOCK: Final = "close the program that locks the file"
+CURE: Final = f"free space on its disk, or {UNLOCK}"
+"""Cures of a database that cannot be written."""
 
 
 class Cursor(NamedTuple):
@@ -34,7 +38,7 @@ class Cursor(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Cursor:
-        """Return the cursor that `str` made this text of.
+        """Return the cursor of which `text` is the text form.
 
         Raises
         ------
@@ -118,14 +122,14 @@ class Store:
             ) from error
 
     def add(self, event: JsonObject, time_ns: int, *, early: bool = False) -> None:
-        """Keep an event in place of one of the same id; an early one counts as early until `finalize` passes its time.
+        """Store an event, replacing one of the same id; an early event stays early until `finalize` passes its time.
 
         Raises
         ------
         StoreError
             If the file is locked, or its disk is full.
         """
-        with self._kept(f"event {event['id']!r} was") as db:
+        with self._kept(f"event {event['id']!r}") as db:
             self._insert(db, event, time_ns)
             if early:
                 db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
@@ -158,7 +162,7 @@ class Store:
         StoreError
             If the file is locked, or its disk is full.
         """
-        with self._kept(f"{len(events)} events were") as db:
+        with self._kept(f"{len(events)} events") as db:
             db.executemany("DELETE FROM events WHERE id = ?", [(old,) for old in replaced])
             for event, time_ns in events:
                 self._insert(db, event, time_ns)
@@ -197,7 +201,7 @@ class Store:
             if enabled
             else "INSERT OR IGNORE INTO disabled VALUES (?, ?)"
         )
-        with self._kept(f"that array {array!r} is {'enabled' if enabled else 'disabled'} was") as db:
+        with self._kept(f"the state of array {array!r}") as db:
             db.execute(sql, (site, array))
 
     def early_events(self) -> list[tuple[int, JsonObject]]:
@@ -212,7 +216,7 @@ class Store:
         try:
             return [(time_ns, json.loads(text)) for time_ns, text in self._writing.rows(sql)]
         except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: cannot read: {error}; release the file") from error
+            raise StoreError(f"server.events_db: cannot read: {error}; {UNLOCK}") from error
 
     def _insert(self, db: sqlite3.Connection, event: JsonObject, time_ns: int) -> None:
         db.execute(
@@ -231,7 +235,7 @@ class Store:
             with self._writing.lock, self._writing.db as db:
                 yield db
         except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: {what} not kept: {error}; free space or release the file") from error
+            raise StoreError(f"server.events_db: cannot store {what}: {error}; {CURE}") from error
 
     def expire(self, before_ns: int) -> int:
         """Delete the events that began before a time, and overwrite them in the file; return their number.
@@ -247,9 +251,9 @@ class Store:
                     gone = db.execute("DELETE FROM events WHERE time_ns < ?", (before_ns,)).rowcount
                 busy, *_ = self._writing.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
                 if busy:
-                    raise StoreError("server.events_db: its journal was not emptied of old events; release the file")
+                    raise StoreError(f"server.events_db: its journal was not emptied of old events; {UNLOCK}")
         except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: old events were not deleted: {error}; release the file") from error
+            raise StoreError(f"server.events_db: old events were not deleted: {error}; {UNLOCK}") from error
         return gone
 
     def get(self, event_id: str) -> JsonObject | None:

@@ -125,21 +125,15 @@ def impulse_responses(
     high-pass: below 100 Hz, where images only ever add, the response rings longer than the time asked for. The lattice
     is visited in shells of equal volume, so memory does not grow with the number of images.
     """
-    room_m = _as_room_m(room_size_m)
-    source = _as_inside_m(np.atleast_2d(np.asarray(source_m)), room_m, "source")[0]
-    microphones = _as_inside_m(microphones_m, room_m, "microphone")
-    if (microphones == source).all(axis=1).any():
-        raise ValueError(f"room: expected source and microphones apart, got both at {_xyz(source)} m; move one")
+    room_m, source, microphones = _checked_positions(room_size_m, source_m, microphones_m)
     if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
         raise ValueError(f"sample rate: expected Hz above 0, got {sample_rate_hz}")
     if len(rt60s_s) == 0:
         raise ValueError("reverberation times: expected one or more, got none")
     beta = np.sqrt([1.0 - absorption(rt60_s, room_m, c_m_s) for rt60_s in rt60s_s])
     across_s = float(np.linalg.norm(room_m)) / c_m_s + GUARD / sample_rate_hz
-    if duration_s is None:
-        duration_s = max(*rt60s_s, across_s)
-    if not (np.isfinite(duration_s) and duration_s * sample_rate_hz >= 1):
-        raise ValueError(f"duration: expected at least one sample, {1 / sample_rate_hz:g} s, got {duration_s} s")
+    duration_s = max(*rt60s_s, across_s) if duration_s is None else duration_s
+    _check_duration(duration_s, sample_rate_hz)
     count = int(np.ceil(duration_s * sample_rate_hz))
     ends = np.full(len(beta), count, dtype=np.int64)
     if own_lengths:
@@ -161,6 +155,23 @@ def impulse_responses(
     for r, end in enumerate(ends):
         responses[r, :, end:] = 0.0
     return responses
+
+
+def _checked_positions(
+    room_size_m: ArrayLike, source_m: ArrayLike, microphones_m: ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the room's size (3,), the source (3,) and the microphones (K, 3), metres, once they are checked."""
+    room_m = _as_room_m(room_size_m)
+    source = _as_inside_m(np.atleast_2d(np.asarray(source_m)), room_m, "source")[0]
+    microphones = _as_inside_m(microphones_m, room_m, "microphone")
+    if (microphones == source).all(axis=1).any():
+        raise ValueError(f"room: expected source and microphones apart, got both at {_xyz(source)} m; move one")
+    return room_m, source, microphones
+
+
+def _check_duration(duration_s: float, sample_rate_hz: float) -> None:
+    if not (np.isfinite(duration_s) and duration_s * sample_rate_hz >= 1):
+        raise ValueError(f"duration: expected at least one sample, {1 / sample_rate_hz:g} s, got {duration_s} s")
 
 
 def _all(

@@ -192,7 +192,7 @@ def _wide_arrays(site: Site) -> Iterator[str]:
     from a grid point to a corner of its cell.
     """
     grid = search_grid(site)
-    points_m = grid.nodes_m(slice(0, grid.size, grid.size // SAMPLED_GRID_POINTS | 1))
+    points_m = grid.points_m(slice(0, grid.size, grid.size // SAMPLED_GRID_POINTS | 1))
     reach_m = grid.spacing_m * len(grid.free_axes) ** 0.5 / 2.0
     for spec in site.processed:
         if reach_m == 0.0 or uses_envelope(spec.band_hz):

@@ -103,7 +103,7 @@ def validation_findings(model: type[BaseModel], errors: Iterable[Mapping[str, An
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Return the sentence for a key that is not known, with the known key that it may be a slip of."""
+    """Return the sentence for a key that is not known, with the closest known key, if there is one."""
     similar = get_close_matches(key, list(known), 1)
     return f"unknown key {key!r}; " + (f"did you mean {similar[0]!r}?" if similar else "remove it")
 

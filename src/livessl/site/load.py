@@ -72,10 +72,11 @@ def parse_site(
     """
     try:
         data = read_yaml(text)
+        # parsed a second time, to nodes: only they have line numbers and duplicate keys
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         locator = Locator(source, root)
     except RecursionError as error:
-        raise ConfigError([Fault(source, "not a site: it holds itself, or is nested too deeply")]) from error
+        raise ConfigError([Fault(source, "not a site: an alias contains itself, or nesting is too deep")]) from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{source}:{mark.line + 1}" if mark else source
@@ -86,13 +87,13 @@ def parse_site(
         data["joint"] |= {name: list(members) for name, members in joint.items()}
     site, findings = _checked(data, directory or Path())
     findings = [*duplicate_keys(root), *findings]
-    if findings or site is None:
+    if site is None or findings:
         raise ConfigError([locator.fault(place, what) for place, what in findings])
     return site.model_copy(update={"warnings": warnings_of(site)})
 
 
 def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, list[Finding]]:
-    """Validate the data, and check what is valid as a whole; None if too little is valid."""
+    """Validate each section, then check the valid ones together; return None for the site if too little is valid."""
     known = {key: value for key, value in data.items() if key in SiteFile.model_fields}
     findings: list[Finding] = [
         ((key,), unknown_key(str(key), SiteFile.model_fields)) for key in data if key not in known
@@ -100,6 +101,7 @@ def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, lis
     errors: list[Any] = []
     file = None
     try:
+        # the models append most faults to the context and go on; only what stops them is raised
         file = SiteFile.model_validate(known, context=errors)
     except ValidationError as error:
         errors += error.errors()
@@ -113,5 +115,5 @@ def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, lis
 
 
 def _follows_from(faulty: set[str], place: Place) -> bool:
-    """Return True if a finding may only be due to faulty arrays that were left out."""
+    """Return True if the finding may be caused only by the arrays that were dropped as faulty."""
     return bool(faulty) and (place[-1] in faulty or place == ("fusion", "min_arrays"))

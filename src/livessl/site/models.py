@@ -1,4 +1,7 @@
-"""Models of the site file, and `Site`: a site file with the arrays that were built from it. They build nothing."""
+"""Models of the site file, and `Site`: a site file with the arrays that were built from it.
+
+The models only validate; `livessl.site.build` computes from them.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,7 @@ class Tetrahedron(Model):
 
 
 class Circle(Model):
-    """A horizontal circle: channel 1 towards +x, then counter-clockwise, or clockwise if so set."""
+    """A horizontal circle: channel 1 towards +x, then counter-clockwise, or clockwise with `clockwise: true`."""
 
     radius_m: Positive
     count: Annotated[int, Field(ge=MIN_MICROPHONES, le=MAX_MICROPHONES)]
@@ -183,9 +186,8 @@ class Zone(Model):
 class SiteFile(Model):
     """A whole site file, as it is written.
 
-    With a list as validation context, the faults of a section, or of a named entry such as an array, are appended to
-    the list and the section or entry is left out, so that the rest can be checked further. A fault of `site` or `room`
-    is always raised.
+    If the validation context is a list, faults are appended to it instead of raised. The faulty section or named entry
+    is dropped, and the rest is still checked. A fault of `site` or `room` always raises.
     """
 
     site: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
 from livessl.site.fields import FileName, Model, Positive
+from livessl.site.sink_types import check_sink_type
 
 
 class HttpConfig(Model):
@@ -53,9 +54,9 @@ class HttpConfig(Model):
 
 
 class SinkConfig(Model):
-    """Another destination of events: a file with one JSON object a line."""
+    """Another destination of events, of one of the types in `livessl.site.sink_types`."""
 
-    type: Literal["jsonl"]
+    type: Annotated[str, AfterValidator(check_sink_type)]
     path: FileName
 
 

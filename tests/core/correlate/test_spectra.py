@@ -179,8 +179,8 @@ def test_the_mapper_looks_each_point_up_below_its_limit() -> None:
     correlate = GCCPhat(NORTH, RATE_HZ, C_M_S)
     gccs = correlate.below([heard(NORTH, SOURCE_M, burst(4000))], (3000.0, 1500.0))
     mapper = SRPMapper(NORTH, grid, correlate.pairs, correlate.lags_s, C_M_S, (3000.0, 1500.0))
-    limit = alias_free_hz(grid.nodes_m(), NORTH.microphones_m, correlate.pairs, 0.5, C_M_S)
-    lags = steering_delays_s(grid.nodes_m(), NORTH.microphones_m, correlate.pairs, C_M_S)
+    limit = alias_free_hz(grid.points_m(), NORTH.microphones_m, correlate.pairs, 0.5, C_M_S)
+    lags = steering_delays_s(grid.points_m(), NORTH.microphones_m, correlate.pairs, C_M_S)
     step = correlate.lags_s[1] - correlate.lags_s[0]
     place = (lags - correlate.lags_s[0]) / step
     column = np.rint(place).astype(int)

@@ -112,8 +112,8 @@ def test_silence_is_refused_without_a_warning() -> None:
 def test_neighbourhood_reaches_a_metre_and_stays_inside_the_grid() -> None:
     box = refine.neighbourhood(SOURCE_M, GRID)
     for axis, (first, last) in enumerate(box):
-        nodes = GRID.axis_m(axis)
-        assert abs(nodes[first] - SOURCE_M[axis]) <= 1.0
-        assert abs(nodes[last] - SOURCE_M[axis]) <= 1.0
-        assert first == 0 or abs(nodes[first - 1] - SOURCE_M[axis]) > 1.0
-        assert last == len(nodes) - 1 or abs(nodes[last + 1] - SOURCE_M[axis]) > 1.0
+        points = GRID.axis_m(axis)
+        assert abs(points[first] - SOURCE_M[axis]) <= 1.0
+        assert abs(points[last] - SOURCE_M[axis]) <= 1.0
+        assert first == 0 or abs(points[first - 1] - SOURCE_M[axis]) > 1.0
+        assert last == len(points) - 1 or abs(points[last + 1] - SOURCE_M[axis]) > 1.0

@@ -30,7 +30,7 @@ class HighestGridPoint(MapEstimator):
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         evidence = self.evidence(sounds)
         maps = self.power_maps(evidence)
-        position_m = maps.grid.node_m(int(maps.fused.argmax()))
+        position_m = maps.grid.point_m(int(maps.fused.argmax()))
         return Localization(position_m, np.diag(maps.grid.cell_m**2), 0.5, evidence)
 
 

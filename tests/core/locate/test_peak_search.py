@@ -82,7 +82,7 @@ def test_the_peak_is_that_of_the_whole_map(kernels: ModuleType, count: int, kind
         searched = searching(evidence, grid)
         power = fused_map(evidence, grid)
         (found,) = searched.among(evidence)(1)
-        assert found.node == power.argmax()
+        assert found.point == power.argmax()
         assert found.power == power.max()
 
 
@@ -126,7 +126,7 @@ def test_the_first_of_equal_points_is_the_peak(kernels: ModuleType) -> None:
     spec = arrays(1, 3)[0]
     silent = GCCPhat(spec, RATE_HZ, C_M_S)([np.zeros((len(spec.microphones_m), 2048), np.float32)])
     (found,) = searching([Evidence(spec, silent)], grid).among([Evidence(spec, silent)])(1)
-    assert (found.node, found.power) == (0, 0.0)
+    assert (found.point, found.power) == (0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_any_box_is_searched(kernels: ModuleType, bounds: tuple[tuple[float, flo
     evidence = sounds(arrays(2, 4), "talker", 4)
     power = fused_map(evidence, grid)
     (found,) = searching(evidence, grid).among(evidence)(1)
-    assert [found.node, found.power] == [int(power.argmax()), float(power.max())]
+    assert [found.point, found.power] == [int(power.argmax()), float(power.max())]
 
 
 def test_arrays_of_different_rates_and_subsets_of_arrays(kernels: ModuleType) -> None:
@@ -157,7 +157,7 @@ def test_arrays_of_different_rates_and_subsets_of_arrays(kernels: ModuleType) ->
     for chosen in (evidence, evidence[1:], evidence[::-1], evidence[2:]):
         power = fused_map([Evidence(h.spec, h.gcc) for h in chosen], grid)
         (found,) = searched.among(chosen)(1)
-        assert [found.node, found.power] == [int(power.argmax()), float(power.max())]
+        assert [found.point, found.power] == [int(power.argmax()), float(power.max())]
 
 
 def test_a_search_that_gives_up_is_not_proven(kernels: ModuleType) -> None:
@@ -169,7 +169,7 @@ def test_a_search_that_gives_up_is_not_proven(kernels: ModuleType) -> None:
     assert whole.proven
     assert not some.proven
     assert some.power <= whole.power
-    assert some.power == fused_map(evidence, grid)[some.node]
+    assert some.power == fused_map(evidence, grid)[some.point]
 
 
 def test_memory_does_not_grow_with_the_grid() -> None:
@@ -199,7 +199,7 @@ def test_a_bound_over_too_few_lags_loses_peaks(kernels: ModuleType, monkeypatch:
     for seed in range(20):
         evidence = sounds(arrays(2, seed), "noise", seed)
         searched = searching(evidence, grid)
-        lost += searched.among(evidence)(1)[0].node != fused_map(evidence, grid).argmax()
+        lost += searched.among(evidence)(1)[0].point != fused_map(evidence, grid).argmax()
     assert lost > 0
 
 

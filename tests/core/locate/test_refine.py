@@ -48,7 +48,7 @@ NEAR_M = 5e-4
 
 
 def brute_force(power: Float32Array, grid: Grid, count: int) -> list[int]:
-    """Take the highest node that is left, and cross out its neighbours, again and again."""
+    """Take the highest point that is left, and cross out its neighbours, again and again."""
     left = power.reshape(grid.shape).astype(np.float64)
     found: list[int] = []
     while len(found) < count and np.isfinite(left).any():
@@ -72,16 +72,16 @@ def test_peaks_of_a_map_are_those_of_brute_force(
     grid = Grid(((0.0, float(x)), (0.0, float(y)), (0.0, float(z))), 1.0)
     rng = np.random.default_rng(seed)
     if smooth:
-        power = -np.linalg.norm(grid.nodes_m() - rng.uniform(0, 6, 3), axis=1).astype(np.float32)
+        power = -np.linalg.norm(grid.points_m() - rng.uniform(0, 6, 3), axis=1).astype(np.float32)
     else:
         power = rng.permutation(grid.size).astype(np.float32)
     found = refine.in_map(power, grid)(count)
-    nodes = [peak.node for peak in found]
-    assert [peak.power for peak in found] == [power[node] for node in nodes]
-    assert nodes == brute_force(power, grid, count)
-    cell = np.stack(np.unravel_index(nodes, grid.shape), axis=1)
-    assert all(np.abs(cell[a] - cell[b]).max() > 1 for a in range(len(nodes)) for b in range(a))
-    assert all(power[a] >= power[b] for a, b in pairwise(nodes))
+    points = [peak.point for peak in found]
+    assert [peak.power for peak in found] == [power[point] for point in points]
+    assert points == brute_force(power, grid, count)
+    cell = np.stack(np.unravel_index(points, grid.shape), axis=1)
+    assert all(np.abs(cell[a] - cell[b]).max() > 1 for a in range(len(points)) for b in range(a))
+    assert all(power[a] >= power[b] for a, b in pairwise(points))
 
 
 @settings(deadline=None, max_examples=50)
@@ -90,7 +90,7 @@ def test_refining_climbs_and_stays_inside(seed: int) -> None:
     rng = np.random.default_rng(seed)
     outside_m = rng.uniform(GRID.lower_m - 1.0, GRID.upper_m + 1.0)
     functional = SRPFunctional(evidence_of((NORTH, SOUTH), outside_m, noise=0.1, seed=seed), C_M_S)
-    start_m = GRID.node_m(int(rng.integers(GRID.size)))
+    start_m = GRID.point_m(int(rng.integers(GRID.size)))
     position_m, value = refine.refine(functional, start_m, GRID)
     assert (GRID.lower_m <= position_m).all()
     assert (position_m <= GRID.upper_m).all()
@@ -100,8 +100,8 @@ def test_refining_climbs_and_stays_inside(seed: int) -> None:
 
 def test_a_source_outside_the_grid_is_found_on_its_boundary() -> None:
     functional = SRPFunctional(evidence_of((NORTH, SOUTH), np.array([-0.2, 3.1, 1.4])), C_M_S)
-    node = int(functional.value(GRID.nodes_m()).argmax())
-    position_m, _ = refine.refine(functional, GRID.node_m(node), GRID)
+    point = int(functional.value(GRID.points_m()).argmax())
+    position_m, _ = refine.refine(functional, GRID.point_m(point), GRID)
     assert position_m[0] == 0.0
 
 
@@ -110,8 +110,8 @@ def test_a_source_outside_the_grid_is_found_on_its_boundary() -> None:
 def test_two_arrays_find_a_source_off_the_grid(seed: int) -> None:
     source_m = np.random.default_rng(seed).uniform([0.3, 2.0, 0.4], [1.6, 3.6, 2.3])
     functional = SRPFunctional(evidence_of((NORTH, SOUTH), source_m), C_M_S)
-    node = np.abs(GRID.nodes_m() - source_m).sum(axis=1).argmin()
-    position_m, value = refine.refine(functional, GRID.node_m(int(node)), GRID)
+    point = np.abs(GRID.points_m() - source_m).sum(axis=1).argmin()
+    position_m, value = refine.refine(functional, GRID.point_m(int(point)), GRID)
     assert np.linalg.norm(position_m - source_m) < NEAR_M
     assert value == pytest.approx(6.0, abs=6 * 3.5e-5)  # the functional's own error, derived at its test
 
@@ -121,8 +121,8 @@ def test_refining_in_a_plane_keeps_its_height() -> None:
     source_m = np.array([1.13, 3.31, 1.2])
     evidence = evidence_of((NORTH, SOUTH), source_m)
     functional = SRPFunctional(evidence, C_M_S)
-    node = int(functional.value(plane.nodes_m()).argmax())
-    position_m, _ = refine.refine(functional, plane.node_m(node), plane)
+    point = int(functional.value(plane.points_m()).argmax())
+    position_m, _ = refine.refine(functional, plane.point_m(point), plane)
     assert position_m[2] == 1.2
     assert np.linalg.norm(position_m - source_m) < NEAR_M
     covariance = covariance_of(evidence, plane, position_m)
@@ -134,15 +134,15 @@ def test_refining_in_a_plane_keeps_its_height() -> None:
 def test_a_grid_of_one_point_returns_that_point() -> None:
     point = Grid(((1.0, 1.0), (2.0, 2.0), (1.5, 1.5)), 0.1)
     evidence = evidence_of((NORTH, SOUTH))
-    position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), point.node_m(0), point)
+    position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), point.point_m(0), point)
     assert position_m.tolist() == [1.0, 2.0, 1.5]
     assert (covariance_of(evidence, point, position_m) == 0).all()
 
 
 def hills(*tops: tuple[tuple[float, float, float], float]) -> Float32Array:
-    nodes_m = GRID.nodes_m()
+    points_m = GRID.points_m()
     return np.asarray(
-        sum(height * np.exp(-50 * ((nodes_m - place) ** 2).sum(axis=1)) for place, height in tops), dtype=np.float32
+        sum(height * np.exp(-50 * ((points_m - place) ** 2).sum(axis=1)) for place, height in tops), dtype=np.float32
     )
 
 
@@ -230,7 +230,7 @@ def squared_distances() -> FloatArray:
     rng = np.random.default_rng(6)
     n, trials = 1600, 200
     correlate = {spec.name: GCCPhat(spec, RATE_HZ, C_M_S) for spec in (NORTH, SOUTH)}
-    node_m = GRID.node_m(int(np.abs(GRID.nodes_m() - SOURCE_M).sum(axis=1).argmin()))
+    point_m = GRID.point_m(int(np.abs(GRID.points_m() - SOURCE_M).sum(axis=1).argmin()))
     distances = np.empty(trials)
     for trial in range(trials):
         sound = rng.standard_normal(n)
@@ -238,7 +238,7 @@ def squared_distances() -> FloatArray:
         for spec in (NORTH, SOUTH):
             noisy = heard(spec, SOURCE_M, sound) + rng.standard_normal((4, n))
             evidence.append(Evidence(spec, correlate[spec.name]([noisy.astype(np.float32)])))
-        position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), node_m, GRID)
+        position_m, _ = refine.refine(SRPFunctional(evidence, C_M_S), point_m, GRID)
         error_m = position_m - SOURCE_M
         distances[trial] = error_m @ np.linalg.solve(covariance_of(evidence, GRID, position_m), error_m)
     return distances

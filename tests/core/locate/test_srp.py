@@ -55,21 +55,21 @@ def test_a_steering_delay_is_positive_if_the_second_microphone_is_further_away()
 
 def test_map_peaks_at_the_source_and_mirrored_lags_do_not() -> None:
     gcc = GCCPhat(NORTH, RATE_HZ, C_M_S)([heard(NORTH, SOURCE_M, burst(3000))])
-    nodes_m = GRID.nodes_m()
+    points_m = GRID.points_m()
     # Half a cell, 87 mm of diagonal, is 2.5 degrees at the 1.8 m from array to source; one array hardly
     # determines the distance, so only the direction counts.
-    assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, gcc).argmax()]) < 2 * 2.5
+    assert off_axis_deg(NORTH, points_m[mapped(NORTH, gcc).argmax()]) < 2 * 2.5
     mirrored = GCC(gcc.pairs, gcc.lags_s.copy(), gcc.values[:, ::-1].copy())
-    assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, mirrored).argmax()]) > 90
+    assert off_axis_deg(NORTH, points_m[mapped(NORTH, mirrored).argmax()]) > 90
     swapped = GCC(gcc.pairs[:, ::-1].copy(), gcc.lags_s.copy(), gcc.values.copy())
-    assert off_axis_deg(NORTH, nodes_m[mapped(NORTH, swapped).argmax()]) > 90
+    assert off_axis_deg(NORTH, points_m[mapped(NORTH, swapped).argmax()]) > 90
 
 
 def test_the_map_of_two_arrays_peaks_at_a_neighbouring_grid_point() -> None:
     power = sum(mapped(spec, ideal(spec)) for spec in (NORTH, SOUTH))
-    nodes_m = GRID.nodes_m()
+    points_m = GRID.points_m()
     # perhaps not the nearest of all: half a cell along an axis may cost less in one direction than in another
-    assert (np.abs(nodes_m[int(np.argmax(power))] - SOURCE_M) <= GRID.cell_m).all()
+    assert (np.abs(points_m[int(np.argmax(power))] - SOURCE_M) <= GRID.cell_m).all()
 
 
 def test_the_map_is_the_functional_to_half_a_fine_lag() -> None:
@@ -77,7 +77,7 @@ def test_the_map_is_the_functional_to_half_a_fine_lag() -> None:
     for array in (spec, NORTH):
         gcc = ideal(array)
         on_grid = mapped(array, gcc)
-        smooth = SRPFunctional([Evidence(array, gcc)], C_M_S).value(GRID.nodes_m())
+        smooth = SRPFunctional([Evidence(array, gcc)], C_M_S).value(GRID.points_m())
         # half a fine lag off at most: half the largest difference, and what the largest curvature takes off
         steepest = 0.5 * np.abs(np.diff(gcc.values, axis=1)).max(axis=1)
         bend = np.abs(np.diff(gcc.values, 2, axis=1)).max(axis=1) / 8
@@ -115,7 +115,7 @@ def test_the_power_at_the_source_is_the_number_of_independent_delays() -> None:
     for count in (2, 3, 8, 16):
         spec = ArraySpec("any", np.random.default_rng(count).uniform(0, 0.3, (count, 3)), BAND_HZ)
         functional = SRPFunctional([Evidence(spec, ideal(spec))], C_M_S)
-        # K (K - 1) / 2 pairs of value 1 and weight 2 / K; a node half a fine lag off loses (w h / 2)^2 / 2 / 3
+        # K (K - 1) / 2 pairs of value 1 and weight 2 / K; a point half a fine lag off loses (w h / 2)^2 / 2 / 3
         assert functional.value(SOURCE_M[None])[0] == pytest.approx(count - 1, rel=3.5e-5)
         assert mapped(spec, ideal(spec), point)[0] == pytest.approx(count - 1, rel=0.0036)
     assert pair_weight(4) == 0.5
@@ -189,7 +189,7 @@ def test_swapped_channels_need_swapped_microphones() -> None:
     np.testing.assert_allclose(both.argmax(), usual.argmax())
     one = mapped(NORTH, GCCPhat(NORTH, RATE_HZ, C_M_S)([samples[order]]))
     assert one.max() < 0.8 * usual.max()
-    assert off_axis_deg(NORTH, GRID.node_m(int(one.argmax()))) > 20
+    assert off_axis_deg(NORTH, GRID.point_m(int(one.argmax()))) > 20
 
 
 def test_the_map_of_a_plane_is_a_slice_of_the_volume() -> None:

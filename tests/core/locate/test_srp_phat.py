@@ -59,7 +59,7 @@ def test_maps_are_drawn_from_the_evidence(estimator: SrpPhat) -> None:
     assert maps.arrays.keys() == {"north", "south"}
     assert maps.fused.shape == (maps.grid.size,)
     np.testing.assert_array_equal(maps.fused, maps.arrays["north"] + maps.arrays["south"])
-    assert (np.abs(maps.grid.node_m(int(maps.fused.argmax())) - SOURCE_M) <= maps.grid.cell_m).all()
+    assert (np.abs(maps.grid.point_m(int(maps.fused.argmax())) - SOURCE_M) <= maps.grid.cell_m).all()
     alone = estimator.power_maps(found.evidence, {"south"})
     assert alone.arrays.keys() == {"south"}
     np.testing.assert_array_equal(alone.arrays["south"], maps.arrays["south"])

@@ -43,8 +43,8 @@ def summed_directly(spec: ArraySpec, samples: Float32Array, *, band_limit: bool)
     low, high = band_bins(spectra.n_fft, RATE_HZ, BAND_HZ)
     frequency_hz = np.arange(low, high) * RATE_HZ / spectra.n_fft
     inside = spectra.values[0, :, low:high].astype(np.complex128)
-    delay_s = steering_delays_s(GRID.nodes_m(), spec.microphones_m, pairs, C_M_S)
-    limit_hz = alias_free_hz(GRID.nodes_m(), spec.microphones_m, pairs, GRID.spacing_m, C_M_S)
+    delay_s = steering_delays_s(GRID.points_m(), spec.microphones_m, pairs, C_M_S)
+    limit_hz = alias_free_hz(GRID.points_m(), spec.microphones_m, pairs, GRID.spacing_m, C_M_S)
     power = np.zeros(GRID.size)
     for p, (i, k) in enumerate(pairs):
         phase = np.conj(inside[i]) * inside[k]

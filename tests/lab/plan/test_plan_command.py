@@ -213,7 +213,7 @@ WARNINGS: dict[str, tuple[Changes, float]] = {
     "wider than the critical distance": ({**FINE, "arrays.north.geometry": {"tetrahedron": {"edge_m": 1.4}}}, 1.5),
     "less than half a wavelength": ({**FINE, "arrays.north.geometry": {"tetrahedron": {"edge_m": 0.02}}}, 0.5),
     "needs a sample rate of 13333 Hz": ({**FINE, "nodes.lab-pc.device.sample_rate_hz": 13000}, 0.5),
-    "joint arrays (both) are not planned as such": ({**FINE, "joint.both": ["north", "south"]}, 0.5),
+    "the plan treats the joint arrays (both) as separate ones": ({**FINE, "joint.both": ["north", "south"]}, 0.5),
     "a grid of 0.5 m is too coarse": ({"grid.spacing_m": 0.5}, 0.5),
 }
 

@@ -24,7 +24,7 @@ ROOM_BOUNDS_M = ((0.0, 8.0), (0.0, 10.0), (0.0, 4.0))
 NORTH = tetra("north", [4.1, 2.4, 1.9], edge_m=0.5)
 SOUTH = tetra("south", [3.8, 7.3, 2.1], edge_m=0.5, yaw_deg=131.0)
 CONDITIONS = prediction.Conditions(critical_m=1.39, time_s=0.1, calibration_m=0.002)
-FLOOR_M = Grid((ROOM_BOUNDS_M[0], ROOM_BOUNDS_M[1], (1.5, 1.5)), 0.8).nodes_m()
+FLOOR_M = Grid((ROOM_BOUNDS_M[0], ROOM_BOUNDS_M[1], (1.5, 1.5)), 0.8).points_m()
 
 
 @pytest.mark.parametrize(
@@ -138,8 +138,8 @@ BANDS = {
 def test_band_that_pairs_keep(edge_and_spacing_m: tuple[float, float]) -> None:
     edge_m, spacing_m = edge_and_spacing_m
     microphones_m = tetrahedron(edge_m) + np.array([4.0, 5.0, 2.0])
-    nodes_m = Grid(ROOM_BOUNDS_M, spacing_m).nodes_m()
-    kept = alias_free_hz(nodes_m, microphones_m, microphone_pairs(4), spacing_m, C_M_S)
+    points_m = Grid(ROOM_BOUNDS_M, spacing_m).points_m()
+    kept = alias_free_hz(points_m, microphones_m, microphone_pairs(4), spacing_m, C_M_S)
     each, lowest = BANDS[edge_and_spacing_m]
     np.testing.assert_allclose(np.percentile(kept, [5, 25, 50, 75, 95]), each, rtol=0.02)
     np.testing.assert_allclose(np.percentile(kept.min(axis=0), [5, 50, 95]), lowest, rtol=0.04)
@@ -296,8 +296,8 @@ def test_prediction_is_near_the_simulation(rt60_s: float, simulated_m: float) ->
     drawn = np.linalg.cholesky(prediction.covariance_m2(arrays[0] + arrays[1], EXTENT_M)) @ rng.standard_normal(
         (2000, 3, 1)
     )
-    to_node_m = rng.uniform(-0.05, 0.05, (2000, 3))
-    median_m = float(np.median(np.linalg.norm(drawn[..., 0] + to_node_m, axis=1)))
+    to_point_m = rng.uniform(-0.05, 0.05, (2000, 3))
+    median_m = float(np.median(np.linalg.norm(drawn[..., 0] + to_point_m, axis=1)))
     # the simulated median is printed to half a centimetre, up to 8 %, and has a deviation of 1.25/sqrt(160) = 10 %
     assert median_m == pytest.approx(simulated_m, rel=0.28)
 
@@ -408,7 +408,7 @@ def test_no_move_where_there_is_no_room() -> None:
         (lambda: prediction.delay_std_s(0.0, BAND_HZ, 0.1), "squared coherence"),
         (lambda: prediction.delay_std_s(0.5, (200.0, 100.0), 0.1), "band low < high"),
         (lambda: prediction.delay_std_s(0.5, BAND_HZ, 0.0), "time above 0"),
-        (lambda: prediction.Conditions(1.0, 0.1, 0.0), "nothing is known exactly"),
+        (lambda: prediction.Conditions(1.0, 0.1, 0.0), "no position is exact"),
         (lambda: prediction.Conditions(0.0, 0.1, 0.002), "critical distance: expected above 0"),
         (lambda: alias_free_hz(FLOOR_M, NORTH.microphones_m, microphone_pairs(4), 0.0, C_M_S), "grid spacing"),
         (lambda: prediction.shifts_m(NORTH, [], ROOM_M, 0.0), "step: expected metres above 0"),

@@ -20,8 +20,8 @@ from websockets.typing import Subprotocol
 
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
-from livessl.server.api.auth import MAX_BODY_BYTES, needed_role
-from livessl.server.app import REFRESH_S, Server
+from livessl.server.api.auth import MAX_BODY_BYTES, RELOAD_S, needed_role
+from livessl.server.app import Server
 from livessl.server.http import MAX_HEAD_BYTES
 from livessl.site.tokens import Role, add_token, revoke_token
 from small_site import HANG_S, running_server, site_of, wait_until, write_site
@@ -136,7 +136,7 @@ def test_new_and_revoked_tokens_take_effect_without_a_restart(tmp_path: Path) ->
             assert secured.ask("/api/v1/site", Role.VIEWER).status_code == 401
             path.chmod(0o644)  # a file that others can read is refused: the tokens of before stay valid
             path.touch()
-            time.sleep(2 * REFRESH_S)
+            time.sleep(2 * RELOAD_S)
             assert secured.ask("/api/v1/site", Role.OPERATOR).status_code == 200
             path.unlink()
             wait_until(lambda: secured.ask("/api/v1/site", Role.ADMIN).status_code == 401, "the end of all tokens")

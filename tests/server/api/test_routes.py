@@ -230,7 +230,8 @@ def test_events_are_published_while_the_database_is_locked(tmp_path: Path) -> No
         with httpx.Client(base_url=server.url) as client:
             assert get(client, "events")["events"] == []
             assert "\nlivessl_events_unkept_total 2.0\n" in client.get("/metrics").text
-            lost = "server.events_db: 2 events were not kept; free space or release the file"
+            cure = "free space on its disk, or close the program that locks the file"
+            lost = f"server.events_db: 2 events were not stored; {cure}"
             assert lost in get(client, "health")["reasons"]
             replay_scene(server)
             wait_until(lambda: len(get(client, "events")["events"]) == 2, "both events, now that the file is free")

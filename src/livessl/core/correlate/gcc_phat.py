@@ -39,12 +39,12 @@ _PRODUCT_BINS: Final = 2048
 FFT."""
 
 _TOGETHER_S: Final = 0.25
-"""Longest sound, in seconds, that is correlated together with those of other arrays: matrices are read once for all,
-and spectra still fit in the cache."""
+"""Longest window, in seconds, for which several arrays are correlated in one product: longer spectra would not fit in
+the cache."""
 
 _ROUNDING: Final = 1e-6
-"""Fraction of a fine lag that is rounded away: apertures of one shape in different poses differ in the
-last digits."""
+"""Tolerance, in fine lags, in rounding up the largest lag, so that arrays of one shape share a lag axis despite
+rounding errors."""
 
 _SAMPLINGS: Final = 16
 """Lag samplings that are cached; the arrays of a site have few shapes."""
@@ -176,7 +176,7 @@ class CrossSpectra:
     sample_rate_hz : float
     band_hz : (float, float)
     weights : (L, B) float32 or None
-        Weights of each frame's bins in the band; correlations are then sums. None makes them means.
+        Weights of each frame's bins in the band. Given weights make correlations weighted sums; None makes them means.
     noise : (L, B) float32 or None
         Power of the noise in each frame's bins in the band; magnitudes count where it dominates. None uses phases only.
 
@@ -234,7 +234,7 @@ class CrossSpectra:
         return self.around_zero(self.n_fft, reach, cut_off_hz, envelope=envelope).astype(np.complex64)
 
     def around_zero(self, count: int, reach: int, cut_off_hz: float, *, envelope: bool) -> ComplexArray | Float32Array:
-        """The same as `correlations` at lags n_fft/count samples apart, by an inverse FFT of `count` points.
+        """Compute the same as `correlations`, at lags n_fft/count samples apart, by an inverse FFT of `count` points.
 
         Returns
         -------
@@ -298,7 +298,7 @@ class LagSampling:
         return samples.view(np.complex64) if envelope else samples
 
     def fine(self, samples: ComplexArray | Float32Array) -> Float32Array:
-        """Interpolate to the fine lags, (P, L), from the near-Nyquist lags; of an analytic signal the magnitude."""
+        """Interpolate from the near-Nyquist to the fine lags, (P, L); for an analytic signal, return the magnitude."""
         if np.iscomplexobj(samples):
             return np.asarray(np.hypot(samples.real @ self._weights, samples.imag @ self._weights), dtype=np.float32)
         return np.asarray(samples @ self._weights)

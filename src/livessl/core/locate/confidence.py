@@ -24,7 +24,7 @@ LEAST_CONFIDENCE: Final = 0.8
 """Confidence below which a position is refused."""
 
 SURE: Final = 0.9
-"""Confidence from which onsets alone suffice, if two arrays have a clear peak."""
+"""Confidence at and above which whole segments are not examined, provided that two arrays have a clear peak."""
 
 CROSSING_DEG: Final = 20.0
 """Angle, in degrees, from which arrays whose lines of sight cross determine the distance, whatever the margin."""
@@ -41,7 +41,7 @@ _DISTANCE_FIT: Final = (-0.04, 62.2)
 one array, or arrays side by side, whose maps have a ridge along that line."""
 
 _CLEAR_PEAK_TO_RMS: Final = 2.0
-"""Peak-to-RMS ratio of one array from which its peak is surely no noise, whose own ratio is about 1."""
+"""Peak-to-RMS ratio at and above which one array's peak cannot be noise; noise gives about 1."""
 
 _FITTED_DELAYS: Final = 3.0
 """Independent delays of an array of four microphones, with which the constants were fitted."""

@@ -68,6 +68,15 @@ class Sound:
         return GCC(gcc.pairs, gcc.lags_s, values)
 
 
+def strongest_onsets(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
+    """Return the sounds with the strongest onsets, at most `most`, in the order of the arrays' names."""
+    in_order = {name: sounds[name] for name in sorted(sounds)}
+    if len(in_order) <= most:
+        return in_order
+    strongest = sorted(in_order, key=lambda name: -in_order[name].onset_strength)[:most]
+    return {name: sound for name, sound in in_order.items() if name in strongest}
+
+
 @dataclass(frozen=True, slots=True)
 class Localization:
     """The answer of an estimator: a position, its certainty, and the evidence for it.

@@ -35,7 +35,7 @@ class MapEstimator(ABC):
     ...     def locate(self, sounds):
     ...         evidence = self.evidence(sounds)
     ...         maps = self.power_maps(evidence)
-    ...         position_m = maps.grid.node_m(int(maps.fused.argmax()))
+    ...         position_m = maps.grid.point_m(int(maps.fused.argmax()))
     ...         return Localization(position_m, np.diag(maps.grid.cell_m**2), 0.5, evidence)
     >>> register("highest-grid-point", HighestGridPoint)  # doctest: +SKIP
 

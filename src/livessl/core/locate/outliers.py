@@ -178,7 +178,7 @@ class _OwnPeaks:
         name = evidence.spec.name
         if name not in self._highest:
             (peak,) = self._search.among([evidence])(1)
-            self._highest[name] = (peak.power, self._grid.node_m(peak.node))
+            self._highest[name] = (peak.power, self._grid.point_m(peak.point))
         return self._highest[name]
 
 

@@ -3,8 +3,8 @@
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
 pair can add at any point of the cell; the sum of these maxima bounds the cell, and a cell whose bound is below the best
 power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
-Usually some two thousand of millions of points are visited. The size of a cell in metres is fixed, so memory does not
-grow with a finer grid.
+Usually about 2000 points out of millions are visited. The size of a cell in metres is fixed, so memory does not grow
+with a finer grid.
 """
 
 from __future__ import annotations
@@ -160,18 +160,18 @@ class PeakSearch:
         kernels.upper_bounds(maxima, self._cube_places, rows, self._bounds.of_cubes)
         self._bounds.known[:] = False
 
-        def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        def find(count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
                 left_out = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
-                node, power, proven = kernels.highest(
+                point, power, proven = kernels.highest(
                     values, maxima, rows, self._cells, self._bounds, left_out, most_look_ups
                 )
                 if power == -np.inf:
                     break
-                found.append(Peak(int(node), float(power), bool(proven)))
-                boxes.append(box_around(self._grid, int(node), apart_nodes))
+                found.append(Peak(int(point), float(power), bool(proven)))
+                boxes.append(box_around(self._grid, int(point), apart_points))
             return found
 
         return find

@@ -10,7 +10,7 @@ import numpy as np
 
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import array_power, peak_to_rms
+from livessl.core.locate.confidence import Judgement, array_power, judge, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Evidence, FloatArray
@@ -51,6 +51,10 @@ class Place:
         ratios = (peak_to_rms(part, array_power(part, term)) for part, term in zip(self.evidence, terms, strict=True))
         return min(ratios) >= 1.0
 
+    def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:
+        """Judge the place; `whole` if the evidence includes whole segments."""
+        return judge(self.functional, self.evidence, self.position_m, self.power, self.rival_power, grid, whole=whole)
+
     def apart_m(self, other: Place) -> float:
         """Distance from another place, in metres."""
         return float(np.linalg.norm(self.position_m - other.position_m))
@@ -73,7 +77,7 @@ def highest_place(evidence: Sequence[Evidence], search: PeakSearch, grid: Grid, 
     find = search.among(evidence)
     found = find(_STARTS)
     functional = SRPFunctional(evidence, c_m_s)
-    starts_m = np.stack([grid.node_m(peak.node) for peak in found])
+    starts_m = np.stack([grid.point_m(peak.point) for peak in found])
     position_m, power = refine.refine(functional, starts_m, grid)
     rival_power = refine.rival_power(find, grid, position_m)
     return Place(evidence, functional, position_m, power, rival_power, found[0].proven)

@@ -35,7 +35,7 @@ _SUBDIVISIONS: Final = 4
 class Peak:
     """A grid point, the fused power there, and whether it is proven to be the highest, not only of those examined."""
 
-    node: int
+    point: int
     power: float
     proven: bool = True
 
@@ -43,8 +43,8 @@ class Peak:
 class FindPeaks(Protocol):
     """Finds the highest grid points, best first: each is the highest of those far enough from the ones before it."""
 
-    def __call__(self, count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
-        """Find up to `count` peaks that differ by more than `apart_nodes` along some axis, none of them in a box.
+    def __call__(self, count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+        """Find up to `count` peaks that differ by more than `apart_points` along some axis, none of them in a box.
 
         A box (3, 2) is the first and last point along each axis. The first of equal points in the grid's order wins.
         """
@@ -54,28 +54,28 @@ class FindPeaks(Protocol):
 def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
     """Return a function that finds the peaks of a whole map (G,)."""
 
-    def find(count: int, apart_nodes: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
+    def find(count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
         left = power.reshape(grid.shape).copy()
         for box in without:
             left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
         found: list[Peak] = []
         for _ in range(count):
-            node = int(left.argmax())
-            highest = float(left.flat[node])
+            point = int(left.argmax())
+            highest = float(left.flat[point])
             if highest == -np.inf:
                 break
-            found.append(Peak(node, highest))
-            box = box_around(grid, node, apart_nodes)
+            found.append(Peak(point, highest))
+            box = box_around(grid, point, apart_points)
             left[tuple(slice(max(0, first), last + 1) for first, last in box.tolist())] = -np.inf
         return found
 
     return find
 
 
-def box_around(grid: Grid, node: int, apart_nodes: int) -> IntArray:
-    """Return the box (3, 2) of points at most `apart_nodes` from one along each axis: the first and last of each."""
-    at = np.array(np.unravel_index(node, grid.shape))
-    return np.stack([at - apart_nodes, at + apart_nodes], axis=1)
+def box_around(grid: Grid, point: int, apart_points: int) -> IntArray:
+    """Return the box (3, 2) of points at most `apart_points` from one along each axis: the first and last of each."""
+    at = np.array(np.unravel_index(point, grid.shape))
+    return np.stack([at - apart_points, at + apart_points], axis=1)
 
 
 def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:

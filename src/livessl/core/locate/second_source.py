@@ -9,16 +9,20 @@ reverberation leaves in that it is prominent in some frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from livessl.core.correlate.band import uses_envelope
 from livessl.core.correlate.gcc_phat import LagSampling
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import refine
+from livessl.core.locate.confidence import Judgement
+from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
+from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
 from livessl.core.locate.srp import SRPFunctional
@@ -26,6 +30,9 @@ from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array
 
 APART_M: Final = 1.0
 """Distance, in metres, below which two places are one source."""
+
+MOST_ARRAYS_SEPARATED: Final = 8
+"""Most arrays used to separate two sources; the time it takes is in proportion to their number."""
 
 MAX_FRAMES: Final = 40
 """Most frames that are kept apart; those of a longer sound are merged, so that memory and time do not grow with it."""
@@ -40,7 +47,7 @@ LITTLE: Final = 200.0
 """Onset weight of a frame below which it is mostly noise and counts less: noise at 10 dB gives some 30, a source in a
 clear frame thousands."""
 
-LEAST_CONFIDENCE: Final = 0.5
+LEAST_SECOND_SOURCE: Final = 0.5
 """Confidence below which a second source is not reported."""
 
 LEAST_PROSPECT: Final = 0.1
@@ -157,6 +164,28 @@ class TwoSources:
     second: Place
     confidence: float
 
+    @property
+    def stand_out_everywhere(self) -> bool:
+        """Whether every array has a peak at both places."""
+        return self.first.stands_out_everywhere and self.second.stands_out_everywhere
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """The answers for two sources that sounded at the same time: the first as a place, to be published as the main one.
+
+    Parameters
+    ----------
+    first : Place
+    judgement : Judgement
+        Judgement of the first place.
+    second : Localization
+    """
+
+    first: Place
+    judgement: Judgement
+    second: Localization
+
 
 class SecondSourceSearch:
     """Searches for a second source beside a known one.
@@ -174,6 +203,65 @@ class SecondSourceSearch:
         self._search = search
         self._grid = grid
         self._c_m_s = c_m_s
+
+    def separate(
+        self,
+        consensus: Consensus,
+        evidence: tuple[Evidence, ...],
+        sounds: Mapping[str, Sound],
+        frames_of: Callable[[Evidence], FrameGCCs],
+    ) -> Separation | None:
+        """Separate two sources that sound at the same time; None if there is no second one.
+
+        Arrays may disagree because they receive different sources best, so the second source is searched for in all
+        evidence first, and then in that of the arrays that agree. If all arrays have a peak at both places, none is an
+        outlier.
+
+        Parameters
+        ----------
+        consensus : Consensus
+            The consensus of `evidence`.
+        evidence : tuple of Evidence
+        sounds : mapping of str to Sound
+            The sound of each array of the evidence.
+        frames_of : callable
+            Returns the frames of an array's evidence.
+        """
+        agreeing = consensus.place.evidence
+        for tried in (evidence, agreeing) if consensus.outliers else (evidence,):
+            used = _separable(tried, sounds)
+            if not used:
+                return None
+            first = replace(consensus.place, evidence=used, functional=SRPFunctional(used, self._c_m_s))
+            found = self.find(first, [frames_of(part) for part in used])
+            disputed = consensus.refused is not None or len(tried) > len(agreeing)
+            if found is not None and (found.stand_out_everywhere or not disputed):
+                return self._separation(consensus, found, keeps_first=not disputed)
+        return None
+
+    def _separation(self, consensus: Consensus, found: TwoSources, *, keeps_first: bool) -> Separation:
+        """Judge both places. With `keeps_first` the consensus remains the first place if that is more confident.
+
+        Equalising the frames weakens a short first source.
+        """
+        places = [found.first]
+        if keeps_first and consensus.place.apart_m(found.second) >= APART_M:
+            places.append(consensus.place)
+        judged = [(place, place.judgement(self._grid)) for place in places]
+        first, judgement = max(judged, key=lambda pair: pair[1].features.confidence)
+        second, used = found.second.judgement(self._grid), {part.spec.name for part in found.second.evidence}
+        return Separation(
+            first,
+            judgement,
+            Localization(
+                found.second.position_m,
+                second.covariance_m2,
+                found.confidence,
+                found.second.evidence,
+                features=second.features,
+                outliers={name: off_deg for name, off_deg in consensus.outliers.items() if name not in used},
+            ),
+        )
 
     def find(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources | None:
         """Find a second source; None if there is none.
@@ -193,7 +281,7 @@ class SecondSourceSearch:
             return None
         again, _ = self.beside(second, frames)
         second, confidence = self.beside(again, frames)
-        if confidence < LEAST_CONFIDENCE or not second.proven or again.apart_m(second) < APART_M:
+        if confidence < LEAST_SECOND_SOURCE or not second.proven or again.apart_m(second) < APART_M:
             return None
         return TwoSources(again, second, confidence)
 
@@ -206,19 +294,31 @@ class SecondSourceSearch:
         evidence = tuple(each.without(taken_s) for each, taken_s in zip(frames, delays_s, strict=True))
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [refine.neighbourhood(place.position_m, self._grid)]
-        apart_nodes = round(CANDIDATES_APART_M / self._grid.spacing_m)
+        apart_points = round(CANDIDATES_APART_M / self._grid.spacing_m)
         best, chosen = 0.0, (place, 0.0)
         for _ in range(CANDIDATES):
             found = find(1, without=known)
             if not found:
                 break
-            position_m, power = refine.refine(functional, self._grid.node_m(found[0].node), self._grid)
+            position_m, power = refine.refine(functional, self._grid.point_m(found[0].point), self._grid)
             terms = functional.pair_terms(position_m)
             each = zip(frames, terms, delays_s, strict=True)
             prominent = prominence([one.prominence(term.lags_s, taken_s) for one, term, taken_s in each])
             if power * prominent > best:
                 candidate = Place(evidence, functional, position_m, power, power, found[0].proven)
                 best, chosen = power * prominent, (candidate, confidence(prominent))
-            known.append(refine.box_around(self._grid, found[0].node, apart_nodes))
+            known.append(refine.box_around(self._grid, found[0].point, apart_points))
         other, other_confidence = chosen
         return replace(other, rival_power=refine.rival_power(find, self._grid, other.position_m)), other_confidence
+
+
+def _separable(evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
+    """Return the evidence with the strongest onsets, from which two sources may be separated; empty if they may not.
+
+    It takes two arrays, `sources` > 1 and onsets. Envelopes do not qualify: magnitudes of two sources do not add up.
+    """
+    strongest = strongest_onsets({part.spec.name: sounds[part.spec.name] for part in evidence}, MOST_ARRAYS_SEPARATED)
+    used = tuple(part for part in evidence if part.spec.name in strongest)
+    if len(used) < 2 or not all(sound.onsets and sound.sources > 1 for sound in strongest.values()):
+        return ()
+    return () if any(uses_envelope(part.spec.band_hz) for part in used) else used

@@ -21,7 +21,7 @@ from livessl.core.kernels.with_numpy import interpolated, neighbours
 from livessl.core.steering import NEAREST_M, alias_free_hz
 from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray, IntArray
 
-_SLAB_NODES: Final = 1 << 15
+_SLAB_POINTS: Final = 1 << 15
 """Grid points whose delays are computed at once: as many as fit the second-level cache."""
 
 
@@ -79,8 +79,8 @@ class SRPMapper:
         ascending_hz = np.array([spec.band_hz[1], *cut_offs_hz])[::-1]
         columns = len(lags_s) * len(ascending_hz)
         table = np.empty((grid.size, len(pairs)), dtype=np.uint16 if columns < 1 << 16 else np.uint32)
-        for first in range(0, grid.size, _SLAB_NODES):
-            points_m = grid.nodes_m(slice(first, first + _SLAB_NODES))
+        for first in range(0, grid.size, _SLAB_POINTS):
+            points_m = grid.points_m(slice(first, first + _SLAB_POINTS))
             place = lag_places(points_m.astype(np.float32), microphones_m, pairs, on_axis.scale, on_axis.offset)
             if len(cut_offs_hz):
                 limit = alias_free_hz(points_m, spec.microphones_m, pairs, grid.spacing_m, c_m_s)

@@ -58,7 +58,7 @@ class SrpPhat(MapEstimator):
         find = refine.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
         found = find(refine.CANDIDATES)
         functional = SRPFunctional(evidence, self.c_m_s)
-        position, _ = refine.refine(functional, np.stack([grid.node_m(peak.node) for peak in found]), grid)
+        position, _ = refine.refine(functional, np.stack([grid.point_m(peak.point) for peak in found]), grid)
         return Localization(
             position,
             refine.laplace_covariance_m2(functional, evidence, position, grid),
@@ -93,7 +93,7 @@ class SrpPhat(MapEstimator):
         if band_limit is not None:
             return band_limit
         grid = self._map_grid
-        some = grid.nodes_m(slice(None, None, max(1, grid.size // _SAMPLED_POINTS)))
+        some = grid.points_m(slice(None, None, max(1, grid.size // _SAMPLED_POINTS)))
         pairs = microphone_pairs(len(spec.microphones_m))
         limit_hz = alias_free_hz(some, spec.microphones_m, pairs, grid.spacing_m, self.c_m_s)
         return bool(np.median(limit_hz) < spec.band_hz[1])

@@ -46,7 +46,7 @@ class PairMatrices:
     """
 
     def __init__(self, grid: Grid, sample_rate_hz: float, c_m_s: float, *, band_limit: bool) -> None:
-        self._nodes_m = grid.nodes_m()
+        self._points_m = grid.points_m()
         self._spacing_m = grid.spacing_m
         self._rate_hz = sample_rate_hz
         self._c_m_s = c_m_s
@@ -68,7 +68,7 @@ class PairMatrices:
         (G, C) float32
         """
         centre = lags.shape[2] // 2
-        total = np.zeros((len(self._nodes_m), len(lags)), dtype=np.float32)
+        total = np.zeros((len(self._points_m), len(lags)), dtype=np.float32)
         for index, (i, k) in enumerate(pairs):
             matrix = self._matrix(spec.microphones_m[[i, k]])
             reach = matrix.shape[1] // 2
@@ -86,17 +86,17 @@ class PairMatrices:
         spacing_m = float(np.linalg.norm(microphones_m[1] - microphones_m[0]))
         reach = reach_samples(spacing_m, self._rate_hz, self._c_m_s)
         lags_s = np.arange(-reach, reach + 1) / self._rate_hz
-        matrix = np.empty((len(self._nodes_m), len(lags_s)), dtype=np.float32)
+        matrix = np.empty((len(self._points_m), len(lags_s)), dtype=np.float32)
         for first in range(0, len(matrix), _SLAB_POINTS):
-            nodes_m = self._nodes_m[first : first + _SLAB_POINTS]
-            delay_s = steering_delays_s(nodes_m, microphones_m, pairs, self._c_m_s)[0]
-            cut_hz = np.full(len(nodes_m), self._rate_hz / 2.0)
+            points_m = self._points_m[first : first + _SLAB_POINTS]
+            delay_s = steering_delays_s(points_m, microphones_m, pairs, self._c_m_s)[0]
+            cut_hz = np.full(len(points_m), self._rate_hz / 2.0)
             if self._band_limit:
-                limit_hz = alias_free_hz(nodes_m, microphones_m, pairs, self._spacing_m, self._c_m_s)[0]
+                limit_hz = alias_free_hz(points_m, microphones_m, pairs, self._spacing_m, self._c_m_s)[0]
                 cut_hz = np.minimum(cut_hz, limit_hz)
             offset_s = delay_s[:, None] - lags_s
             width = 2.0 * cut_hz[:, None]
-            matrix[first : first + len(nodes_m)] = width / self._rate_hz * np.sinc(width * offset_s) * _taper(offset_s)
+            matrix[first : first + len(points_m)] = width / self._rate_hz * np.sinc(width * offset_s) * _taper(offset_s)
         return matrix
 
 

@@ -173,8 +173,8 @@ class Position:
             for a, spec in enumerate(system.arrays):
                 lags = np.stack([one[m].lags[a] for one in events])
                 power += self._mapper.power(spec, microphone_pairs(len(spec.microphones_m)), lags)
-            for head, one, node in zip(heads, events, power.argmax(axis=0), strict=True):
-                estimate_m = self.grid.node_m(int(node))
+            for head, one, point in zip(heads, events, power.argmax(axis=0), strict=True):
+                estimate_m = self.grid.point_m(int(point))
                 rows.append(
                     {"system": system.name, "method": method}
                     | head

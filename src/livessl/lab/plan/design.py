@@ -93,9 +93,9 @@ class ArrayPlan:
         Correlation of a diffuse field at the widest pair, averaged over the band.
     pairs : tuple of PairPlan
     alias_free_hz : tuple of float
-        Percentiles `SHARES`, over points and pairs, of the frequency up to which there is no spatial aliasing.
+        Percentiles `SHARES`, over (point, pair) combinations, of the frequency up to which there is no aliasing.
     beyond_grid : float
-        Share of points and pairs with spatial aliasing inside the band on this grid.
+        Share of (point, pair) combinations with spatial aliasing inside the band on this grid.
     alone : Errors
         Errors predicted for this array without the others.
     """
@@ -166,7 +166,7 @@ def make_plan(
     )
     volume = _volume(site)
     floor = _floor(volume, height_m)
-    points = floor.nodes_m()
+    points = floor.points_m()
     extent = volume.upper_m - volume.lower_m
     information = [prediction.information_1_m2(spec, points, conditions) for spec in site.specs]
     arrays = tuple(
@@ -229,7 +229,7 @@ def _step_m(room_size_m: tuple[float, float, float]) -> float:
 
 def _errors(information: FloatArray, floor: Grid, extent_m: FloatArray, origin_m: FloatArray) -> Errors:
     covariance = prediction.covariance_m2(information, extent_m)
-    parts = prediction.radial_tangential_m(covariance, floor.nodes_m(), origin_m)
+    parts = prediction.radial_tangential_m(covariance, floor.points_m(), origin_m)
     total, radial, tangential = (
         part.reshape(floor.shape[:2]).T for part in (prediction.position_error_m(covariance), *parts)
     )
@@ -241,7 +241,7 @@ def _array_plan(site: Site, spec: ArraySpec, volume: Grid, alone: Errors) -> Arr
     known_hz = site.nodes[node].device.sample_rate_hz if node is not None else None
     rate_hz = known_hz or RATE_HZ
     pairs = microphone_pairs(len(spec.microphones_m))
-    points = _thinned(volume, BAND_POINTS).nodes_m()
+    points = _thinned(volume, BAND_POINTS).points_m()
     kept = alias_free_hz(points, spec.microphones_m, pairs, site.grid.spacing_m, site.c_m_s)
     apart = np.linalg.norm(spec.microphones_m[pairs[:, 0]] - spec.microphones_m[pairs[:, 1]], axis=1)
     errors = prediction.angle_error_deg(np.array(ANGLES_DEG), spec.aperture_m, rate_hz, site.c_m_s)

@@ -143,10 +143,10 @@ def _floor(ax: Axes, plan: Plan, title: str, errors: Errors, norm: Any) -> Any:
     return image
 
 
-def _ends(nodes_m: FloatArray) -> tuple[float, float]:
+def _ends(points_m: FloatArray) -> tuple[float, float]:
     """Return the outer edges of the cells around grid points; half a metre to either side of a single one."""
-    half = 0.5 * float(nodes_m[1] - nodes_m[0]) if len(nodes_m) > 1 else 0.5
-    return float(nodes_m[0]) - half, float(nodes_m[-1]) + half
+    half = 0.5 * float(points_m[1] - points_m[0]) if len(points_m) > 1 else 0.5
+    return float(points_m[0]) - half, float(points_m[-1]) + half
 
 
 def _inside(errors: Errors) -> list[float]:

@@ -9,21 +9,24 @@ from typing import Final
 import numpy as np
 
 from livessl.core.types import FloatArray
-from livessl.lab.plan.design import ArrayPlan, Plan
+from livessl.lab.plan.design import SHARES, ArrayPlan, Plan
 from livessl.lab.plan.prediction import CLEARANCE_M
 from livessl.site.build.grid import search_grid
 
 FLAT_M: Final = 0.01
-"""Largest RMS distance, in metres, of microphones from a plane in which they are taken to lie."""
+"""RMS distance, in metres, from the best-fitting plane up to which microphones count as coplanar."""
 
 IN_LINE_M: Final = 0.3
-"""Largest RMS distance, in metres, of arrays from a line on which they are taken to lie."""
+"""RMS distance, in metres, from the best-fitting line up to which arrays count as collinear."""
 
-MOSTLY: Final = 0.5
-"""Share of points and pairs with aliasing inside the band above which a grid is too coarse."""
+MAX_ALIASED_SHARE: Final = 0.5
+"""Share of (point, pair) combinations with aliasing inside the band above which the grid is reported as too coarse."""
 
-OF_RATE: Final = 0.45
-"""Share of the sample rate up to which correlations are interpolated accurately."""
+MAX_EDGE_PER_RATE: Final = 0.45
+"""Highest band edge, as a share of the sample rate, at which correlations are interpolated accurately."""
+
+_MEDIAN: Final = SHARES.index(50)
+"""Index of the median in `ArrayPlan.alias_free_hz`."""
 
 _WALLS: Final = (("x = 0", "x = {:g} m"), ("y = 0", "y = {:g} m"), ("the floor", "the ceiling"))
 
@@ -41,16 +44,15 @@ def warnings(plan: Plan) -> list[str]:
 def _together(plan: Plan) -> Iterator[str]:
     if plan.site.joint:
         yield (
-            f"joint arrays ({', '.join(plan.site.joint)}) are not planned as such: the error above is that of the sum "
-            "of the maps of the single arrays"
+            f"the plan treats the joint arrays ({', '.join(plan.site.joint)}) as separate ones whose maps are summed"
         )
     if len(plan.arrays) == 1:
         yield "one array alone measures a direction, but hardly a distance; set up a second one, metres apart"
     centres = np.array([array.spec.centre_m for array in plan.arrays])
     if len(centres) >= 3 and _scatter_m(centres)[1] < IN_LINE_M:
         yield (
-            "all arrays stand in one line, so that the distance of a sound on its extension is hardly determined; "
-            "move one array metres to the side"
+            "all arrays stand in one line: the distance of a sound beyond either end of that line is poorly "
+            "determined; move one array metres to the side"
         )
     microphones = np.concatenate([array.spec.microphones_m for array in plan.arrays])
     if _scatter_m(microphones)[2] < FLAT_M and _searched_on_both_sides(plan, microphones):
@@ -96,7 +98,7 @@ def _size(plan: Plan, array: ArrayPlan) -> Iterator[str]:
         yield (
             f"array {array.spec.name!r}: its aperture of {aperture:.2f} m is wider than the critical distance of "
             f"{plan.conditions.critical_m:.2f} m at RT60 {plan.rt60_s:g} s: reverberation covers the direct sound "
-            "at some microphones, and false peaks are likely, which the error above does not include; "
+            "at some microphones, and false peaks are likely; the error above ignores them; "
             "build it smaller, and set several arrays far apart"
         )
     if aperture * high / plan.site.c_m_s < 0.5:
@@ -109,15 +111,17 @@ def _size(plan: Plan, array: ArrayPlan) -> Iterator[str]:
 
 def _sampling(plan: Plan, array: ArrayPlan) -> Iterator[str]:
     high, spacing = array.spec.band_hz[1], plan.site.grid.spacing_m
-    if high > OF_RATE * array.sample_rate_hz:
+    if high > MAX_EDGE_PER_RATE * array.sample_rate_hz:
         yield (
-            f"array {array.spec.name!r}: a band up to {high:g} Hz needs a sample rate of {high / OF_RATE:.0f} Hz or "
-            f"more, got {array.sample_rate_hz:g} Hz; raise sample_rate_hz or lower band_hz"
+            f"array {array.spec.name!r}: a band up to {high:g} Hz needs a sample rate of "
+            f"{high / MAX_EDGE_PER_RATE:.0f} Hz or more, got {array.sample_rate_hz:g} Hz; raise sample_rate_hz "
+            "or lower band_hz"
         )
-    if array.beyond_grid > MOSTLY:
-        fits = spacing * array.alias_free_hz[2] / high
+    if array.beyond_grid > MAX_ALIASED_SHARE:
+        median_hz = array.alias_free_hz[_MEDIAN]
+        fits = spacing * median_hz / high
         yield (
             f"array {array.spec.name!r}: a grid of {spacing:g} m is too coarse for {high:g} Hz: "
-            f"{array.beyond_grid:.0%} of points and pairs are free of spatial aliasing only up to a lower frequency, "
-            f"half of them up to {array.alias_free_hz[2]:.0f} Hz or less; use grid.spacing_m {fits:.2g} m"
+            f"{array.beyond_grid:.0%} of all (point, pair) combinations alias below {high:g} Hz; the median alias-free "
+            f"frequency is {median_hz:.0f} Hz; use grid.spacing_m {fits:.2g} m"
         )

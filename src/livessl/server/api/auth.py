@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Final
 
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from livessl.errors import ConfigError
 from livessl.server.refusals import Refusals
-from livessl.site.tokens import Client, Role, Tokens
+from livessl.site.tokens import Client, Role, Tokens, file_stamp, read_tokens
 
 DOOR: Final = "http"
 
@@ -29,10 +32,15 @@ ACCESS: Final = "/api/v1/access"
 ANYONE: Final = Client("anyone", Role.ADMIN)
 """Every client of a site without tokens, whose server listens on the local machine only."""
 
+RELOAD_S: Final = 1.0
+"""Interval, in seconds, at which the tokens file is checked for changes: they take effect without a restart."""
+
 CLOSE_S: Final = 1.0
 """Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
 
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+
+_log = logging.getLogger(__name__)
 
 
 class Access:
@@ -40,12 +48,19 @@ class Access:
 
     Parameters
     ----------
-    tokens : Tokens or None
+    tokens_file : Path or None
         None gives every client the role of an admin.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be used.
     """
 
-    def __init__(self, tokens: Tokens | None) -> None:
-        self._tokens = tokens
+    def __init__(self, tokens_file: Path | None) -> None:
+        self._file = tokens_file
+        self._stamp = None if tokens_file is None else file_stamp(tokens_file)
+        self._tokens = None if tokens_file is None else read_tokens(tokens_file)
         self._open: dict[asyncio.Event, tuple[str, Client]] = {}
 
     @property
@@ -64,7 +79,24 @@ class Access:
             return ANYONE
         return None if token is None else self._tokens.client(token)
 
-    def replace(self, tokens: Tokens) -> None:
+    async def reload_tokens(self) -> None:
+        """Read the tokens file again whenever it changes, until cancelled; return at once if there is none.
+
+        If the file cannot be used, the former tokens stay valid.
+        """
+        while (path := self._file) is not None:
+            await asyncio.sleep(RELOAD_S)
+            stamp = await asyncio.to_thread(file_stamp, path)
+            if stamp == self._stamp:
+                continue
+            self._stamp = stamp
+            try:
+                self._replace(await asyncio.to_thread(read_tokens, path, missing_ok=True))
+                _log.info("%s has changed: %d tokens are in force", path, len(self.clients))
+            except ConfigError as error:
+                _log.error("%s; the former tokens stay in force", error)
+
+    def _replace(self, tokens: Tokens) -> None:
         """Replace the valid tokens, and end the WebSockets whose token is revoked or has another role."""
         self._tokens = tokens
         for revoked, (token, client) in self._open.items():

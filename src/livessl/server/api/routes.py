@@ -22,8 +22,8 @@ from livessl.server.api.png import map_png
 from livessl.server.api.queries import array_names, instant, map_names, page_cursor, unprocessable
 from livessl.server.maps import FUSED, bounds_of_view_m, projection
 from livessl.server.parts import Parts
+from livessl.server.store import CURE, StoreError
 from livessl.server.store import Query as EventQuery
-from livessl.server.store import StoreError
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 
@@ -149,9 +149,9 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
     unkept, unsaved = parts.event_log.unkept, parts.event_log.unsaved
     if unkept:
-        reasons.append(f"server.events_db: {unkept} events were not kept; free space or release the file")
+        reasons.append(f"server.events_db: {unkept} events were not stored; {CURE}")
     if unsaved:
-        reasons.append(f"server.events_db: {unsaved} events wait for it; free space or release the file")
+        reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
     if parts.failure is not None:

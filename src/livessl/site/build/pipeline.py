@@ -13,15 +13,15 @@ from livessl.site.models import Site
 
 def activity_parameters(site: Site) -> ActivityParameters:
     """Return the parameters of the activity detection, as the core takes them."""
-    a = site.activity
+    activity = site.activity
     return ActivityParameters(
-        threshold=a.threshold,
-        release_s=a.release_s,
-        floor_window_s=a.floor_window_s,
-        floor_factor=a.floor_factor,
-        min_power=10.0 ** (a.min_level_dbfs / 10.0),
-        pre_roll_s=a.pre_roll_s,
-        hang_over_s=a.hang_over_s,
+        threshold=activity.threshold,
+        release_s=activity.release_s,
+        floor_window_s=activity.floor_window_s,
+        floor_factor=activity.floor_factor,
+        min_power=10.0 ** (activity.min_level_dbfs / 10.0),
+        pre_roll_s=activity.pre_roll_s,
+        hang_over_s=activity.hang_over_s,
     )
 
 

@@ -25,7 +25,7 @@ class LocalizerCurve:
     error_m : mapping of method to (n,) float64
         Errors in ascending order, infinite where the event was refused; the standard method comes first.
     off : (n,) bool
-        Whether each event of the last method is off, in descending order of confidence.
+        For the last method's events by falling confidence: True where the position is more than 0.5 m off.
     """
 
     label: str
@@ -34,7 +34,7 @@ class LocalizerCurve:
 
 
 def draw_localizer(directory: Path, curves: Sequence[LocalizerCurve]) -> None:
-    """Draw the share of events within a distance, and the share that is off among the most confident."""
+    """Draw the share of events within a distance and, against the share of events kept, the share of those off."""
     figure, axes = panels(1, 2, (11.0, 4.6))
     share, risk = axes[0]
     for colour, curve in zip(COLOURS, curves, strict=False):

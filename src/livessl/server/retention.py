@@ -1,0 +1,29 @@
+"""Deletes stored events that are older than `store.retention_days` of the site file."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Final
+
+from livessl.clock import Clock
+from livessl.server.store import Store, StoreError
+
+EXPIRE_S: Final = 600.0
+"""Interval, in seconds, at which old events are deleted."""
+
+DAY_NS: Final = 86_400_000_000_000
+
+_log = logging.getLogger(__name__)
+
+
+async def delete_old_events(store: Store, clock: Clock, retention_days: float | None) -> None:
+    """Delete events older than `retention_days` every `EXPIRE_S`, until cancelled; return at once if it is None."""
+    while retention_days is not None:
+        before_ns = clock.now_ns() - round(retention_days * DAY_NS)
+        try:
+            if gone := await asyncio.to_thread(store.expire, before_ns):
+                _log.info("%d events older than %g days were deleted", gone, retention_days)
+        except StoreError as error:
+            _log.error("%s", error)
+        await asyncio.sleep(EXPIRE_S)
