@@ -22,7 +22,7 @@ from livessl.core.types import FRAME_NS, Frame
 from livessl.errors import RunError
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
-"""Most bytes of frames in memory, without a folder or while its disk is full: half a minute of six arrays."""
+"""Limit, in bytes, on frames kept in memory (no folder, or its disk is full): about 30 s of six arrays."""
 
 SEGMENT_BYTES: Final = 4 * 1024 * 1024
 """Size of a segment in bytes, a few seconds of sound: the unit of deletion, and the most that a restarted node sends
@@ -103,7 +103,7 @@ class Spool:
     def append(self, frame: Frame) -> tuple[Kept, list[Kept]]:
         """Add a frame; return it as it is kept, and the frames that were removed.
 
-        Frames of the same array at or after its time are removed: their clock has been set back since.
+        Kept frames of this array with the same or a later time are removed: the clock has been set back since.
         """
         removed = self._clear_from(frame)
         data = wire.encode(frame)

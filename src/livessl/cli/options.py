@@ -55,7 +55,7 @@ def add_joint(parser: Any) -> None:
         type=argument.joint,
         default=[],
         metavar="NAME=ARRAY,ARRAY,…",
-        help="process arrays of one node as a single array, in addition to those that the site file joins",
+        help="join arrays of one node into one array called NAME; joins of the site file stay in force",
     )
 
 

@@ -23,7 +23,10 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
     parser.add_argument(
-        "--events", type=Path, metavar="DIR", help="folder of WAV or FLAC files to play (default: built-in sounds)"
+        "--events",
+        type=Path,
+        metavar="DIR",
+        help="folder of WAV or FLAC sounds to place in the room (default: built-in sounds)",
     )
     parser.add_argument(
         "--rt60",

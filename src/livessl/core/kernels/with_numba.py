@@ -1,6 +1,6 @@
 """The kernels compiled by numba. Each has a twin of the same name and arguments in `with_numpy`, which documents it.
 
-The kernels of maps and of the search give the same answers as their twins to the last bit, the others to rounding.
+Kernels of maps and of the search match their twins bit for bit; the other kernels differ only by rounding.
 """
 
 from __future__ import annotations

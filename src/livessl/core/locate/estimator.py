@@ -39,7 +39,8 @@ class Sound:
     sources : int
         Most sources to look for.
     ended : bool
-        Whether the sound is complete. While it lasts it will be located again, so a second look is not worth its time.
+        Whether the sound is complete. While it goes on it will be located again anyway, so an estimator
+        can skip its slower second look.
     """
 
     segments: Sequence[Float32Array]
@@ -140,8 +141,8 @@ class PowerMaps:
 class Estimator(Protocol):
     """The interface of a localization method, as fusion uses it.
 
-    `locate` does the work, live and offline; everything else may do nothing: `prepare` is only called live, when a node
-    connects; `onset_front_end` may return None; `power_maps` is only called when a client requests a map. An estimator
+    Only `locate` must do work, live and offline. `prepare` may do nothing (it is called live, when a node connects),
+    `onset_front_end` may return None, and `power_maps` is called only when a client requests a map. An estimator
     may cache, but must give the same answer to the same sounds, and must not depend on their order.
 
     Calls come from one thread, with two exceptions: `onset_front_end` may be called for several arrays at once, and
@@ -185,8 +186,8 @@ class Estimator(Protocol):
 
 
 Factory = Callable[[Sequence[ArraySpec], Grid, float], Estimator]
-"""Makes an estimator from the arrays, the search grid and the speed of sound in m/s. A class with these constructor
-parameters is one."""
+"""Makes an estimator from the arrays, the search grid and the speed of sound in m/s. A class whose constructor takes
+these parameters is itself a factory."""
 
 
 def register(name: str, factory: Factory) -> None:

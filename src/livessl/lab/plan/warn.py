@@ -14,13 +14,13 @@ from livessl.lab.plan.prediction import CLEARANCE_M
 from livessl.site.build.grid import search_grid
 
 FLAT_M: Final = 0.01
-"""RMS distance, in metres, from the best-fitting plane up to which microphones count as coplanar."""
+"""Microphones count as coplanar if their RMS distance from the best-fitting plane is at most this, in metres."""
 
 IN_LINE_M: Final = 0.3
-"""RMS distance, in metres, from the best-fitting line up to which arrays count as collinear."""
+"""Arrays count as collinear if their RMS distance from the best-fitting line is at most this, in metres."""
 
 MAX_ALIASED_SHARE: Final = 0.5
-"""Share of (point, pair) combinations with aliasing inside the band above which the grid is reported as too coarse."""
+"""If more than this share of (point, pair) combinations alias inside the band, the grid is reported as too coarse."""
 
 MAX_EDGE_PER_RATE: Final = 0.45
 """Highest band edge, as a share of the sample rate, at which correlations are interpolated accurately."""
