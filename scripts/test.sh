@@ -39,4 +39,4 @@ ruff format --check
 mypy
 lint-imports
 python -c 'from livessl.core.locate.peak_search import warm_up; warm_up()' # compile once, not in every worker
-pytest -n 4 --dist loadfile "$@"
+pytest -n 4 --dist loadfile --no-loadscope-reorder "$@"

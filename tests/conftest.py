@@ -21,6 +21,25 @@ def _compiled() -> None:
     warm_up()
 
 
+LONGEST_FIRST = (
+    "test_processes.py",
+    "test_campaign.py",
+    "test_release.py",
+    "test_live.py",
+    "test_clocks_and_backfill.py",
+    "test_localizer.py",
+    "test_sessions.py",
+)
+"""Files that take minutes: begun first, no worker is left with one of them when the others are done."""
+
+
+@pytest.hookimpl(trylast=True)  # after the shuffling
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(
+        key=lambda item: LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else len(LONGEST_FIRST)
+    )
+
+
 def require(condition: bool, reason: str) -> None:
     """Skip the test unless `condition` holds; fail it instead where LIVESSL_REQUIRE_ALL is 1.
 
