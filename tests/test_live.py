@@ -12,6 +12,8 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -139,26 +141,15 @@ def live(session: Session) -> LiveRun:
         code = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
         reader = [sys.executable, "-u", "-c", code]
         clients.append(subprocess.Popen(reader, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
-        begin = utc_text(time.time_ns() + LEAD_NS)
-        for node, array in (("north-pc", "north"), ("south-pc", "south")):
-            wav = f"{array}={session.directory / array}.wav"
-            command = [
-                *LIVESSL,
-                "capture",
-                "--site",
-                str(session.site),
-                "--node",
-                node,
-                "--wav",
-                wav,
-                "--start-at",
-                begin,
-            ]
-            nodes.append(subprocess.Popen(command))
-        watch_in_browser(session, seen, nodes)
-        for process in nodes:
-            assert process.wait(timeout=HANG_S) == 0
-        wait_for(lambda: len(seen.final_events) >= COUNT, "all events")
+        with browser_page(session, seen) as page:
+            begin = utc_text(time.time_ns() + LEAD_NS)
+            for node, array in (("north-pc", "north"), ("south-pc", "south")):
+                wav = f"{array}={session.directory / array}.wav"
+                command = [*LIVESSL, "capture", "--site", str(session.site), "--node", node]
+                command += ["--wav", wav, "--start-at", begin]
+                nodes.append(subprocess.Popen(command))
+            watch(page, seen, nodes)
+        assert [process.wait(timeout=HANG_S) for process in nodes] == [0, 0]
         seen.curl_clients = curl_examples(session)
     finally:
         for service in [*nodes, server]:
@@ -171,7 +162,9 @@ def live(session: Session) -> LiveRun:
     return seen
 
 
-def watch_in_browser(session: Session, seen: LiveRun, nodes: list[subprocess.Popen[bytes]]) -> None:
+@contextmanager
+def browser_page(session: Session, seen: LiveRun) -> Iterator[Page]:
+    """The dashboard in a browser, with the documented JavaScript client in it."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET_BROWSER)
         page = browser.new_page(viewport={"width": 1440, "height": 900})
@@ -179,19 +172,21 @@ def watch_in_browser(session: Session, seen: LiveRun, nodes: list[subprocess.Pop
         page.on("pageerror", lambda error: seen.problems.append(str(error)))
         page.goto(session.url)
         start_javascript_client(page, session)
-        while any(node.poll() is None for node in nodes):
-            seen.page.append(look(page))
-            if seen.page[-1]["kind"] == "update":
-                save_screenshot(page)
-            time.sleep(0.2)
-        time.sleep(0.5)
-        seen.page.append(look(page))
-        seen.javascript_client = page.evaluate("window.seenEvents")
-        for node in nodes:
-            node.wait(timeout=HANG_S)
-        page.wait_for_selector('[data-testid="array-north"][data-state="lost"]', timeout=1000 * HANG_S)
-        seen.after_the_end = page.get_by_test_id("array-south").get_attribute("data-state") or ""
+        yield page
         browser.close()
+
+
+def watch(page: Page, seen: LiveRun, nodes: list[subprocess.Popen[bytes]]) -> None:
+    while any(node.poll() is None for node in nodes):
+        seen.page.append(look(page))
+        if seen.page[-1]["kind"] == "update":
+            save_screenshot(page)
+        time.sleep(0.2)
+    wait_for(lambda: len(seen.final_events) >= COUNT, "all events")
+    page.wait_for_selector('[data-testid="array-north"][data-state="lost"]', timeout=1000 * HANG_S)
+    seen.page.append(look(page))
+    seen.javascript_client = page.evaluate("window.seenEvents")
+    seen.after_the_end = page.get_by_test_id("array-south").get_attribute("data-state") or ""
 
 
 def look(page: Page) -> dict[str, Any]:

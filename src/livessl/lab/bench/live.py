@@ -168,10 +168,18 @@ def measure(
         received: Received = listening.recv()
         sounding.send("end")
         report: load.Report = sounding.recv()
-        after = _counters(url)
+        after = _final_counters(url, report.sent - report.dropped, clock)
     due = len(load.windows_ns(site, from_ns, until_ns))
     lost = {name: after[name] - before[name] for name in LOST}
     return _outcome(demand, report, after["frames"], lost, received, usage, due)
+
+
+def _final_counters(url: str, frames: int, clock: Clock) -> dict[str, int]:
+    """Return the counters once the server has processed that many frames, or has had `SETTLE_NS` for it."""
+    deadline_ns = clock.monotonic_ns() + SETTLE_NS
+    while (counters := _counters(url))["frames"] < frames and clock.monotonic_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + processes.POLL_NS)
+    return counters
 
 
 def table(outcome: Outcome) -> str:
