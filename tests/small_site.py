@@ -48,7 +48,7 @@ SMALL: dict[str, Any] = {
 }
 """Two tetrahedra in a small room at a low rate: quick to localize in. Addresses are chosen by the system."""
 
-FIRST_RASTER = 999
+FIRST_FRAME_INDEX = 999
 """A frame's frame index is its number beyond this, where a test does not say otherwise."""
 
 HANG_S = 100.0
@@ -138,7 +138,7 @@ def frame(
 ) -> Frame:
     """A frame of noise as the small site's nodes send it; each later in time than the one numbered before it."""
     samples = hiss(0.05, seed=seed)
-    frame_index = FIRST_RASTER + sequence if frame_index is None else frame_index
+    frame_index = FIRST_FRAME_INDEX + sequence if frame_index is None else frame_index
     return Frame(array, sequence, frame_index, frame_index * 50_000_000, float(RATE_HZ), samples, 0.01, active)
 
 

@@ -21,7 +21,7 @@ from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
 from livessl.server.receiver import Receiver
-from small_site import FIRST_RASTER, frame, mark, site_of, wait_until
+from small_site import FIRST_FRAME_INDEX, frame, mark, site_of, wait_until
 
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
 
@@ -77,8 +77,10 @@ class Router:
 
     def ack(self, settled: int | None = None, **received: int) -> None:
         """Acknowledge frames by number, and settle those before a number."""
-        frame_indices = {array: FIRST_RASTER + number for array, number in received.items()}
-        self.send(wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_RASTER + settled)))
+        frame_indices = {array: FIRST_FRAME_INDEX + number for array, number in received.items()}
+        self.send(
+            wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_FRAME_INDEX + settled))
+        )
 
     def hellos(self) -> list[wire.Hello]:
         return [message for message in self.got if isinstance(message, wire.Hello)]
@@ -190,7 +192,7 @@ def test_broken_connection_is_detected_before_the_next_one_is_used() -> None:
             together(link, router, lambda: router.got, "anything")
             first = router.got[0]
             assert isinstance(first, wire.Hello)
-            assert first.backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 5)}
+            assert first.backlog == {"north": (FIRST_FRAME_INDEX + 1, FIRST_FRAME_INDEX + 5)}
 
 
 def test_silent_server_is_detected_and_survived() -> None:
@@ -266,7 +268,7 @@ def test_mark_is_not_sent_after_later_frames() -> None:
     link.service()
     [hello, quiet, sound, _] = dealer.sent[-4:]
     assert isinstance(hello, wire.Hello)
-    assert hello.backlog == {"north": (FIRST_RASTER + 2, FIRST_RASTER + 3)}
+    assert hello.backlog == {"north": (FIRST_FRAME_INDEX + 2, FIRST_FRAME_INDEX + 3)}
     assert isinstance(quiet, Mark)
     assert quiet.array == "south"
     assert isinstance(sound, Frame)
@@ -317,7 +319,7 @@ def test_live_sound_goes_first_and_the_backlog_follows_in_order_of_time() -> Non
                 lambda: len(router.frames()) == 2 + BACKLOG_FRAMES,
                 "live sound, and a part of the backlog",
             )
-            assert router.hellos()[-1].backlog == {"north": (FIRST_RASTER + 1, FIRST_RASTER + 51)}
+            assert router.hellos()[-1].backlog == {"north": (FIRST_FRAME_INDEX + 1, FIRST_FRAME_INDEX + 51)}
             assert router.frames() == [*range(1, BACKLOG_FRAMES + 1), 51, 52] or router.frames()[:2] == [51, 52]
             router.ack(north=10)
             together(link, router, lambda: len(router.frames()) == 12 + BACKLOG_FRAMES, "ten more")

@@ -275,7 +275,7 @@ class Soak(World):
         self.frame_index += step
         for node in self.nodes.values():
             if not node.stopped:  # else its device's buffer holds what is heard
-                first = self.frame_index - step if node.next_raster is None else node.next_raster
+                first = self.frame_index - step if node.next_frame_index is None else node.next_frame_index
                 node.link.send(
                     [
                         m
@@ -283,7 +283,7 @@ class Soak(World):
                         for m in node.microphones.messages_at(frame_index)
                     ]
                 )
-                node.next_raster = self.frame_index
+                node.next_frame_index = self.frame_index
         self._serve()
 
     def _is_quiet(self) -> bool:

@@ -256,8 +256,9 @@ class Node:
     name: str
     microphones: Microphones
     link: Link
+    spool: Spool
     stopped: bool = False
-    next_raster: int | None = None
+    next_frame_index: int | None = None
 
 
 class World:
@@ -336,7 +337,7 @@ class World:
         spool = Spool(None if self._spools is None else self._spools / name)
         hello = wire.Hello(name, f"run-{self._runs}", {array: float(RATE_HZ)})
         link = Link("", hello, self.clock, spool=spool, dealer=Cable(self, name))
-        self.nodes[name] = Node(name, self._microphones(array), link)
+        self.nodes[name] = Node(name, self._microphones(array), link, spool)
         if self.down[name]:
             self.down[name][-1] = (self.down[name][-1][0], self.frame_index)
 
@@ -348,7 +349,7 @@ class World:
     def kill_node(self, name: str) -> None:
         """Its files stay as they are; whatever was in memory is gone."""
         node = self.nodes.pop(name)
-        node.link._spool.close()
+        node.spool.close()
         self.wires.pop(name, None)
         self.down[name].append((self.frame_index, 2**62))
 
@@ -400,7 +401,7 @@ class World:
         self.clock.time_ns += FRAME_NS - FRAME_NS // 2
         self.frame_index += 1
         for node in self.nodes.values():
-            first = self.frame_index - 1 if node.next_raster is None else node.next_raster
+            first = self.frame_index - 1 if node.next_frame_index is None else node.next_frame_index
             if not node.stopped:  # else its device's buffer holds what is heard
                 node.link.send(
                     [
@@ -410,7 +411,7 @@ class World:
                     ]
                 )
                 first = self.frame_index
-            node.next_raster = first
+            node.next_frame_index = first
         self._serve()
         for node in self.nodes.values():
             if not node.stopped:
