@@ -29,7 +29,17 @@ from livessl.server.app import Server
 from livessl.server.receiver import BindError, address_cure
 from livessl.site import keys
 from livessl.site.tokens import add_token
-from small_site import RATE_HZ, Changes, running_server, scene, scene_recordings, site_of, wait_until, write_site
+from small_site import (
+    HANG_S,
+    RATE_HZ,
+    Changes,
+    running_server,
+    scene,
+    scene_recordings,
+    site_of,
+    wait_until,
+    write_site,
+)
 
 CLOCK = SystemClock()
 INTERFACES = Path("/proc/net/if_inet6")
@@ -125,7 +135,7 @@ def test_loopback_serves_nodes_requests_and_websockets() -> None:
         capture_scene(server, server.endpoint, {})
         assert len(httpx.get(f"{server.url}/api/v1/events").json()["events"]) == 2
         with connect(f"ws{server.url.removeprefix('http')}/api/v1/live", origin=Origin(server.url)) as live:
-            assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+            assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
         with pytest.raises(httpx.ConnectError):
             httpx.get(f"http://127.0.0.1:{port_of(server.url)}/api/v1/health")
 
@@ -149,7 +159,7 @@ def test_names_and_pages_are_checked_like_those_of_ipv4() -> None:
                 connect(address, origin=Origin(origin)) as live,
                 pytest.raises(ConnectionClosed, match="trusted_hosts"),
             ):
-                live.recv(timeout=5)
+                live.recv(timeout=HANG_S)
 
 
 def test_every_address_means_ipv4_as_well(folder: Path) -> None:
@@ -165,7 +175,7 @@ def test_every_address_means_ipv4_as_well(folder: Path) -> None:
             assert httpx.get(f"{url}/api/v1/site").status_code == 401
             assert httpx.get(f"{url}/api/v1/site", headers=admin).status_code == 200
             with connect(f"ws{url.removeprefix('http')}/api/v1/live", additional_headers=admin) as live:
-                assert json.loads(live.recv(timeout=5))["kind"] == "hello"
+                assert json.loads(live.recv(timeout=HANG_S))["kind"] == "hello"
             with pytest.raises(InvalidStatus, match="403"):
                 connect(f"ws{url.removeprefix('http')}/api/v1/live")
             refused = server.parts.refusals.count("nodes")
@@ -183,7 +193,7 @@ def test_link_local_address_with_its_interface(folder: Path) -> None:
         assert server.endpoint.startswith(f"tcp://[{host}]:")
         assert server.url.startswith(f"http://[{host.replace('%', '%25')}]:")
         capture_scene(server, server.endpoint, {"keys": "keys"}, folder)
-        with socket.create_connection((host, port_of(server.url)), timeout=5) as connection:
+        with socket.create_connection((host, port_of(server.url)), timeout=HANG_S) as connection:
             head = f"GET /api/v1/site HTTP/1.1\r\nHost: [::1]\r\nAuthorization: {admin['Authorization']}\r\n\r\n"
             connection.sendall(head.encode())
             assert connection.recv(15) == b"HTTP/1.1 200 OK"
@@ -207,7 +217,7 @@ def test_session_is_replayed_to_a_server(tmp_path: Path, capsys: pytest.CaptureF
 def test_dashboard_works() -> None:
     with running_server(site_of(on("::1"))) as server, running_browser() as browser, faultless_page(browser) as page:
         page.goto(server.url)
-        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=10_000)
+        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("array-north")).to_be_visible()
 
 

@@ -19,7 +19,7 @@ from browser import faultless_page, running_browser
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from nginx import example, running_nginx
-from small_site import Changes, running_server, site_of
+from small_site import HANG_S, Changes, running_server, site_of
 
 HOST = "Host $http_host"
 PUBLIC = "http://site.example"
@@ -47,9 +47,9 @@ def proxied(
 def first_message(url: str, origin: str, **headers: str) -> str:
     """Kind of the first message that a page gets, or the reason why its WebSocket is closed."""
     address = f"ws{url.removeprefix('http')}/api/v1/live"
-    with connect(address, origin=Origin(origin), additional_headers=headers, open_timeout=10) as live:
+    with connect(address, origin=Origin(origin), additional_headers=headers, open_timeout=HANG_S) as live:
         try:
-            return str(json.loads(live.recv(timeout=10))["kind"])
+            return str(json.loads(live.recv(timeout=HANG_S))["kind"])
         except ConnectionClosed as error:
             closed = error.rcvd
     assert closed is not None
@@ -71,12 +71,12 @@ def test_documented_nginx_serves_the_dashboard(
         page.get_by_role("textbox", name="Access token").fill(token)
         with page.expect_websocket(lambda socket: "/api/v1/map" in socket.url):  # opened after the greeting
             page.keyboard.press("Enter")
-        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=20_000)
+        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("array-north")).to_be_visible()
         expect(page.get_by_test_id("banner")).to_be_hidden()
         assert set(opened) == {f"ws{url.removeprefix('http')}/api/v1/{name}" for name in ("live", "map")}
         page.goto(f"{url}/docs")
-        expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=20_000)
+        expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=1000 * HANG_S)
         page.locator("#operations-estimates-get_tracks_api_v1_tracks_get .opblock-summary-control").click()
         page.get_by_role("button", name="Try it out").click()
         page.get_by_role("button", name="Execute").click()
@@ -246,7 +246,7 @@ def test_page_names_the_cause_when_its_origin_is_refused(browser: Browser, tmp_p
     with proxied(tmp_path, host="Host $proxy_host") as (_, url), faultless_page(browser) as page:
         page.goto(f"{url}/")
         banner = page.get_by_test_id("banner")
-        expect(banner).to_contain_text(f"No connection: origin: {url.removeprefix('http://')}", timeout=20_000)
+        expect(banner).to_contain_text(f"No connection: origin: {url.removeprefix('http://')}", timeout=1000 * HANG_S)
         expect(banner).to_contain_text("is not this server; add it to server.http.trusted_hosts")
 
 
@@ -258,7 +258,7 @@ def test_page_names_the_cause_when_the_proxy_passes_no_websocket(browser: Browse
         with running_nginx(tmp_path, block) as url:
             page.goto(f"{url}/")
             expected = "No connection: requests are answered, but the WebSocket is not; a reverse proxy must pass on"
-            expect(page.get_by_test_id("banner")).to_contain_text(expected, timeout=20_000)
+            expect(page.get_by_test_id("banner")).to_contain_text(expected, timeout=1000 * HANG_S)
 
 
 @pytest.mark.browser
@@ -266,9 +266,9 @@ def test_page_names_the_cause_when_the_host_is_refused_later(browser: Browser, t
     """The proxy is changed while the page is open, so that the server no longer knows its name."""
     with faultless_page(browser) as page, running_server(site_of()) as server:
         page.goto(server.url)
-        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=20_000)
+        expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         refusal = "host: expected a name of this server, got 'site.example'; add it to server.http.trusted_hosts"
         page.route("**/api/v1/site", lambda route: route.fulfill(status=400, content_type="text/plain", body=refusal))
         page.route_web_socket("**/api/v1/live*", lambda socket: socket.close())
         page.reload()
-        expect(page.get_by_test_id("banner")).to_contain_text(f"No connection: {refusal}", timeout=20_000)
+        expect(page.get_by_test_id("banner")).to_contain_text(f"No connection: {refusal}", timeout=1000 * HANG_S)
