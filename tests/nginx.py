@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from conftest import require
+from livessl.lab.processes import free_port
 from small_site import started, wait_until
 
 NGINX: Final = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
@@ -40,12 +41,6 @@ def example(location: str) -> str:
     blocks: list[str] = re.findall(r"^```nginx\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
     [block] = [block for block in blocks if f"location {location} {{" in block]
     return block
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -28,7 +27,8 @@ from websockets.sync.client import connect
 from conftest import require
 from livessl.clock import utc_text
 from livessl.lab import demo
-from small_site import HANG_S
+from livessl.lab.processes import free_port
+from small_site import HANG_S, wait_until
 
 ROOT = Path(__file__).parents[1]
 LIVESSL = [sys.executable, "-m", "livessl"]
@@ -97,12 +97,6 @@ def events_of(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     directory = tmp_path_factory.mktemp("session")
@@ -135,7 +129,7 @@ def live(session: Session) -> LiveRun:
     nodes: list[subprocess.Popen[bytes]] = []
     clients: list[subprocess.Popen[str]] = []
     try:
-        wait_for(lambda: answers(session.url), "the server to answer")
+        wait_until(lambda: answers(session.url), "the server to answer")
         listener = Thread(target=listen, args=(session.url, seen.messages), daemon=True)
         listener.start()
         code = readme_block("python").replace("127.0.0.1:8000", session.url.removeprefix("http://"))
@@ -182,7 +176,7 @@ def watch(page: Page, seen: LiveRun, nodes: list[subprocess.Popen[bytes]]) -> No
         if seen.page[-1]["kind"] == "update":
             save_screenshot(page)
         time.sleep(0.2)
-    wait_for(lambda: len(seen.final_events) >= COUNT, "all events")
+    wait_until(lambda: len(seen.final_events) >= COUNT, "all events")
     page.wait_for_selector('[data-testid="array-north"][data-state="lost"]', timeout=1000 * HANG_S)
     seen.page.append(look(page))
     seen.javascript_client = page.evaluate("window.seenEvents")
@@ -270,13 +264,6 @@ def answers(url: str) -> bool:
             return True
     except OSError:
         return False
-
-
-def wait_for(condition: Any, what: str, within_s: float = HANG_S) -> None:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {within_s:g} s: {what}"
-        time.sleep(0.05)
 
 
 def test_locate_finds_every_sound_near_its_true_position(session: Session, located: str) -> None:

@@ -6,7 +6,6 @@ import json
 import math
 import random
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from proxy import Proxy
 from websockets.sync.client import connect
 
 from livessl.clock import utc_ns, utc_text
+from livessl.lab.processes import free_port
 from livessl.simulation.export import write_scene
 from livessl.simulation.scene import make_scene
 from livessl.site import keys
@@ -75,13 +75,6 @@ def make_recordings(
         samples, rate = soundfile.read(directory / f"{array}.wav", always_2d=True)
         hum = 1e-4 * np.random.default_rng(k).standard_normal((round(TAIL_S * rate), samples.shape[1]))
         soundfile.write(directory / f"{array}.wav", np.concatenate([samples, hum]), rate, subtype="PCM_16")
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass
