@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
@@ -69,6 +69,8 @@ def sounds(draw: st.DrawFn) -> tuple[Float32Array, int, tuple[str, str, int]]:
 
 @settings(deadline=None, max_examples=60)
 @given(sound=sounds(), where=st.floats(0, 1))
+@example(sound=(noise(1, 1, 0), 8000, ("WAV", "PCM_24", 3)), where=47 / 48)  # an odd number of bytes is padded
+@example(sound=(noise(1, 1, 0), 8000, ("WAV", "PCM_24", 3)), where=1.0)
 def test_file_cut_at_any_byte_is_read_up_to_there_or_refused(
     tmp_path_factory: pytest.TempPathFactory, sound: Any, where: float
 ) -> None:
@@ -78,13 +80,14 @@ def test_file_cut_at_any_byte_is_read_up_to_there_or_refused(
     path = tmp_path_factory.mktemp("cut") / "cut.wav"
     path.write_bytes(whole[:size])
     per_sample = width * samples.shape[1]
-    sound_bytes = len(samples) * per_sample if container != "FLAC" else len(whole) - whole.find(b"\xff\xf8")
-    left = size - (len(whole) - sound_bytes)  # bytes of sound, negative within the header
+    start = whole.find(b"\xff\xf8") if container == "FLAC" else whole.find(b"data") + 8
+    left = size - start  # bytes of sound and of its padding, negative within the header
     if container == "FLAC":
+        sound_bytes = len(whole) - start
         possible = left / sound_bytes * len(samples)
         least = possible - 2 * FLAC_BLOCK  # frames of noise are nearly equally long
     else:
-        possible = least = left // per_sample
+        possible = least = min(left // per_sample, len(samples))
     refusal = ""
     try:
         got, note = read(path)

@@ -8,7 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, WebSocketRoute, expect
+from playwright.sync_api import Browser, expect
 
 from browser import faultless_page, running_browser
 from livessl.capture.node import send_session
@@ -20,6 +20,21 @@ pytestmark = [pytest.mark.browser]
 
 LEVEL_BAR_DBFS = -96.0
 """Level at the left end of the page's level bars; the right end is 0 dBFS."""
+
+ADD_AFTER_HELLO = """
+window.WebSocket = class extends WebSocket {
+  constructor(...given) {
+    super(...given);
+    const add = ({ data }) => {
+      if (typeof data !== "string" || JSON.parse(data).kind !== "hello") return;
+      this.removeEventListener("message", add);
+      setTimeout(() => this.dispatchEvent(new MessageEvent("message", { data: %s })));
+    };
+    this.addEventListener("message", add);
+  }
+};
+"""
+"""Script that hands the page one more message behind the server's greeting."""
 
 
 @pytest.fixture(scope="module")
@@ -112,20 +127,9 @@ def test_page_claims_no_state_while_the_server_is_unreachable(browser: Browser) 
     ],
 )
 def test_page_reports_skipped_messages(browser: Browser, replayed: Server, missed: int | None, notice: str) -> None:
-    gap = json.dumps({"kind": "gap", "missed": missed, "reason": "the client was too slow"})
-
-    def pass_on_then_report(socket: WebSocketRoute) -> None:
-        server_side = socket.connect_to_server()
-
-        def pass_on(message: str | bytes) -> None:
-            socket.send(message)
-            if json.loads(message)["kind"] == "hello":
-                socket.send(gap)
-
-        server_side.on_message(pass_on)
-
+    gap = {"kind": "gap", "missed": missed, "reason": "the client was too slow"}
     with faultless_page(browser) as page:
-        page.route_web_socket("**/api/v1/live*", pass_on_then_report)
+        page.add_init_script(ADD_AFTER_HELLO % json.dumps(json.dumps(gap)))
         page.goto(replayed.url)
         expect(page.get_by_test_id("gap")).to_contain_text(notice, timeout=1000 * HANG_S)
         expect(page.get_by_test_id("event")).to_have_count(2)
