@@ -15,7 +15,7 @@ import numpy as np
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
 from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
-from livessl.core.types import ArraySpec, Evidence, FloatArray
+from livessl.core.types import ArraySpec, Candidate, Evidence, FloatArray
 
 NEAR_M: Final = 0.5
 """Largest error, in metres, of a position that counts as right: the confidence is the probability of that."""
@@ -54,6 +54,10 @@ _CALIBRATED_MISFIT: Final = 0.4
 """Residual misfit below which most of what stands elsewhere on the lag axis is no noise but side lobes of the sound
 itself, so that the variance shrinks with its square. It is about 0.05 in free field, and 0.7 or more in a room."""
 
+_PLACED_M: Final = 0.001
+"""Standard deviation, in metres, with which the acoustic centres of an array's microphones are known relative to each
+other at best. Coordinates that hang on the curvature of the wavefront are no more certain than that allows."""
+
 _LEAST_DEVIATION_M: Final = 0.005
 """Standard deviation along each axis, in metres, that remains with the clearest evidence: reflections just after the
 direct sound, which the lag axis does not resolve, move positions by that much."""
@@ -76,6 +80,8 @@ class ConfidenceFeatures:
         Second highest of the arrays' shares of `peak_to_rms`; 0 for one array.
     whole : bool
         Whether the evidence includes whole segments.
+    share : float
+        Probability of the position among the places that explain the evidence about as well, such as mirror images.
     """
 
     margin: float
@@ -83,10 +89,16 @@ class ConfidenceFeatures:
     crossing_deg: float = 0.0
     second_array: float = 0.0
     whole: bool = False
+    share: float = 1.0
 
     @property
     def confidence(self) -> float:
         """Probability that the position is right to within `NEAR_M`."""
+        return self.share * self.confidence_of_candidates
+
+    @property
+    def confidence_of_candidates(self) -> float:
+        """Probability that the position or a place that explains the evidence as well is right to within `NEAR_M`."""
         if self.crossing_deg >= CROSSING_DEG:
             return self.confidence_at_known_distance
         intercept, of_margin = _DISTANCE_FIT
@@ -101,12 +113,32 @@ class ConfidenceFeatures:
     @property
     def is_sure(self) -> bool:
         """Whether another look at the sound is not worth its time."""
-        return self.confidence >= SURE and self.second_array >= _CLEAR_PEAK_TO_RMS
+        return self.confidence_of_candidates >= SURE and self.second_array >= _CLEAR_PEAK_TO_RMS
 
     @property
     def has_direction(self) -> bool:
         """Whether the position stands out from noise, so that at least its direction means something."""
         return self.peak_to_rms >= 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rivals:
+    """Other places that explain the evidence about as well as a position.
+
+    Parameters
+    ----------
+    share : float
+        Probability of the position, and of places nearer than `NEAR_M`, among all of them.
+    candidates : tuple of Candidate
+        The position, and then the other places, most probable first; their probabilities sum to 1.
+    spread_m2 : (3, 3) float64
+        Second moment of the rivals nearer than `NEAR_M` about the position, square metres: they are the same answer but
+        belong into its covariance.
+    """
+
+    share: float
+    candidates: tuple[Candidate, ...]
+    spread_m2: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +151,15 @@ class Judgement:
         Square metres.
     features : ConfidenceFeatures
     refused : str or None
-        Why the position should not be relied on, in words; None if it may be.
+        Why neither the position nor its `candidates` should be relied on, in words; None if they may be.
+    candidates : tuple of Candidate
+        The position and the places that explain the evidence about as well; empty if the position is clearly the best.
     """
 
     covariance_m2: FloatArray
     features: ConfidenceFeatures
     refused: str | None
+    candidates: tuple[Candidate, ...] = ()
 
 
 def judge(
@@ -136,6 +171,7 @@ def judge(
     grid: Grid,
     *,
     whole: bool = False,
+    rivals: Rivals | None = None,
 ) -> Judgement:
     """Judge a position.
 
@@ -152,6 +188,8 @@ def judge(
         Search grid.
     whole : bool
         Whether the evidence includes whole segments.
+    rivals : Rivals or None
+        Other places that explain the evidence about as well.
     """
     terms = functional.pair_terms(position_m)
     ratios = sorted(peak_to_rms(part, array_power(part, term)) for part, term in zip(evidence, terms, strict=True))
@@ -161,16 +199,22 @@ def judge(
         crossing_deg([part.spec for part in evidence], position_m),
         ratios[-2] if len(ratios) > 1 else 0.0,
         whole,
+        1.0 if rivals is None else rivals.share,
     )
     covariance_m2 = refine.laplace_covariance_m2(functional, evidence, position_m, grid)
     covariance_m2 *= _INFLATION * np.sqrt(len(evidence))
     covariance_m2 *= min(1.0, _residual_misfit(evidence, terms, len(grid.free_axes)) / _CALIBRATED_MISFIT) ** 2
+    covariance_m2 += refine.placement_covariance_m2(functional, position_m, _PLACED_M, grid)
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _LEAST_DEVIATION_M**2
+    if rivals is not None:
+        covariance_m2 += rivals.spread_m2
+    ambiguous = features.share < LEAST_CONFIDENCE
+    confidence = features.confidence_of_candidates if ambiguous else features.confidence
     refused = None
-    if features.confidence < LEAST_CONFIDENCE:
-        refused = f"confidence {features.confidence:.2f} is below the threshold of {LEAST_CONFIDENCE:.2f}"
-    return Judgement(covariance_m2, features, refused)
+    if confidence < LEAST_CONFIDENCE:
+        refused = f"confidence {confidence:.2f} is below the threshold of {LEAST_CONFIDENCE:.2f}"
+    return Judgement(covariance_m2, features, refused, rivals.candidates if ambiguous and rivals is not None else ())
 
 
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:

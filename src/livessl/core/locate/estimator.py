@@ -18,7 +18,7 @@ from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.geometry import Grid
 from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.core.methods import METHODS, is_method, unknown_method
-from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray
+from livessl.core.types import GCC, ArraySpec, Candidate, Evidence, Float32Array, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,11 @@ class Localization:
         Arrays that were not used because enough others have stronger onsets.
     others : tuple of Localization
         Further sources that sounded at the same time.
+    candidates : tuple of Candidate
+        The position, and then the places that explain the sound about as well, most probable first; empty if there are
+        none. With candidates, fusion reports at most a direction.
+    ambiguity : str or None
+        Why there are candidates, in words; None without them.
     """
 
     position_m: FloatArray
@@ -117,6 +122,8 @@ class Localization:
     outliers: Mapping[str, float] | None = None
     unneeded: Collection[str] = ()
     others: tuple[Localization, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    ambiguity: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

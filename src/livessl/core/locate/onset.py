@@ -11,14 +11,16 @@ import numpy as np
 from livessl.core.correlate.gcc_phat import LagSampling, require_band
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, summed
 from livessl.core.geometry import Grid, microphone_pairs
-from livessl.core.locate import outliers
-from livessl.core.locate.confidence import Judgement
+from livessl.core.locate import ambiguity, outliers
+from livessl.core.locate.confidence import LEAST_CONFIDENCE, Judgement
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
 from livessl.core.locate.outliers import Consensus
+from livessl.core.locate.outside import Outside, find_outside
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place, highest_place
 from livessl.core.locate.second_source import FrameGCCs, SecondSourceSearch
+from livessl.core.locate.srp import SRPFunctional
 from livessl.core.methods import ONSET
 from livessl.core.types import GCC, ArraySpec, Evidence
 
@@ -91,39 +93,32 @@ class Onset(MapEstimator):
         """Find the place that most arrays agree on, then a second source, and judge both.
 
         If there is no second source and the first answer is not sure, a sound that has ended gets a second look: whole
-        segments are added to the onsets, and the more confident of the two answers is returned.
+        segments are added to the onsets, and the more confident of the two answers is returned. A sound that a place
+        outside the search volume explains better is reported as such (`livessl.core.locate.outside`).
         """
         strongest = strongest_onsets(sounds, MOST_ARRAYS)
         evidence = self.evidence(strongest)
         suspect = [name for name, sound in strongest.items() if sound.suspect]
         answer = self._answer(evidence, suspect)
-        separation = self._second_source.separate(
-            answer.consensus, evidence, strongest, lambda part: self._frames(part, strongest[part.spec.name])
-        )
+        outside = self._outside(answer)
+        separation = None
+        if outside is None or not outside.is_sufficient:
+            separation = self._second_source.separate(
+                answer.consensus, evidence, strongest, lambda part: self._frames(part, strongest[part.spec.name])
+            )
         others: tuple[Localization, ...] = ()
         if separation is not None:
             second, judgement = separation.second, separation.judgement
             consensus = Consensus(separation.first, second.outliers or {})
-            answer = _Answer(evidence, consensus, judgement, judgement.refused)
+            answer, outside = _Answer(evidence, consensus, judgement, judgement.refused), None
+            second = self._with_candidates(second)
             others = (replace(second, unneeded=sounds.keys() - {part.spec.name for part in second.evidence}),)
-        elif not answer.is_sure and all(sound.ended for sound in strongest.values()):
+        elif outside is None and not answer.is_sure and all(sound.ended for sound in strongest.values()):
             second_look = self._answer(self._with_whole_segments(evidence, strongest), suspect, whole=True)
             answer = max(answer, second_look, key=lambda one: (one.refused is None, one.judgement.features.confidence))
-        place = answer.consensus.place
-        return Localization(
-            position_m=place.position_m,
-            covariance_m2=answer.judgement.covariance_m2,
-            confidence=answer.judgement.features.confidence,
-            evidence=answer.evidence,
-            proven=place.proven,
-            features=answer.judgement.features,
-            refused=(
-                answer.refused if place.proven else "no place stands out: the search was stopped before it was complete"
-            ),
-            outliers=answer.consensus.outliers,
-            unneeded=sounds.keys() - strongest.keys(),
-            others=others,
-        )
+            outside = self._outside(answer)
+        found = self._localization(answer) if outside is None else self._beyond(answer, outside)
+        return replace(found, unneeded=sounds.keys() - strongest.keys(), others=others)
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
@@ -133,6 +128,57 @@ class Onset(MapEstimator):
         consensus = outliers.consensus(evidence, suspect, self._search, self.grid, self._place)
         judgement = consensus.place.judgement(self.grid, whole=whole)
         return _Answer(evidence, consensus, judgement, consensus.refused or judgement.refused)
+
+    def _outside(self, answer: _Answer) -> Outside | None:
+        place, refused = answer.consensus.place, answer.refused is not None
+        return find_outside(place, answer.evidence, self.grid, self.c_m_s, refused=refused)
+
+    def _localization(self, answer: _Answer) -> Localization:
+        place, judgement = answer.consensus.place, answer.judgement
+        specs = [part.spec for part in place.evidence]
+        return Localization(
+            position_m=place.position_m,
+            covariance_m2=judgement.covariance_m2,
+            confidence=judgement.features.confidence,
+            evidence=answer.evidence,
+            proven=place.proven,
+            features=judgement.features,
+            refused=(
+                answer.refused if place.proven else "no place stands out: the search was stopped before it was complete"
+            ),
+            outliers=answer.consensus.outliers,
+            candidates=judgement.candidates,
+            ambiguity=ambiguity.reason(judgement.candidates, specs, self.c_m_s) if judgement.candidates else None,
+        )
+
+    def _beyond(self, answer: _Answer, outside: Outside) -> Localization:
+        """Return the place outside the search volume and the one inside as candidates; all arrays agree on it."""
+        place, judgement = outside.place, outside.place.judgement(outside.grid, whole=answer.judgement.features.whole)
+        candidates = outside.candidates(answer.consensus.place.position_m)
+        features = replace(judgement.features, share=candidates[0].probability)
+        known = features.confidence_at_known_distance >= LEAST_CONFIDENCE
+        return Localization(
+            position_m=place.position_m,
+            covariance_m2=judgement.covariance_m2,
+            confidence=features.confidence,
+            evidence=answer.evidence,
+            proven=place.proven,
+            features=features,
+            refused=None if known else outside.reason,
+            outliers={},
+            candidates=candidates,
+            ambiguity=outside.reason,
+        )
+
+    def _with_candidates(self, second: Localization) -> Localization:
+        """Add the places that explain what remains for a second source as well."""
+        functional, specs = SRPFunctional(second.evidence, self.c_m_s), [part.spec for part in second.evidence]
+        power = float(functional.value(second.position_m[None])[0])
+        rivals = ambiguity.rivals(functional, specs, second.position_m, power, self.grid)
+        if rivals.share >= LEAST_CONFIDENCE:
+            return second
+        why = ambiguity.reason(rivals.candidates, specs, self.c_m_s)
+        return replace(second, candidates=rivals.candidates, ambiguity=why)
 
     def _place(self, evidence: Sequence[Evidence]) -> Place:
         return highest_place(evidence, self._search, self.grid, self.c_m_s)

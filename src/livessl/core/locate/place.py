@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.geometry import Grid
-from livessl.core.locate import refine
+from livessl.core.locate import ambiguity, refine
 from livessl.core.locate.confidence import Judgement, array_power, judge, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPFunctional
@@ -53,7 +53,12 @@ class Place:
 
     def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:
         """Judge the place; `whole` if the evidence includes whole segments."""
-        return judge(self.functional, self.evidence, self.position_m, self.power, self.rival_power, grid, whole=whole)
+        specs = [part.spec for part in self.evidence]
+        rivals = ambiguity.rivals(self.functional, specs, self.position_m, self.power, grid)
+        return judge(
+            self.functional, self.evidence, self.position_m, self.power, self.rival_power, grid, whole=whole,
+            rivals=rivals,
+        )  # fmt: skip
 
     def apart_m(self, other: Place) -> float:
         """Distance from another place, in metres."""

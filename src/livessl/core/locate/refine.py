@@ -197,6 +197,24 @@ def laplace_covariance_m2(
     return covariance
 
 
+def placement_covariance_m2(
+    functional: SRPFunctional, position_m: FloatArray, placed_m: float, grid: Grid
+) -> FloatArray:
+    """Covariance (3, 3) due to errors of the microphones' positions: (sum 2/K grad tau grad tau^T / s^2 + prior)^-1.
+
+    An error of `placed_m` in each coordinate of each microphone changes a pair's delay by s = sqrt(2) `placed_m` / c,
+    however little noise there is. The prior is that of `laplace_covariance_m2`.
+    """
+    axes = list(grid.free_axes)
+    information = np.diag(12.0 / np.maximum(grid.upper_m - grid.lower_m, 1e-9) ** 2)
+    for term, weight in zip(functional.pair_terms(position_m), functional.pair_weights, strict=True):
+        information += weight * (term.gradient_s_m.T @ term.gradient_s_m) * functional.c_m_s**2 / (2.0 * placed_m**2)
+    covariance = np.zeros((3, 3))
+    if axes:
+        covariance[np.ix_(axes, axes)] = np.linalg.inv(information[np.ix_(axes, axes)])
+    return covariance
+
+
 def noise(evidence: Evidence, term: PairTerms, live: BoolArray) -> float:
     """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
     lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(evidence.spec.band_hz))

@@ -120,10 +120,13 @@ class SRPFunctional:
 
     def __init__(self, evidence: Sequence[Evidence], c_m_s: float) -> None:
         self._names = [part.spec.name for part in evidence]
-        self._c_m_s = c_m_s
+        self.c_m_s = c_m_s
+        """Speed of sound, m/s."""
         counts = [len(part.spec.microphones_m) for part in evidence]
         rows = [len(part.gcc.pairs) for part in evidence]
         self._first_row = np.cumsum([0, *rows])
+        self.pair_weights = tuple(pair_weight(count) for count in counts)
+        """Weight of each array's pairs."""
         shift = np.repeat(np.cumsum([0, *counts[:-1]]), rows)
         lengths = np.repeat([len(part.gcc.lags_s) for part in evidence], rows)
         self._rows = SmoothRows(
@@ -133,13 +136,13 @@ class SRPFunctional:
             step_s=np.repeat([part.gcc.lags_s[1] - part.gcc.lags_s[0] for part in evidence], rows),
             start=np.cumsum(lengths) - lengths,
             last=np.repeat([len(part.gcc.lags_s) - 3 for part in evidence], rows),
-            weight=np.repeat([pair_weight(count) for count in counts], rows),
+            weight=np.repeat(self.pair_weights, rows),
             values=np.concatenate([part.gcc.values.ravel() for part in evidence]),
         )
 
     def value(self, points_m: FloatArray) -> FloatArray:
         """SRP at points (N, 3), in metres: (N,)."""
-        return np.asarray(kernels.smooth_power(np.ascontiguousarray(points_m), self._c_m_s, self._rows))
+        return np.asarray(kernels.smooth_power(np.ascontiguousarray(points_m), self.c_m_s, self._rows))
 
     def pair_terms(self, point_m: FloatArray) -> list[PairTerms]:
         """Return the terms of each array's pairs at one point (3,)."""
@@ -160,11 +163,11 @@ class SRPFunctional:
         distance = np.sqrt((towards**2).sum(axis=1))
         unit = towards / np.maximum(distance, NEAREST_M)[:, None]
         i, k = rows.pairs.T
-        lags = (distance[k] - distance[i]) / self._c_m_s
+        lags = (distance[k] - distance[i]) / self.c_m_s
         place = (lags - rows.first_s) / rows.step_s
         left, around = neighbours(place, rows.start, rows.last, rows.values)
         value, slope, curvature = interpolated(place - left, *around)
-        return value, slope / rows.step_s, curvature / rows.step_s**2, (unit[k] - unit[i]) / self._c_m_s, lags
+        return value, slope / rows.step_s, curvature / rows.step_s**2, (unit[k] - unit[i]) / self.c_m_s, lags
 
 
 @dataclass(frozen=True, slots=True)

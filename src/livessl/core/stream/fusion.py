@@ -282,7 +282,8 @@ class Fusion:
         if len(excerpt.sounds) < self._parameters.min_arrays:
             return []
         update, found = self._verdicts.locate_window(event, excerpt)
-        trusted = [*([] if update.status is Status.REFUSED else [update.estimate]), *update.others]
+        usable = update.status is not Status.REFUSED and not update.estimate.candidates
+        trusted = [*([update.estimate] if usable else []), *update.others]
         tracks = self._tracker.step(excerpt.middle_ns, trusted, probable=found.features is not None)
         return [update, Window(excerpt.middle_ns, found.evidence), *tracks]
 

@@ -45,11 +45,14 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
     if spread_m <= RANGE_UNKNOWN * nearest_m and not alone:
-        return (Status.LOCATED, _dissent(found)) if found.refused is None else (Status.REFUSED, found.refused)
+        if found.refused is not None:
+            return Status.REFUSED, found.refused
+        return (Status.DIRECTION_ONLY, found.ambiguity) if found.candidates else (Status.LOCATED, _dissent(found))
     if found.features is not None and not found.features.has_direction:
         return Status.REFUSED, "no direction stands out in the sound"
     who = "one array" if len(specs) == 1 else "these arrays"
-    return Status.DIRECTION_ONLY, f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+    unresolved = f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
+    return Status.DIRECTION_ONLY, unresolved if found.ambiguity is None else f"{found.ambiguity}; {unresolved}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +183,9 @@ class Verdicts:
 
 def _estimate(found: Localization, excerpt: Excerpt) -> Estimate:
     arrays = _used(found, excerpt.sounds)
-    return Estimate(excerpt.middle_ns, found.position_m, found.covariance_m2, found.confidence, arrays)
+    return Estimate(
+        excerpt.middle_ns, found.position_m, found.covariance_m2, found.confidence, arrays, found.candidates
+    )
 
 
 def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from livessl.core.types.arrays import (
 )
 from livessl.core.types.results import (
     BackfillRequest,
+    Candidate,
     Contribution,
     Estimate,
     Event,
@@ -50,6 +51,7 @@ __all__ = [
     "BackfillRequest",
     "Block",
     "BoolArray",
+    "Candidate",
     "ClockState",
     "ComplexArray",
     "Contribution",

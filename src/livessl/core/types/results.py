@@ -26,6 +26,25 @@ class TrackState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Candidate:
+    """One of several places that explain a sound about equally well.
+
+    Parameters
+    ----------
+    position_m : (3,) float64
+        Metres, room corner at the origin.
+    probability : float
+        Probability of this place among all candidates, 0 to 1.
+    """
+
+    position_m: FloatArray
+    probability: float
+
+    def __post_init__(self) -> None:
+        read_only(self.position_m)
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """A position and its certainty.
 
@@ -42,6 +61,9 @@ class Estimate:
         of the map's peak over the next best place; it is not a probability.
     arrays : tuple of str
         Arrays from which the position was computed.
+    candidates : tuple of Candidate
+        The position, and then the places that explain the sound about as well, most probable first; empty if there are
+        none.
 
     Raises
     ------
@@ -54,6 +76,7 @@ class Estimate:
     covariance_m2: FloatArray
     confidence: float
     arrays: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
 
     def __post_init__(self) -> None:
         if self.position_m.shape != (3,) or self.covariance_m2.shape != (3, 3):

@@ -95,6 +95,7 @@ class Messages:
             "late": event.late,
             "replaces": list(replaces),
             "source": event.source,
+            "candidates": _candidates(event.estimate),
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
@@ -112,6 +113,7 @@ class Messages:
             "status": str(update.status),
             "contributions": [_contribution(c) for c in update.contributions],
             "others": [self._other(other) for other in update.others],
+            "candidates": _candidates(update.estimate),
             "zones": self._site.zones_of(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
@@ -156,6 +158,11 @@ def where(
         return None, None, 0.0, []
     covariance = [_square_metres(row) for row in estimate.covariance_m2]
     return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
+
+
+def _candidates(estimate: Estimate | None) -> list[JsonObject]:
+    candidates = () if estimate is None else estimate.candidates
+    return [{"position_m": _metres(each.position_m), "probability": round(each.probability, 4)} for each in candidates]
 
 
 def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:

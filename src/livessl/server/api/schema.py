@@ -157,6 +157,22 @@ StagesOrNull = Annotated[
 ]
 
 
+class Candidate(BaseModel):
+    """One of several places that explain a sound about equally well, such as mirror images."""
+
+    position_m: PositionM
+    probability: float = Field(ge=0, le=1, description="Its probability among all candidates.", examples=[0.5])
+
+
+Candidates = Annotated[
+    list[Candidate],
+    Field(
+        description="Where places cannot be told apart: `position_m`, and then those that explain the sound about as "
+        "well, most probable first; `status` is then at most `direction-only`. Empty otherwise.",
+    ),
+]
+
+
 class Event(BaseModel):
     """A finished sound: the accurate answer."""
 
@@ -173,7 +189,8 @@ class Event(BaseModel):
     arrays: ArrayNames = Field(description="Arrays that contributed to the position.")
     method: str = Field(description="Name of the estimator.", examples=["onset", "srp-phat"])
     status: Status = Field(
-        description="`located`; `direction-only` where the distance cannot be determined; `refused` where too few "
+        description="`located`; `direction-only` where the distance cannot be determined, where `candidates` cannot be "
+        "told apart, or where the sound came from outside the search volume; `refused` where too few "
         "arrays detected the sound, the position is too uncertain, or arrays disagree and none can be excluded."
     )
     reason: str | None = Field(
@@ -196,6 +213,7 @@ class Event(BaseModel):
         description="1, or 2 for the second of two simultaneous sources, each of which has an event of its own.",
         examples=[1],
     )
+    candidates: Candidates
 
 
 class OtherSource(BaseModel):
@@ -343,6 +361,7 @@ class UpdateMessage(_Numbered):
     status: Status
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     others: list[OtherSource] = Field(description="Further simultaneous sources, where the site enables them.")
+    candidates: Candidates
     zones: Zones
     level_dbfs: LevelDbfs | None = Field(description="Level of the loudest 50 ms; null for digital silence.")
     latency_s: LatencyS | None = Field(description="Seconds from the end of the sound used; null in a replay.")

@@ -1,0 +1,93 @@
+"""Weighs a position against its mirror images by the power there. It sees correlations and no sound.
+
+The geometry of the microphones proposes places that look alike (`livessl.core.mirror`). Where another array, or a
+microphone off the plane, tells them apart, they have less power than the position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from livessl.core.geometry import Grid
+from livessl.core.locate import refine
+from livessl.core.locate.confidence import NEAR_M, Rivals
+from livessl.core.locate.srp import SRPFunctional
+from livessl.core.mirror import described, look_alikes
+from livessl.core.types import ArraySpec, Candidate, FloatArray
+
+SAME_POWER: Final = 0.02
+"""Margin, as a share of the power, at which another place is e times less probable. Mirror images of coplanar
+microphones have a margin of 0. Poses, geometry and sampling of the lag axis shift powers by about this much."""
+
+MOST_CANDIDATES: Final = 8
+"""Most places that are reported of an ambiguous answer; on a circle around a line there are arbitrarily many."""
+
+_LEAST_POWER: Final = 0.8
+"""Power, as a share of that at the position, below which a proposed place is not refined."""
+
+
+def rivals(
+    functional: SRPFunctional,
+    specs: Sequence[ArraySpec],
+    position_m: FloatArray,
+    power: float,
+    grid: Grid,
+) -> Rivals:
+    """Weigh a position against its `look_alikes` by the power there.
+
+    Parameters
+    ----------
+    functional : SRPFunctional
+        SRP of the evidence.
+    specs : sequence of ArraySpec
+        The arrays of the evidence.
+    position_m : (3,) float64
+    power : float
+        The functional there.
+    grid : Grid
+        Search grid.
+    """
+    alone = Rivals(1.0, (), np.zeros((3, 3)))
+    proposed_m = look_alikes(position_m, specs, grid, functional.c_m_s)
+    if not len(proposed_m) or power <= 0.0:
+        return alone
+    values = functional.value(proposed_m)
+    far = np.linalg.norm(proposed_m - position_m, axis=1) > NEAR_M
+    near_m = (proposed_m - position_m)[~far & (values >= (1.0 - SAME_POWER) * power)]
+    spread_m2 = near_m.T @ near_m / (len(near_m) + 1)
+    places = [(position_m, power)]
+    for k in _apart(proposed_m, np.where(far & (values >= _LEAST_POWER * power), values, -np.inf)):
+        place_m, place_power = refine.refine(functional, proposed_m[k], grid)
+        if all(np.linalg.norm(place_m - known_m) > NEAR_M for known_m, _ in places):
+            places.append((place_m, place_power))
+    if len(places) == 1:
+        return Rivals(1.0, (), spread_m2)
+    weights = np.exp([(place_power - power) / (SAME_POWER * power) for _, place_power in places])
+    weights /= weights.sum()
+    candidates = [Candidate(place_m, float(share)) for (place_m, _), share in zip(places, weights, strict=True)]
+    others = sorted(candidates[1:], key=lambda candidate: -candidate.probability)
+    return Rivals(candidates[0].probability, (candidates[0], *others), spread_m2)
+
+
+def reason(candidates: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: float) -> str:
+    """Return why an answer is ambiguous, and the cure, in words."""
+    others = ", ".join(f"({', '.join(f'{x:.2f}' for x in each.position_m)})" for each in candidates[1:4])
+    more = f" and {len(candidates) - 4} more" if len(candidates) > 4 else ""
+    return (
+        f"{described(specs, c_m_s)}, so {others}{more} explain{'s' if len(candidates) == 2 else ''} the sound as well; "
+        "limit grid.bounds_m to one side, or tilt an array or raise a microphone"
+    )
+
+
+def _apart(places_m: FloatArray, values: FloatArray) -> list[int]:
+    """Indices of the highest places that are more than `NEAR_M` from each other, as many as may be reported."""
+    chosen: list[int] = []
+    for k in np.argsort(-values, kind="stable"):
+        if values[k] == -np.inf or len(chosen) == MOST_CANDIDATES - 1:
+            break
+        if all(np.linalg.norm(places_m[k] - places_m[other]) > NEAR_M for other in chosen):
+            chosen.append(int(k))
+    return chosen

@@ -1,0 +1,199 @@
+"""Decides whether a sound came from outside the search volume. It sees correlations and no sound.
+
+The search ends at the volume's surface, so a sound from beyond it is placed on the surface, or at a place inside where
+all arrays find some power. Both have less power than the true place. It is searched for along the direction from which
+each array receives the sound, beyond the volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.geometry import Grid
+from livessl.core.locate import refine
+from livessl.core.locate.ambiguity import SAME_POWER
+from livessl.core.locate.confidence import NEAR_M
+from livessl.core.locate.place import Place
+from livessl.core.locate.srp import SRPFunctional, pair_weight
+from livessl.core.types import Candidate, Evidence, FloatArray
+
+GAIN: Final = 0.1
+"""Power that a place outside must have more than the best place inside, as a share of that. Of sounds outside, the
+middle half has 0.1 to 0.3; noise and reverberation of sounds inside reach 0.04, also after 2 s of reverberation."""
+
+SURFACE_GAIN: Final = 0.005
+"""The same where the best place inside lies on the volume's surface: the power rises only a little along the line of
+sight of arrays that are in line with the sound. Reflections by a wall move places less than `NEAR_M`."""
+
+SUFFICIENT: Final = 0.95
+"""Power, as a share of the highest that the evidence can have anywhere, with which one place explains the evidence so
+well that no second source is needed."""
+
+_DIRECTIONS: Final = 1600
+"""Directions examined for each array, some 5 degrees apart: a lobe of an array of 0.5 m is about as wide."""
+
+_CLOSER_DEG: Final = (3.0, 1.0)
+"""Half widths, in degrees, of two finer looks around the best direction."""
+
+_CLOSER_STEPS: Final = 9
+"""Directions along each axis of a finer look."""
+
+_FARTHEST_DIAGONALS: Final = 3.0
+"""Distance from an array up to which places are examined, in diagonals of it. Beyond, only the direction counts."""
+
+_NEAREST_M: Final = 0.3
+"""Shortest distance, in metres, that is examined along each direction."""
+
+_DISTANCES: Final = 100
+"""Distances examined along each direction, in equal ratios of some 5 %: from two arrays metres apart, neighbours differ
+by less than a lobe."""
+
+_STARTS: Final = 3
+"""Places along the directions that are refined."""
+
+_REFINED_M: Final = 0.5
+"""Edge, in metres, of the cells in which places outside are refined; four times the longest step of the climb."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outside:
+    """A place outside the search volume that explains the evidence better than any place inside.
+
+    Parameters
+    ----------
+    place : Place
+        Its `rival_power` is the power of the place inside.
+    grid : Grid
+        A box that holds the search volume and the place, in which to judge it.
+    surface : bool
+        Whether the place inside lies on the surface, so that the sound may be there.
+    """
+
+    place: Place
+    grid: Grid
+    surface: bool
+
+    @property
+    def is_sufficient(self) -> bool:
+        """Whether the place explains the evidence so well that no second source is needed."""
+        return self.place.power >= SUFFICIENT * highest_power(self.place.evidence)
+
+    def candidates(self, inside_m: FloatArray) -> tuple[Candidate, Candidate]:
+        """Return the place, and the best place inside, with their probabilities."""
+        margin = refine.margin(self.place.power, self.place.rival_power)
+        share = 1.0 / (1.0 + float(np.exp(-margin / SAME_POWER)))
+        return Candidate(self.place.position_m, share), Candidate(inside_m, 1.0 - share)
+
+    @property
+    def reason(self) -> str:
+        """The answer in words."""
+        near = ", ".join(f"{x:.1f}" for x in self.place.position_m)
+        where = (
+            "at the surface of the search volume or outside the search volume"
+            if self.surface
+            else ("outside the search volume")
+        )
+        return (
+            f"{where}, near ({near}); if it was inside, check the arrays' poses in the site file, room.size_m and "
+            "grid.bounds_m"
+        )
+
+
+def find_outside(
+    inside: Place, evidence: Sequence[Evidence], grid: Grid, c_m_s: float, *, refused: bool
+) -> Outside | None:
+    """Find a place outside the search volume that explains the evidence better than the best place inside.
+
+    Parameters
+    ----------
+    inside : Place
+        The best place inside.
+    evidence : sequence of Evidence
+        Evidence of all arrays, also of those that do not agree on the place inside.
+    grid : Grid
+        Search grid.
+    c_m_s : float
+        Speed of sound, m/s.
+    refused : bool
+        Whether the place inside is not relied on anyway; then its being on the surface says nothing.
+    """
+    if len(grid.free_axes) < 3:
+        return None  # a search in a plane: other heights are outside without being wrong
+    evidence = tuple(sorted(evidence, key=lambda part: part.spec.name))
+    functional = SRPFunctional(evidence, c_m_s)
+    power = float(functional.value(inside.position_m[None])[0])
+    surface = not refused and _on_surface(inside.position_m, grid)
+    least = (1.0 + (SURFACE_GAIN if surface else GAIN)) * power
+    if power <= 0.0 or highest_power(evidence) < least:
+        return None
+    starts_m = np.concatenate([_along_m(part, grid, c_m_s) for part in evidence])
+    if not len(starts_m):
+        return None
+    values = functional.value(starts_m)
+    wide = _widened(grid)
+    best = np.argsort(-values, kind="stable")[:_STARTS]
+    position_m, beyond = refine.refine(functional, starts_m[best], wide)
+    off_m = position_m - np.clip(position_m, grid.lower_m, grid.upper_m)
+    if beyond < least or not off_m.any() or np.linalg.norm(position_m - inside.position_m) <= NEAR_M:
+        return None
+    place = Place(evidence, functional, position_m, beyond, power, inside.proven)
+    return Outside(place, wide, surface=surface and beyond < (1.0 + GAIN) * power)
+
+
+def highest_power(evidence: Sequence[Evidence]) -> float:
+    """Power that no place exceeds: that of all pairs at their highest lag."""
+    return sum(
+        pair_weight(len(part.spec.microphones_m)) * float(part.gcc.values.max(axis=1).sum(dtype=np.float64))
+        for part in evidence
+    )
+
+
+def _on_surface(position_m: FloatArray, grid: Grid) -> bool:
+    from_surface_m = np.minimum(position_m - grid.lower_m, grid.upper_m - position_m)
+    return bool((from_surface_m <= grid.cell_m).any())
+
+
+def _widened(grid: Grid) -> Grid:
+    reach_m = _FARTHEST_DIAGONALS * float(np.linalg.norm(grid.upper_m - grid.lower_m))
+    x, y, z = ((low - reach_m, high + reach_m) for low, high in grid.bounds_m)
+    return Grid((x, y, z), _REFINED_M)
+
+
+def _along_m(part: Evidence, grid: Grid, c_m_s: float) -> FloatArray:
+    """Places (N, 3) outside the volume along the direction from which an array receives the sound, from far away."""
+    functional, centre_m = SRPFunctional([part], c_m_s), part.spec.centre_m
+    far_m = _FARTHEST_DIAGONALS * float(np.linalg.norm(grid.upper_m - grid.lower_m))
+
+    def highest(directions: FloatArray) -> FloatArray:
+        return np.asarray(directions[functional.value(centre_m + far_m * directions).argmax()])
+
+    direction = highest(_SPHERE)
+    for half_deg in _CLOSER_DEG:
+        direction = highest(_around(direction, np.radians(half_deg)))
+    places_m = centre_m + np.geomspace(_NEAREST_M, far_m, _DISTANCES)[:, None] * direction
+    return places_m[((places_m < grid.lower_m) | (places_m > grid.upper_m)).any(axis=1)]
+
+
+def _around(direction: FloatArray, half: float) -> FloatArray:
+    """Unit vectors (N, 3) on a square around a direction, `half` radians to each side."""
+    across = np.linalg.svd(direction[None])[2][1:]
+    steps = np.linspace(-half, half, _CLOSER_STEPS)
+    one, other = np.meshgrid(steps, steps)
+    vectors = direction + one.reshape(-1, 1) * across[0] + other.reshape(-1, 1) * across[1]
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _sphere() -> FloatArray:
+    """Unit vectors (N, 3) that cover the sphere evenly: a Fibonacci lattice."""
+    index = np.arange(_DIRECTIONS) + 0.5
+    height = 1.0 - 2.0 * index / _DIRECTIONS
+    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * index
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([np.cos(azimuth) * ring, np.sin(azimuth) * ring, height], axis=1)
+
+
+_SPHERE: Final = _sphere()
