@@ -83,9 +83,9 @@ def test_one_array_with_a_clear_peak_is_not_sure() -> None:
 
 
 def test_pairs_that_disagree_widen_the_covariance() -> None:
-    """Delays off by 20 us, 7 mm of sound: well below a lobe, so that the heights hardly change."""
+    """Delays off by 10 us, 3 mm of sound: far below a lobe, so that the heights hardly change."""
     evidence = [evidence_of(NORTH, 1.0, 0.0), evidence_of(SOUTH, 1.0, 0.0)]
-    off_s = 2e-5 * np.random.default_rng(0).standard_normal((2, 6))
+    off_s = 1e-5 * np.random.default_rng(0).standard_normal((2, 6))
     torn = [
         Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, SOURCE_M) + off, RATE_HZ))
         for spec, off in zip((NORTH, SOUTH), off_s, strict=True)
@@ -94,7 +94,7 @@ def test_pairs_that_disagree_widen_the_covariance() -> None:
     deviations_m = np.sqrt(np.linalg.eigvalsh(agreed))
     assert deviations_m[0] > 0.005  # what remains with the clearest evidence,
     assert deviations_m[-1] < 0.015  # and 1 mm in an array of 0.3 m seen from 1.7 m, along two crossing lines
-    assert np.trace(disagreed) > 1.5 * np.trace(agreed)  # about half of it comes from the misfit
+    assert np.trace(disagreed) > 1.2 * np.trace(agreed)  # although the placement is most of both
 
 
 def test_the_covariance_of_one_array_does_not_shrink_when_its_pairs_agree() -> None:
