@@ -337,7 +337,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "joint arrays at one place": (
         {"arrays.south.position_m": [1.9, 1.3, 1.4], JOINT: ["north", "south"]},
         JOINT,
-        r"microphone 1 of 'north' and microphone 1 of 'south' are at one place \(1.9, 1.3, 1.5837\); correct one",
+        r"expected arrays at different places, 'north' and 'south' are both at \(1.9, 1.3, 1.4\); correct one",
     ),
     "min_arrays of joint ones": (
         {"fusion.min_arrays": 2, JOINT: ["north", "south"]},

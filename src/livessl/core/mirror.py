@@ -15,7 +15,7 @@ import numpy as np
 
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.steering import steering_delays_s
-from livessl.core.types import ArraySpec, BoolArray, FloatArray
+from livessl.core.types import ArraySpec, FloatArray
 
 SAME_PERIODS: Final = 0.125
 """Difference of delays, in periods of the band's upper edge, up to which two places are the same to a pair. A GCC over
@@ -24,6 +24,19 @@ the band has lost a tenth of its height there. Microphones count as coplanar wit
 REACH_M: Final = 0.5
 """Distance, in metres, up to which a mirror image outside the search volume counts as being on its surface: a position
 may be off by that much, and its mirror image with it, so that the volume does not exclude the place."""
+
+CURE: Final = "let grid.bounds_m end at the plane, tilt an array, or raise a microphone"
+"""What makes a position and its mirror image distinguishable."""
+
+MOST_SHARE: Final = 0.05
+"""Share of the search volume above which its look-alikes are worth a warning before anything is mounted."""
+
+_SAMPLED_POINTS: Final = 250
+"""Number of places at which a volume is examined: a share of a few per cent shows."""
+
+_RECURRENCE: Final = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+"""Steps, as shares of the volume's edges, from one of these places to the next, so that they cover it evenly: powers of
+the root of x^4 = x + 1 (Roberts' R3 sequence)."""
 
 _ON_CIRCLE_M: Final = 0.25
 """Distance, in metres, between proposed places on a circle around a line of microphones."""
@@ -90,18 +103,47 @@ def look_alikes(position_m: FloatArray, specs: Sequence[ArraySpec], grid: Grid, 
     return np.concatenate(images) if images else np.empty((0, 3))
 
 
-def indistinguishable(
-    position_m: FloatArray, places_m: FloatArray, specs: Sequence[ArraySpec], c_m_s: float
-) -> BoolArray:
-    """Whether the delays of all pairs at each place (N, 3) are those at a position, to within `SAME_PERIODS`: (N,)."""
-    same = np.ones(len(places_m), dtype=np.bool_)
+def confused(position_m: FloatArray, places_m: FloatArray, specs: Sequence[ArraySpec], c_m_s: float) -> bool:
+    """Whether at one of some places (N, 3) all pairs have the delays of a position, to within `SAME_PERIODS`."""
     for spec in specs:
         points_m = np.concatenate([position_m[None], places_m])
         pairs = microphone_pairs(len(spec.microphones_m))
         delays_s = steering_delays_s(points_m, spec.microphones_m, pairs, c_m_s)
         off_s = np.abs(delays_s[:, 1:] - delays_s[:, :1]).max(axis=0)
-        same &= off_s * spec.band_hz[1] <= SAME_PERIODS
-    return same
+        places_m = places_m[off_s * spec.band_hz[1] <= SAME_PERIODS]
+        if not len(places_m):
+            return False
+    return True
+
+
+def ambiguous_share(specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> float:
+    """Share of the search volume in which some arrays cannot tell a place from another one that is far away.
+
+    What all arrays confuse is an image of each of them, so that the images of one suffice.
+    """
+    flats = [flatness([spec], c_m_s) for spec in specs]
+    shared = flatness(specs, c_m_s) or min(flats, key=lambda flat: flat is not None and flat.is_line)
+    if shared is None or None in flats:
+        return 0.0
+    shares = (0.5 + np.arange(_SAMPLED_POINTS)[:, None] * _RECURRENCE) % 1.0
+    points_m = grid.lower_m + shares * (grid.upper_m - grid.lower_m)
+    count = 0
+    for point_m in points_m:
+        images_m = shared.images_m(point_m, grid)
+        images_m = images_m[np.linalg.norm(images_m - point_m, axis=1) > REACH_M]
+        count += bool(len(images_m)) and confused(point_m, images_m, specs, c_m_s)
+    return count / len(points_m)
+
+
+def warning(specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> str | None:
+    """Return a warning with its cure if arrays cannot tell apart many places of the search volume; None otherwise."""
+    share = ambiguous_share(specs, grid, c_m_s)
+    if share <= MOST_SHARE:
+        return None
+    return (
+        f"arrays: {described(specs, c_m_s)}: in {share:.0%} of the search volume a position and its mirror image "
+        f"cannot be told apart, and such sounds are reported as direction-only with all candidates; {CURE}"
+    )
 
 
 def described(specs: Sequence[ArraySpec], c_m_s: float) -> str:

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from livessl.core import mirror
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import microphone_pairs
 from livessl.core.methods import is_method, unknown_method
@@ -18,12 +19,19 @@ from livessl.errors import Fault
 from livessl.site.addresses import is_loopback
 from livessl.site.build.grid import search_grid
 from livessl.site.fields import Bounds
-from livessl.site.findings import Finding, Place, unknown_array
+from livessl.site.findings import unknown_array
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
+from livessl.site.place import Finding, Place
 
 COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
+
+HOT_C: Final = 50.0
+"""Temperature, in degrees Celsius, from which Fahrenheit is more likely: that of a cold room."""
+
+TALL_M: Final = 100.0
+"""Shortest edge of a room, in metres, from which centimetres are more likely."""
 
 MAX_GRID_POINTS: Final = 50_000_000
 """Most points of a grid. The search could handle more, but a grid point takes some tens of ns when an array joins."""
@@ -55,15 +63,17 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield from ((place, what) for what in _outside(site, bounds))
     for spec in site.specs:
         yield from ((("arrays", spec.name), what) for what in _array_faults(site, spec))
-    for name in {spec.name for spec in site.processed} & set(site.joint):
-        yield from ((("joint", name), what) for what in _coincident_members(site, site.joint[name]))
+    for one, other in combinations(site.specs, 2):
+        joint = next((name for name, members in site.joint.items() if {one.name, other.name} <= {*members}), None)
+        here: Place = ("arrays", other.name) if joint is None else ("joint", joint)
+        yield from ((here, what) for what in _coincident(one, other))
     yield from _grid_faults(site)
     yield from _node_faults(site)
 
 
 def warnings_of(site: Site) -> tuple[str, ...]:
     """Return warnings about settings that are valid but unlikely to work as expected."""
-    return (*_wide_arrays(site), *_privacy_gaps(site))
+    return (*_unlikely_values(site), *_wide_arrays(site), *_look_alikes(site), *_privacy_gaps(site))
 
 
 def unprotected_addresses(site: Site) -> list[Fault]:
@@ -114,24 +124,31 @@ def _array_faults(site: Site, spec: ArraySpec) -> Iterator[str]:
         if np.linalg.norm(positions[i] - positions[k]) < COINCIDENT_M:
             yield f"microphones {i + 1} and {k + 1} are at one place {_xyz(positions[i])}; correct one of them"
     size = np.array(site.room.size_m)
+    wide_m, most_m = spec.aperture_m, float(np.linalg.norm(size))
     outside = ((positions < 0) | (positions > size)).any(axis=1)
     if outside.any():
         k = int(outside.argmax())
         in_mm = bool(((positions >= 0) & (positions <= 1000 * size)).all() and (positions.max(axis=1) > 100).all())
+        in_mm |= most_m < wide_m <= 1000 * most_m
         cure = "give metres, not millimetres" if in_mm else "correct the array's position or room.size_m"
         yield f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; {cure}"
 
 
-def _coincident_members(site: Site, members: Sequence[str]) -> Iterator[str]:
-    for one, other in combinations(members, 2):
-        between_m = site.array(one).microphones_m[:, None] - site.array(other).microphones_m
-        distances_m = np.linalg.norm(between_m, axis=2)
-        if distances_m.min() < COINCIDENT_M:
-            i, k = np.unravel_index(distances_m.argmin(), distances_m.shape)
-            yield (
-                f"microphone {i + 1} of {one!r} and microphone {k + 1} of {other!r} are at one place "
-                f"{_xyz(site.array(one).microphones_m[i])}; correct one of them"
-            )
+def _coincident(one: ArraySpec, other: ArraySpec) -> Iterator[str]:
+    """Yield a fault if two arrays have microphones at one place."""
+    distances_m = np.linalg.norm(one.microphones_m[:, None] - other.microphones_m, axis=2)
+    if distances_m.min() >= COINCIDENT_M:
+        return
+    i, k = np.unravel_index(distances_m.argmin(), distances_m.shape)
+    if distances_m.shape[0] == distances_m.shape[1] and distances_m.min(axis=1).max() < COINCIDENT_M:
+        yield f"expected arrays at different places, {one.name!r} and {other.name!r} are both at " + (
+            f"{_xyz(one.centre_m)}; correct one of them"
+        )
+    else:
+        yield (
+            f"microphone {i + 1} of {one.name!r} and microphone {k + 1} of {other.name!r} are at one place "
+            f"{_xyz(one.microphones_m[i])}; correct one of them"
+        )
 
 
 def _grid_faults(site: Site) -> Iterator[Finding]:
@@ -206,6 +223,36 @@ def _wide_arrays(site: Site) -> Iterator[str]:
                 f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
                 f"wrong: lower the array's band_hz, or {cure}"
             )
+
+
+def _unlikely_values(site: Site) -> Iterator[str]:
+    """Yield a warning for values that are possible, but more likely in another unit, or copied."""
+    celsius = site.temperature_c
+    if celsius is not None and celsius >= HOT_C:
+        yield (
+            f"temperature_c: {celsius:g} degrees Celsius is unlikely, and a wrong temperature moves positions; did you "
+            f"mean {(celsius - 32) / 1.8:.1f}, from Fahrenheit?"
+        )
+    size_m = site.room.size_m
+    if min(size_m) >= TALL_M:
+        yield (
+            f"room.size_m: {' x '.join(f'{x:g}' for x in size_m)} m is unlikely; did you mean "
+            f"[{', '.join(f'{x / 100:g}' for x in size_m)}], from centimetres?"
+        )
+    for one, other in combinations(site.processed, 2):
+        apart_m = float(np.linalg.norm(one.centre_m - other.centre_m))
+        if apart_m < min(one.aperture_m, other.aperture_m) / 2.0:
+            yield (
+                f"arrays: {one.name!r} and {other.name!r} are {apart_m:.2f} m apart and measure one direction; "
+                "distances need arrays metres apart: correct one position, or join them (joint)"
+            )
+
+
+def _look_alikes(site: Site) -> Iterator[str]:
+    """Yield a warning if the arrays together cannot tell positions from their mirror images."""
+    found = mirror.warning(site.processed, search_grid(site), site.c_m_s)
+    if found is not None:
+        yield found
 
 
 def _privacy_gaps(site: Site) -> Iterator[str]:

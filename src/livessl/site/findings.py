@@ -10,12 +10,8 @@ import yaml
 from pydantic import BaseModel
 
 from livessl.errors import Fault
-
-Place = tuple[str | int, ...]
-"""Place in a file: keys and indices from the top down."""
-
-Finding = tuple[Place, str]
-"""A place in a file and the fault there, in one sentence."""
+from livessl.site.place import Finding, Place
+from livessl.site.slips import slip
 
 _SENTENCES: Final = {
     "missing": "missing; add it",
@@ -40,10 +36,36 @@ def read_yaml(text: str) -> Any:
     Raises
     ------
     yaml.YAMLError
-        If it is not YAML, or holds an impossible value such as the 45th of a month.
+        If it is not YAML, or holds an impossible value.
+    """
+    return value_of(nodes_of(text))
+
+
+def nodes_of(text: str) -> yaml.Node | None:
+    """Return the nodes of a YAML text, which have line numbers and duplicate keys; None for an empty text.
+
+    Raises
+    ------
+    yaml.YAMLError
+        If it is not YAML.
     """
     try:
-        return yaml.safe_load(text)
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except (ValueError, RecursionError) as error:  # the library's parser leaks these
+        raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
+
+
+def value_of(root: yaml.Node | None) -> Any:
+    """Return the value of the nodes of a YAML text; None for an empty text.
+
+    Raises
+    ------
+    yaml.YAMLError
+        If it holds an impossible value such as the 45th of a month.
+    """
+    loader = yaml.SafeLoader("")
+    try:
+        return None if root is None else loader.construct_document(root)
     except (ValueError, KeyError, AttributeError, RecursionError) as error:  # the library's constructors leak these
         raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
 
@@ -119,6 +141,9 @@ def reason(error: Exception) -> str:
 
 
 def _sentence(error: Mapping[str, Any]) -> str:
+    meant = slip(error)
+    if meant is not None:
+        return meant
     got = error.get("input")
     template = _SENTENCES.get(error["type"])
     if template is not None:

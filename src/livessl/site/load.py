@@ -13,16 +13,17 @@ from livessl.errors import ConfigError, Fault
 from livessl.site.build.arrays import build_site
 from livessl.site.checks import cross_faults, warnings_of
 from livessl.site.findings import (
-    Finding,
     Locator,
-    Place,
     duplicate_keys,
-    read_yaml,
+    nodes_of,
     reason,
     unknown_key,
     validation_findings,
+    value_of,
 )
 from livessl.site.models import Site, SiteFile
+from livessl.site.place import Finding, Place
+from livessl.site.slips import quote_keys
 
 
 def load_site(path: Path | str, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
@@ -71,10 +72,10 @@ def parse_site(
         With every fault found, each with its line.
     """
     try:
-        data = read_yaml(text)
-        # parsed a second time, to nodes: only they have line numbers and duplicate keys
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = nodes_of(text)
         locator = Locator(source, root)
+        slips = list(quote_keys(root))
+        data = value_of(root)
     except RecursionError as error:
         raise ConfigError([Fault(source, "not a site: an alias contains itself, or nesting is too deep")]) from error
     except yaml.YAMLError as error:
@@ -86,7 +87,7 @@ def parse_site(
     if joint and isinstance(data.setdefault("joint", {}), dict):
         data["joint"] |= {name: list(members) for name, members in joint.items()}
     site, findings = _checked(data, directory or Path())
-    findings = [*duplicate_keys(root), *findings]
+    findings = [*duplicate_keys(root), *slips, *findings]
     if site is None or findings:
         raise ConfigError([locator.fault(place, what) for place, what in findings])
     return site.model_copy(update={"warnings": warnings_of(site)})

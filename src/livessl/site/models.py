@@ -38,13 +38,22 @@ def _celsius(temperature_c: float) -> float:
     if -60 < temperature_c < 80:
         return temperature_c
     hint = f"; did you mean {(temperature_c - 32) / 1.8:.1f}, from Fahrenheit?" if 80 <= temperature_c <= 130 else ""
+    if 213.15 < temperature_c < 353.15:
+        hint = f"; did you mean {temperature_c - 273.15:.1f}, from kelvin?"
     raise ValueError(f"expected a temperature between -60 and 80 degrees Celsius, got {temperature_c:g}{hint}")
+
+
+def _metres(size_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    if min(size_m) < 1000:
+        return size_m
+    meant = ", ".join(f"{length / 1000:g}" for length in size_m)
+    raise ValueError(f"expected metres, got {list(size_m)}; did you mean [{meant}], from millimetres?")
 
 
 class Room(Model):
     """The room: a box with one corner at the origin."""
 
-    size_m: tuple[Positive, Positive, Positive]
+    size_m: Annotated[tuple[Positive, Positive, Positive], AfterValidator(_metres)]
 
 
 class GridConfig(Model):

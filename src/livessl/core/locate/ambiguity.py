@@ -15,7 +15,7 @@ from livessl.core.geometry import Grid
 from livessl.core.locate import refine
 from livessl.core.locate.confidence import NEAR_M, Rivals
 from livessl.core.locate.srp import SRPFunctional
-from livessl.core.mirror import described, look_alikes
+from livessl.core.mirror import CURE, described, look_alikes
 from livessl.core.types import ArraySpec, Candidate, FloatArray
 
 SAME_POWER: Final = 0.02
@@ -78,7 +78,7 @@ def reason(candidates: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: f
     more = f" and {len(candidates) - 4} more" if len(candidates) > 4 else ""
     return (
         f"{described(specs, c_m_s)}, so {others}{more} explain{'s' if len(candidates) == 2 else ''} the sound as well; "
-        "limit grid.bounds_m to one side, or tilt an array or raise a microphone"
+        f"{CURE}"
     )
 
 

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
 from typing import Final
 
 import numpy as np
 
+from livessl.core import mirror
 from livessl.core.types import FloatArray
 from livessl.lab.plan.design import SHARES, ArrayPlan, Plan
 from livessl.lab.plan.prediction import CLEARANCE_M
 from livessl.site.build.grid import search_grid
-
-FLAT_M: Final = 0.01
-"""Microphones count as coplanar if their RMS distance from the best-fitting plane is at most this, in metres."""
 
 IN_LINE_M: Final = 0.3
 """Arrays count as collinear if their RMS distance from the best-fitting line is at most this, in metres."""
@@ -54,20 +51,9 @@ def _together(plan: Plan) -> Iterator[str]:
             "all arrays stand in one line: the distance of a sound beyond either end of that line is poorly "
             "determined; move one array metres to the side"
         )
-    microphones = np.concatenate([array.spec.microphones_m for array in plan.arrays])
-    if _scatter_m(microphones)[2] < FLAT_M and _searched_on_both_sides(plan, microphones):
-        yield (
-            "all microphones lie in one plane: a position and its mirror image cannot be distinguished, and the error "
-            "above does not include that; raise a microphone, tilt an array, or let grid.bounds_m end at the plane"
-        )
-
-
-def _searched_on_both_sides(plan: Plan, microphones_m: FloatArray) -> bool:
-    grid, middle = search_grid(plan.site), microphones_m.mean(axis=0)
-    normal = np.linalg.svd(microphones_m - middle)[2][2]
-    corners = np.array(list(product(*grid.bounds_m)))
-    height = (corners - middle) @ normal
-    return bool(height.min() < -grid.spacing_m and height.max() > grid.spacing_m)
+    mirrored = mirror.warning(plan.site.specs, search_grid(plan.site), plan.site.c_m_s)
+    if mirrored is not None:
+        yield f"{mirrored}; the error above does not include that"
 
 
 def _scatter_m(points_m: FloatArray) -> FloatArray:

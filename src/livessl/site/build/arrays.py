@@ -13,8 +13,9 @@ from livessl.core.geometry import as_positions_m, circle, line, posed, speed_of_
 from livessl.core.joint_array import joined
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.errors import ConfigError, Fault
-from livessl.site.findings import Finding, Place, dotted, read_yaml, reason, unknown_array, validation_findings
+from livessl.site.findings import dotted, read_yaml, reason, unknown_array, validation_findings
 from livessl.site.models import ArrayConfig, GeometryFile, Orientation, Shape, Site, SiteFile
+from livessl.site.place import Finding, Place
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 """Speed of sound in m/s where the site file gives neither speed nor temperature: that of air at 20 degrees Celsius."""
