@@ -1,7 +1,8 @@
 """Groups of arguments that kernels take by name, and the constants that kernels share.
 
 In all kernels L is the number of lags, P of an array's pairs, A of arrays, M of their microphones together, R of rows
-(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest.
+(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest. Of a cube with stride s
+only the points `corner + n s + s // 2` along each axis are examined, n = 0, 1, …; at the grid's end it is the last one.
 """
 
 from __future__ import annotations
@@ -105,6 +106,10 @@ class SearchCells(NamedTuple):
     """
 
     axes: Axes
+    corners: IntArray
+    """First grid point of each of T cubes along x, y and z: (T, 3)."""
+    strides: IntArray
+    """Distance between neighbouring points of each cube, in grid points: (T,)."""
     edge: int
     """Points along the edge of a cell."""
     per_cube: int

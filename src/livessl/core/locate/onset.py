@@ -115,11 +115,8 @@ class Onset(MapEstimator):
             covariance_m2=answer.judgement.covariance_m2,
             confidence=answer.judgement.features.confidence,
             evidence=answer.evidence,
-            proven=place.proven,
             features=answer.judgement.features,
-            refused=(
-                answer.refused if place.proven else "no place stands out: the search was stopped before it was complete"
-            ),
+            refused=answer.refused,
             outliers=answer.consensus.outliers,
             unneeded=sounds.keys() - strongest.keys(),
             others=others,
