@@ -13,10 +13,10 @@ import numpy as np
 
 from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray, RealArray, UInt16Array
 
-BLOCKS: Final = 256
+BLOCKS: Final = 512
 """Most blocks into which a lag axis is divided for the bounds of the search."""
 
-RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(6) for q in (4, 5, 6, 7)), BLOCKS])
+RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(7) for q in (4, 5, 6, 7)), BLOCKS])
 """Lengths, in blocks, of the runs whose maxima are kept: none is more than a quarter longer than the one before."""
 
 NO_LAG: Final = 65535
@@ -126,6 +126,6 @@ class SearchBounds(NamedTuple):
     of_cubes: Float32Array
     """Bounds of the cubes: (T,)."""
     of_cells: Float32Array
-    """Bounds of the cells of each cube: (T, per_cube^3)."""
+    """Bounds of what the arrays from each on add in the cells of each cube: (T, per_cube^3, A + 1)."""
     known: BoolArray
     """Cubes whose cells' bounds are known: (T,)."""

@@ -122,6 +122,31 @@ def upper_bounds(maxima: Float32Array, places: UInt16Array, rows: SearchRows, bo
         bound += weight * total
 
 
+def bounds_of_rest(
+    maxima: Float32Array, places: UInt16Array, rows: SearchRows, rounding: np.float32, bound: Float32Array
+) -> None:
+    """Bound what the arrays from each on add to the power of the points of some cells.
+
+    Parameters
+    ----------
+    maxima : (R, levels * `BLOCKS`) float32
+        `running_maxima` of the rows.
+    places : (site's pairs, C) uint16
+        As in `upper_bounds`.
+    rows : SearchRows
+    rounding : float32
+        Largest difference between sums of the same powers of arrays in different orders; every bound includes it.
+    bound : (C, A + 1) float32
+        Output: bounds of the arrays from the first on, from the second on, …, and of none.
+    """
+    bound[:, -1] = rounding
+    for a in range(len(rows.weight) - 1, -1, -1):
+        total = np.zeros(len(bound), dtype=np.float32)
+        for r in range(rows.first_row[a], rows.first_row[a + 1]):
+            total += maxima[r, places[rows.site_pair[r]]]
+        bound[:, a] = bound[:, a + 1] + rows.weight[a] * total
+
+
 def highest(
     values: Float32Array,
     maxima: Float32Array,
@@ -157,8 +182,7 @@ def highest(
     power : float
         -inf if there is no point outside the boxes.
     """
-    del rounding  # sums run in one order here
-    search = _Search(values, maxima, rows, cells, bounds, boxes)
+    search = _Search(values, maxima, rows, cells, bounds, boxes, rounding)
     search.run()
     return search.best_point, float(search.best)
 
@@ -174,6 +198,7 @@ class _Search:
         cells: SearchCells,
         bounds: SearchBounds,
         boxes: IntArray,
+        rounding: np.float32,
     ) -> None:
         self._values = values
         self._maxima = maxima
@@ -181,6 +206,7 @@ class _Search:
         self._cells = cells
         self._bounds = bounds
         self._boxes = boxes
+        self._rounding = rounding
         self._shape = tuple(len(axis_m) for axis_m in cells.axes)
         self._halves = cells.leaf_places.shape[2] > 0
         self._leaf_edge = cells.edge // 2 if self._halves else cells.edge
@@ -197,12 +223,13 @@ class _Search:
         while (chosen := cubes.take(self.best, self.best_point)) is not None:
             which, first, stride = chosen
             for cube in which[~known[which]]:
-                upper_bounds(self._maxima, self._cells.cell_places[cube], self._rows, of_cells[cube])
+                places = self._cells.cell_places[cube]
+                bounds_of_rest(self._maxima, places, self._rows, self._rounding, of_cells[cube])
                 known[cube] = True
             children = (which[:, None] * per_cube**3 + np.arange(per_cube**3)).ravel()
             firsts = (first[:, None] + inner * stride[:, None, None]).reshape(-1, 3)
             strides = np.repeat(stride, per_cube**3)
-            self._examine(self._promising(children, firsts, strides, edge, of_cells[which].ravel()))
+            self._examine(self._promising(children, firsts, strides, edge, of_cells[which, :, 0].ravel()))
 
     def _examine(self, cells: _InOrder) -> None:
         """Examine all cells that may hold a better point."""

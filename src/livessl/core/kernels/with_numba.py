@@ -267,6 +267,23 @@ def upper_bounds(maxima, places, rows, bound):  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def bounds_of_rest(maxima, places, rows, rounding, bound):  # type: ignore[no-untyped-def]
+    """Bound what the arrays from each on add to the power of the points of some cells."""
+    site_pair, first_row, weight = rows.site_pair, rows.first_row, rows.weight
+    cells, arrays = len(bound), len(weight)
+    total = np.empty(cells, np.float32)
+    bound[:, arrays] = rounding
+    for a in range(arrays - 1, -1, -1):
+        total[:] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            p = site_pair[r]
+            for c in range(cells):
+                total[c] += maxima[r, places[p, c]]
+        for c in range(cells):
+            bound[c, a] = bound[c, a + 1] + weight[a] * total[c]
+
+
+@_compiled
 def _covered(first, extent, shape, boxes):  # type: ignore[no-untyped-def]
     """Whether a cube of grid points lies wholly in one of the boxes."""
     for box in boxes:
@@ -281,12 +298,12 @@ def _covered(first, extent, shape, boxes):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _best_of_leaf(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    first, stride, edge, axes, rows, values, boxes, left, rounding, best, best_point, scratch
+    first, stride, edge, axes, rows, values, boxes, rest, best, best_point, scratch
 ):
     """Find the best point of one leaf, if it is better than the best so far.
 
-    `left` are bounds of what the arrays from each on, (A + 1,), can add: as soon as they cannot make up for what is
-    missing, the other arrays are skipped.
+    `rest` (A + 1,) bounds what the arrays from each on add: the others are skipped once they cannot make up for what is
+    missing.
     """
     x_m, y_m, z_m = axes
     distance, total, power = scratch
@@ -321,7 +338,7 @@ def _best_of_leaf(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
         for n in range(count):
             power[n] += weight * total[n]
             highest = max(highest, power[n])
-        if highest + left[a + 1] < best - rounding:
+        if highest + rest[a + 1] < best:
             return best, best_point
     for n in range(count):
         if power[n] >= best:
@@ -337,22 +354,14 @@ def _best_of_leaf(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 @_compiled
 def _best_of_cell(  # type: ignore[no-untyped-def]
-    first, cube, cell, values, maxima, rows, cells, boxes, rounding, best, best_point, parts, left, scratch
+    first, cube, cell, values, maxima, rows, cells, boxes, rest, best, best_point, parts, rest_of_half, scratch
 ):
     """Find the best point of one cell, if it is better than the best so far."""
     stride, site_pair, first_row, weight = cells.strides[cube], rows.site_pair, rows.first_row, rows.weight
-    places = cells.cell_places[cube]
     count = len(weight)
-    left[count] = np.float32(0.0)
-    for a in range(count - 1, -1, -1):
-        total = np.float32(0.0)
-        for r in range(first_row[a], first_row[a + 1]):
-            total += maxima[r, places[site_pair[r], cell]]
-        left[a] = left[a + 1] + weight[a] * total
-    halves = cells.leaf_places.shape[2]
-    if halves == 0:
+    if cells.leaf_places.shape[2] == 0:
         return _best_of_leaf(
-            first, stride, cells.edge, cells.axes, rows, values, boxes, left, rounding, best, best_point, scratch
+            first, stride, cells.edge, cells.axes, rows, values, boxes, rest, best, best_point, scratch
         )
     bound, total = parts[count], parts[count + 1]
     bound[:] = np.float32(0.0)
@@ -360,17 +369,18 @@ def _best_of_cell(  # type: ignore[no-untyped-def]
     for a in range(count):
         total[:] = np.float32(0.0)
         for r in range(first_row[a], first_row[a + 1]):
-            row, of_halves = maxima[r], places[site_pair[r]]
+            p = site_pair[r]
             for h in range(8):
-                total[h] += row[of_halves[h]]
+                total[h] += maxima[r, places[p, h]]
         highest = np.float32(-np.inf)
         for h in range(8):
             parts[a, h] = weight[a] * total[h]
             bound[h] += parts[a, h]
             highest = max(highest, bound[h])
-        if highest + left[a + 1] < best - rounding:
+        if highest + rest[a + 1] < best:
             return best, best_point
     shape, edge = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2])), cells.edge // 2
+    rest_of_half[count] = rest[count]
     while True:
         h = np.argmax(bound)
         if bound[h] < best or bound[h] == -np.inf:
@@ -381,9 +391,9 @@ def _best_of_cell(  # type: ignore[no-untyped-def]
         if corner[0] >= shape[0] or corner[1] >= shape[1] or corner[2] >= shape[2]:
             continue
         for a in range(count - 1, -1, -1):
-            left[a] = left[a + 1] + parts[a, h]
+            rest_of_half[a] = rest_of_half[a + 1] + parts[a, h]
         best, best_point = _best_of_leaf(
-            corner, stride, edge, cells.axes, rows, values, boxes, left, rounding, best, best_point, scratch
+            corner, stride, edge, cells.axes, rows, values, boxes, rest_of_half, best, best_point, scratch
         )
 
 
@@ -403,7 +413,7 @@ def highest(values, maxima, rows, cells, bounds, boxes, rounding):  # type: igno
         np.empty(leaf, np.float32),
         np.empty(leaf, np.float32),
     )
-    parts, left = np.empty((arrays + 2, 8), np.float32), np.empty(arrays + 1, np.float32)
+    parts, rest = np.empty((arrays + 2, 8), np.float32), np.empty(arrays + 1, np.float32)
     best, best_point = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
     opened, waiting = np.empty(len(of_cubes), np.int64), np.empty((len(of_cubes), per_cube**3), np.float32)
     count = 0
@@ -419,6 +429,7 @@ def highest(values, maxima, rows, cells, bounds, boxes, rounding):  # type: igno
             if turn == 2:
                 for cube in order:
                     top = max(top, waiting[cube].max())
+        share = np.float32(1 + _PASSES - turn) / np.float32(_PASSES)
         for cube in order:
             if turn < 2:
                 if of_cubes[cube] < best:
@@ -428,17 +439,15 @@ def highest(values, maxima, rows, cells, bounds, boxes, rounding):  # type: igno
                 ):
                     continue
                 if not known[cube]:
-                    upper_bounds(maxima, cells.cell_places[cube], rows, of_cells[cube])
+                    bounds_of_rest(maxima, cells.cell_places[cube], rows, rounding, of_cells[cube])
                     known[cube] = True
                 opened[count] = cube
                 count += 1
-                waiting[cube] = of_cells[cube]
-            one = turn == 1
+                waiting[cube] = of_cells[cube, :, 0]
             while True:
                 cell = np.argmax(waiting[cube])
                 bound = waiting[cube, cell]
-                share = np.float32(_PASSES + 1 - turn) / np.float32(_PASSES)
-                threshold = best if turn < 2 or best == -np.inf else best + share * max(top - best, np.float32(0.0))
+                threshold = best if turn < 2 else best + share * max(top - best, np.float32(0.0))
                 if bound < threshold or bound == -np.inf:
                     break
                 waiting[cube, cell] = -np.inf
@@ -455,8 +464,9 @@ def highest(values, maxima, rows, cells, bounds, boxes, rounding):  # type: igno
                 if _covered(first, step, shape, boxes):
                     continue
                 best, best_point = _best_of_cell(
-                    first, cube, cell, values, maxima, rows, cells, boxes, rounding, best, best_point, parts, left, scratch
-                )
-                if one:
+                    first, cube, cell, values, maxima, rows, cells, boxes, of_cells[cube, cell], best, best_point,
+                    parts, rest, scratch,
+                )  # fmt: skip
+                if turn == 1:
                     break
     return best_point, best

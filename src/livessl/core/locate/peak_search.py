@@ -78,12 +78,8 @@ class PeakSearch:
             leaf_places=np.zeros((count * children, total, 8 if self._halves else 0), np.uint16),
         )
         self._cube_places = np.zeros((total, count), np.uint16)
-        self._bounds = SearchBounds(
-            of_cubes=np.zeros(count, np.float32),
-            of_cells=np.zeros((count, children), np.float32),
-            known=np.zeros(count, np.bool_),
-        )
-        self._values, self._maxima = _Buffer(), _Buffer()
+        self._of_cubes, self._known = np.zeros(count, np.float32), np.zeros(count, np.bool_)
+        self._values, self._maxima, self._of_cells = _Buffer(), _Buffer(), _Buffer()
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Among] = {}
 
@@ -144,8 +140,10 @@ class PeakSearch:
             count = part.gcc.values.shape[1]
             values[own, :count], values[own, count:] = part.gcc.values, 0.0
         kernels.running_maxima(values, among.block, maxima)
-        kernels.upper_bounds(maxima, self._cube_places, rows, self._bounds.of_cubes)
-        self._bounds.known[:] = False
+        kernels.upper_bounds(maxima, self._cube_places, rows, self._of_cubes)
+        self._known[:] = False
+        of_cells = self._of_cells.of(len(self._known) * CELLS_PER_CUBE**3, len(evidence) + 1)
+        bounds = SearchBounds(self._of_cubes, of_cells.reshape(len(self._known), -1, len(evidence) + 1), self._known)
         greatest = np.abs(values).max(axis=1)
         rounding = np.float32(_ROUNDING * (np.add.reduceat(greatest, rows.first_row[:-1]) @ rows.weight))
 
@@ -154,7 +152,7 @@ class PeakSearch:
             found: list[Peak] = []
             for _ in range(count):
                 left_out = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
-                point, power = kernels.highest(values, maxima, rows, self._cells, self._bounds, left_out, rounding)
+                point, power = kernels.highest(values, maxima, rows, self._cells, bounds, left_out, rounding)
                 if power == -np.inf:
                     break
                 stride = self._cubes.stride_at(np.array(np.unravel_index(point, self._grid.shape)))
