@@ -117,11 +117,16 @@ def test_both_kinds_of_kernels_give_the_same_cell_intervals() -> None:
     axes = tuple(np.arange(count, dtype=np.float32) * np.float32(0.11) for count in (7, 9, 5))
     microphones_m = np.random.default_rng(0).uniform(0.0, 1.0, (4, 3)).astype(np.float32)
     pairs = microphone_pairs(4).astype(np.int32)
+    corners, strides = np.array([[0, 0, 0], [0, 4, 0], [4, 0, 4]]), np.array([1, 2, 1])
+    places = np.float32(300.0), np.float32(500.5)
     ends = []
     for kernels in (with_numba, with_numpy):
-        low, high = np.empty((2, len(pairs), 4 * 5 * 3), np.uint16)
-        kernels.cell_intervals(axes, microphones_m, pairs, np.float32(300.0), np.float32(500.5), 2, low, high)
-        assert (low <= high).all()
+        low, high = np.empty((2, len(pairs), 3, 8), np.uint16)
+        kernels.cell_intervals(axes, corners, strides, 2, 2, microphones_m, pairs, *places, low, high)
+        without = low == NO_LAG
+        assert (high[without] == 0).all()
+        assert without.any()
+        assert (low <= high)[~without].all()
         assert (low < high).any()
         assert high.max() < NO_LAG
         ends.append((low, high))

@@ -160,18 +160,6 @@ def test_arrays_of_different_rates_and_subsets_of_arrays(kernels: ModuleType) ->
         assert [found.point, found.power] == [int(power.argmax()), float(power.max())]
 
 
-def test_a_search_that_gives_up_is_not_proven(kernels: ModuleType) -> None:
-    grid = Grid(ROOM, 0.1)
-    evidence = sounds(arrays(6, 3), "noise", 3)
-    searched = searching(evidence, grid)
-    (whole,) = searched.among(evidence)(1)
-    (some,) = searched.among(evidence, most_look_ups=20_000)(1)
-    assert whole.proven
-    assert not some.proven
-    assert some.power <= whole.power
-    assert some.power == fused_map(evidence, grid)[some.point]
-
-
 def test_memory_does_not_grow_with_the_grid() -> None:
     specs = arrays(2, 2)
     coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.05, 0.01))

@@ -1,7 +1,8 @@
 """Groups of arguments that kernels take by name, and the constants that kernels share.
 
 In all kernels L is the number of lags, P of an array's pairs, A of arrays, M of their microphones together, R of rows
-(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest.
+(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest. Of a cube with stride s
+only the points `corner + n s + s // 2` along each axis are examined, n = 0, 1, …; at the grid's end it is the last one.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ import numpy as np
 
 from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray, RealArray, UInt16Array
 
-BLOCKS: Final = 256
+BLOCKS: Final = 512
 """Most blocks into which a lag axis is divided for the bounds of the search."""
 
-RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(6) for q in (4, 5, 6, 7)), BLOCKS])
+RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(7) for q in (4, 5, 6, 7)), BLOCKS])
 """Lengths, in blocks, of the runs whose maxima are kept: none is more than a quarter longer than the one before."""
 
 NO_LAG: Final = 65535
@@ -105,6 +106,10 @@ class SearchCells(NamedTuple):
     """
 
     axes: Axes
+    corners: IntArray
+    """First grid point of each of T cubes along x, y and z: (T, 3)."""
+    strides: IntArray
+    """Distance between neighbouring points of each cube, in grid points: (T,)."""
     edge: int
     """Points along the edge of a cell."""
     per_cube: int
@@ -121,6 +126,6 @@ class SearchBounds(NamedTuple):
     of_cubes: Float32Array
     """Bounds of the cubes: (T,)."""
     of_cells: Float32Array
-    """Bounds of the cells of each cube: (T, per_cube^3)."""
+    """Bounds of what the arrays from each on add in the cells of each cube: (T, per_cube^3, A + 1)."""
     known: BoolArray
     """Cubes whose cells' bounds are known: (T,)."""

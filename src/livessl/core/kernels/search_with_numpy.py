@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.kernels.arguments import BLOCKS, RUNS, Axes, SearchBounds, SearchCells, SearchRows
-from livessl.core.types import Float32Array, IntArray, UInt16Array
+from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, Axes, SearchBounds, SearchCells, SearchRows
+from livessl.core.types import BoolArray, Float32Array, IntArray, UInt16Array
 
 _SLAB_POINTS: Final = 1 << 15
 """Grid points whose distances are computed at once: as many as fit the second-level cache."""
@@ -35,43 +35,47 @@ def lag_places(
 
 def cell_intervals(
     axes: Axes,
+    corners: IntArray,
+    strides: IntArray,
+    edge: int,
+    along: int,
     microphones_m: Float32Array,
     pairs: IntArray,
     scale: np.float32,
     offset: np.float32,
-    edge: int,
     low: UInt16Array,
     high: UInt16Array,
 ) -> None:
-    """Find the lowest and highest lag of every pair of one array over the points of every cell.
+    """Find the lowest and highest lag of every pair of one array over the points of every cell of some cubes.
 
     Parameters
     ----------
     axes : three of (n,) float32
         The grid's axes.
+    corners, strides : (T, 3) int64, (T,) int64
+        The cubes, as in `SearchCells`.
+    edge : int
+        Points along the edge of a cell.
+    along : int
+        Cells along the edge of a cube.
     microphones_m : (K, 3) float32
     pairs : (P, 2) int32
     scale, offset : float32
         From a difference of distances, in metres, to a place on the lag axis.
-    edge : int
-        Points along the edge of a cell.
-    low, high : (P, C) uint16
-        Output; the cells in the grid's order, z fastest.
+    low, high : (P, T, along^3) uint16
+        Output: `NO_LAG` and 0 for cells without points.
     """
-    x_m, y_m, z_m = axes
-    step = max(1, _SLAB_POINTS // (len(y_m) * len(z_m) * edge)) * edge
-    cells_yz = -(-len(y_m) // edge) * -(-len(z_m) // edge)
-    for first in range(0, len(x_m), step):
-        slab = x_m[first : first + step]
-        points_m = np.stack([part.ravel() for part in np.meshgrid(slab, y_m, z_m, indexing="ij")], axis=1)
+    inner = _corners(along * edge)
+    step = max(1, _SLAB_POINTS // len(inner))
+    for first in range(0, len(corners), step):
+        some = slice(first, first + step)
+        at, inside = _points_of(corners[some, None], strides[some, None], inner, tuple(map(len, axes)))
+        points_m = np.stack([axis_m[at[..., axis].ravel()] for axis, axis_m in enumerate(axes)], axis=1)
         place = lag_places(points_m, microphones_m, pairs, scale, offset)
-        place = place.reshape(len(pairs), len(slab), len(y_m), len(z_m))
-        cells = slice(first // edge * cells_yz, (first // edge + -(-len(slab) // edge)) * cells_yz)
-        for extreme, out in ((np.minimum, low), (np.maximum, high)):
-            reduced = place
-            for axis in (1, 2, 3):
-                reduced = extreme.reduceat(reduced, np.arange(0, reduced.shape[axis], edge), axis=axis)
-            out[:, cells] = reduced.reshape(len(pairs), -1)
+        place = place.reshape(len(pairs), *inside.shape)
+        for extreme, out, without in ((np.min, low, NO_LAG), (np.max, high, 0)):
+            split = np.where(inside, place, without).reshape(*place.shape[:2], *(n for _ in range(3) for n in (along, edge)))
+            out[:, some] = extreme(split, axis=(3, 5, 7)).reshape(*place.shape[:2], -1)
 
 
 def running_maxima(values: Float32Array, block: IntArray, maxima: Float32Array) -> None:
@@ -118,6 +122,31 @@ def upper_bounds(maxima: Float32Array, places: UInt16Array, rows: SearchRows, bo
         bound += weight * total
 
 
+def bounds_of_rest(
+    maxima: Float32Array, places: UInt16Array, rows: SearchRows, rounding: np.float32, bound: Float32Array
+) -> None:
+    """Bound what the arrays from each on add to the power of the points of some cells.
+
+    Parameters
+    ----------
+    maxima : (R, levels * `BLOCKS`) float32
+        `running_maxima` of the rows.
+    places : (site's pairs, C) uint16
+        As in `upper_bounds`.
+    rows : SearchRows
+    rounding : float32
+        Largest difference between sums of the same powers of arrays in different orders; every bound includes it.
+    bound : (C, A + 1) float32
+        Output: bounds of the arrays from the first on, from the second on, …, and of none.
+    """
+    bound[:, -1] = rounding
+    for a in range(len(rows.weight) - 1, -1, -1):
+        total = np.zeros(len(bound), dtype=np.float32)
+        for r in range(rows.first_row[a], rows.first_row[a + 1]):
+            total += maxima[r, places[rows.site_pair[r]]]
+        bound[:, a] = bound[:, a + 1] + rows.weight[a] * total
+
+
 def highest(
     values: Float32Array,
     maxima: Float32Array,
@@ -125,8 +154,8 @@ def highest(
     cells: SearchCells,
     bounds: SearchBounds,
     boxes: IntArray,
-    most_look_ups: int,
-) -> tuple[int, float, bool]:
+    rounding: np.float32,
+) -> tuple[int, float]:
     """Find the highest grid point outside some boxes, exactly as in the whole map, by branch and bound.
 
     Cubes of cells are examined in the order of their bounds, and of their cells those whose bound reaches the best
@@ -144,25 +173,22 @@ def highest(
         Those of cells are filled in as they become known.
     boxes : (E, 3, 2) int64
         First and last point along each axis of boxes that are left out.
-    most_look_ups : int
-        Look-ups after which the search gives up: where nothing stands out and many arrays take part, hardly any cell
-        can be skipped.
+    rounding : float32
+        Largest difference between sums of the same powers of arrays in different orders.
 
     Returns
     -------
     point : int
     power : float
         -inf if there is no point outside the boxes.
-    proven : bool
-        Whether no point is higher; otherwise it is the best of those examined.
     """
-    search = _Search(values, maxima, rows, cells, bounds, boxes, most_look_ups)
-    proven = search.run()
-    return search.best_point, float(search.best), proven
+    search = _Search(values, maxima, rows, cells, bounds, boxes, rounding)
+    search.run()
+    return search.best_point, float(search.best)
 
 
 class _Search:
-    """One search: the best point so far, and the look-ups spent."""
+    """One search: the best point so far."""
 
     def __init__(
         self,
@@ -172,7 +198,7 @@ class _Search:
         cells: SearchCells,
         bounds: SearchBounds,
         boxes: IntArray,
-        most_look_ups: int,
+        rounding: np.float32,
     ) -> None:
         self._values = values
         self._maxima = maxima
@@ -180,63 +206,49 @@ class _Search:
         self._cells = cells
         self._bounds = bounds
         self._boxes = boxes
-        self._most_look_ups = most_look_ups
+        self._rounding = rounding
         self._shape = tuple(len(axis_m) for axis_m in cells.axes)
         self._halves = cells.leaf_places.shape[2] > 0
         self._leaf_edge = cells.edge // 2 if self._halves else cells.edge
-        self._spent = 0
         self.best = np.float32(-np.inf)
         self.best_point = int(np.prod(self._shape))
 
-    @property
-    def _gives_up(self) -> bool:
-        return self._spent > self._most_look_ups and bool(self.best > -np.inf)
-
-    def run(self) -> bool:
-        """Examine cubes; return whether the search came to its end."""
+    def run(self) -> None:
+        """Examine cubes."""
         per_cube, edge = self._cells.per_cube, self._cells.edge
         of_cubes, of_cells, known = self._bounds
         inner = _corners(per_cube) * edge
-        cube_counts = tuple(-(-n // (per_cube * edge)) for n in self._shape)
         every = np.arange(len(of_cubes))
-        corners = np.stack(np.unravel_index(every, cube_counts), axis=1) * (per_cube * edge)
-        cubes = self._promising(every, corners, per_cube * edge, of_cubes)
+        cubes = self._promising(every, self._cells.corners, self._cells.strides, per_cube * edge, of_cubes)
         while (chosen := cubes.take(self.best, self.best_point)) is not None:
-            which, first = chosen
+            which, first, stride = chosen
             for cube in which[~known[which]]:
-                if self._gives_up:
-                    return False
-                self._spent += per_cube**3 * len(self._rows.site_pair)
-                upper_bounds(self._maxima, self._cells.cell_places[cube], self._rows, of_cells[cube])
+                places = self._cells.cell_places[cube]
+                bounds_of_rest(self._maxima, places, self._rows, self._rounding, of_cells[cube])
                 known[cube] = True
             children = (which[:, None] * per_cube**3 + np.arange(per_cube**3)).ravel()
-            firsts = (first[:, None] + inner).reshape(-1, 3)
-            if not self._examine(self._promising(children, firsts, edge, of_cells[which].ravel())):
-                return False
-        return True
+            firsts = (first[:, None] + inner * stride[:, None, None]).reshape(-1, 3)
+            strides = np.repeat(stride, per_cube**3)
+            self._examine(self._promising(children, firsts, strides, edge, of_cells[which, :, 0].ravel()))
 
-    def _examine(self, cells: _InOrder) -> bool:
-        """Examine cells; return whether all of them that may hold a better point were examined."""
-        rows = len(self._rows.site_pair)
+    def _examine(self, cells: _InOrder) -> None:
+        """Examine all cells that may hold a better point."""
         halves = _corners(2) * self._leaf_edge
         inmost = _corners(self._leaf_edge)
         bound = np.empty((_CELLS_AT_ONCE, 8), dtype=np.float32)
         while (chosen := cells.take(self.best, self.best_point)) is not None:
-            if self._gives_up:
-                return False
-            which, first = chosen
+            which, first, stride = chosen
             if self._halves:
                 for number, cell in enumerate(which):
                     upper_bounds(self._maxima, self._cells.leaf_places[cell], self._rows, bound[number])
-                self._spent += bound[: len(which)].size * rows
-                first = (first[:, None] + halves)[bound[: len(which)] >= self.best]
-            self._spent += len(first) * len(inmost) * rows
-            self._compare((first[:, None] + inmost).reshape(-1, 3))
-        return True
+                left = bound[: len(which)] >= self.best
+                first = (first[:, None] + halves * stride[:, None, None])[left]
+                stride = np.repeat(stride, left.sum(axis=1))
+            at, inside = _points_of(first[:, None], stride[:, None], inmost, self._shape)
+            self._compare(at[inside])
 
     def _compare(self, at: IntArray) -> None:
         """Compare points, given by their indices (N, 3), with the best one."""
-        at = at[(at < self._shape).all(axis=1)]
         for box in self._boxes:
             at = at[~((at >= box[:, 0]) & (at <= box[:, 1])).all(axis=1)]
         points_m = np.stack([axis_m[at[:, axis]] for axis, axis_m in enumerate(self._cells.axes)], axis=1)
@@ -247,9 +259,11 @@ class _Search:
             self.best_point = point if peak > self.best else min(point, self.best_point)
             self.best = peak
 
-    def _promising(self, which: IntArray, first: IntArray, points: int, bound: Float32Array) -> _InOrder:
+    def _promising(
+        self, which: IntArray, first: IntArray, stride: IntArray, points: int, bound: Float32Array
+    ) -> _InOrder:
         """Put cubes with `points` along an edge in the order of their bounds, without those that cannot be best."""
-        last = np.minimum(first + points, self._shape) - 1
+        last = np.minimum(first + points * stride[:, None], self._shape) - 1
         out = (first >= self._shape).any(axis=1)
         for box in self._boxes:
             out |= ((first >= box[:, 0]) & (last <= box[:, 1])).all(axis=1)
@@ -257,7 +271,7 @@ class _Search:
         order = np.argsort(-bound, kind="stable")
         order = order[(bound[order] > -np.inf) & (bound[order] >= self.best)]
         corner = np.ravel_multi_index(tuple(first[order].T), self._shape)
-        return _InOrder(which[order], first[order], bound[order], corner)
+        return _InOrder(which[order], first[order], stride[order], bound[order], corner)
 
 
 @dataclass
@@ -266,12 +280,13 @@ class _InOrder:
 
     which: IntArray
     first: IntArray
+    stride: IntArray
     bound: Float32Array
     corner: IntArray
     _done: int = 0
     _some: int = 1
 
-    def take(self, best: np.float32, best_point: int) -> tuple[IntArray, IntArray] | None:
+    def take(self, best: np.float32, best_point: int) -> tuple[IntArray, IntArray, IntArray] | None:
         """Take the next ones that may hold a point better than the best, or an equal one before it; None at the end."""
         while self._done < len(self.which) and self.bound[self._done] >= best:
             now = slice(self._done, self._done + self._some)
@@ -279,8 +294,16 @@ class _InOrder:
             bound, corner = self.bound[now], self.corner[now]
             may_hold = (bound > best) | ((bound == best) & (corner < best_point))
             if may_hold.any():
-                return self.which[now][may_hold], self.first[now][may_hold]
+                return self.which[now][may_hold], self.first[now][may_hold], self.stride[now][may_hold]
         return None
+
+
+def _points_of(
+    first: IntArray, stride: IntArray, inner: IntArray, shape: tuple[int, ...]
+) -> tuple[IntArray, BoolArray]:
+    """Points of cells that begin at `first` (..., 3), and which of them are inside the grid."""
+    begin = first + inner * stride[..., None]
+    return np.minimum(begin + stride[..., None] // 2, np.array(shape) - 1), (begin < shape).all(axis=-1)
 
 
 def _corners(count: int) -> IntArray:

@@ -14,36 +14,52 @@ from livessl.core.kernels.jit import jit
 
 NAME: Final = "numba"
 
+_PASSES: Final = 4
+"""Passes in which the cells that are left are examined, from the highest bounds down."""
+
 _compiled = jit(error_model="numpy")
 
 
 @_compiled
-def cell_intervals(axes, microphones_m, pairs, scale, offset, edge, low, high):  # type: ignore[no-untyped-def]
-    """Find the lowest and highest lag of every pair over the points of every cell."""
+def cell_intervals(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    axes, corners, strides, edge, along, microphones_m, pairs, scale, offset, low, high
+):
+    """Find the lowest and highest lag of every pair over the points of every cell of some cubes."""
     x_m, y_m, z_m = axes
-    n_x, n_y, n_z = len(x_m), len(y_m), len(z_m)
-    cells_y, cells_z = -(-n_y // edge), -(-n_z // edge)
-    distance = np.empty((len(microphones_m), n_z), np.float32)
+    points = edge * along
+    distance = np.empty((len(microphones_m), points * points), np.float32)
+    lag = np.empty(points * points, np.int32)
     low[:] = NO_LAG
     high[:] = 0
-    for x in range(n_x):
-        for y in range(n_y):
-            first = (x // edge * cells_y + y // edge) * cells_z
+    for t in range(len(corners)):
+        stride = strides[t]
+        n_x = min(points, -(-(len(x_m) - corners[t, 0]) // stride))
+        n_y = min(points, -(-(len(y_m) - corners[t, 1]) // stride))
+        n_z = min(points, -(-(len(z_m) - corners[t, 2]) // stride))
+        for x in range(n_x):
+            at_x = x_m[min(corners[t, 0] + x * stride + stride // 2, len(x_m) - 1)]
             for m in range(len(microphones_m)):
-                d_x, d_y, at_z = x_m[x] - microphones_m[m, 0], y_m[y] - microphones_m[m, 1], microphones_m[m, 2]
-                flat = d_x * d_x + d_y * d_y
-                for z in range(n_z):
-                    d_z = z_m[z] - at_z
-                    distance[m, z] = np.sqrt(flat + d_z * d_z)
+                to, d_x, n = distance[m], at_x - microphones_m[m, 0], 0
+                for y in range(n_y):
+                    d_y = y_m[min(corners[t, 1] + y * stride + stride // 2, len(y_m) - 1)] - microphones_m[m, 1]
+                    flat = d_x * d_x + d_y * d_y
+                    for z in range(n_z):
+                        d_z = z_m[min(corners[t, 2] + z * stride + stride // 2, len(z_m) - 1)] - microphones_m[m, 2]
+                        to[n] = flat + d_z * d_z
+                        n += 1
+                for k in range(n):
+                    to[k] = np.sqrt(to[k])
             for p in range(len(pairs)):
                 nearer, further = distance[pairs[p, 0]], distance[pairs[p, 1]]
-                for cell in range(cells_z):
-                    least, most = np.int32(NO_LAG), np.int32(0)
-                    for z in range(cell * edge, min((cell + 1) * edge, n_z)):
-                        lag = np.int32((further[z] - nearer[z]) * scale + offset)
-                        least, most = min(least, lag), max(most, lag)
-                    low[p, first + cell] = min(low[p, first + cell], np.uint16(least))
-                    high[p, first + cell] = max(high[p, first + cell], np.uint16(most))
+                for k in range(n_y * n_z):
+                    lag[k] = np.int32((further[k] - nearer[k]) * scale + offset)
+                least, most, n = low[p, t], high[p, t], 0
+                for y in range(n_y):
+                    first = (x // edge * along + y // edge) * along
+                    for z in range(n_z):
+                        cell, here = first + z // edge, np.uint16(lag[n])
+                        least[cell], most[cell] = min(least[cell], here), max(most[cell], here)
+                        n += 1
 
 
 @_compiled
@@ -251,12 +267,29 @@ def upper_bounds(maxima, places, rows, bound):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _covered(first, points, shape, boxes):  # type: ignore[no-untyped-def]
-    """Whether a cube of points lies wholly in one of the boxes."""
+def bounds_of_rest(maxima, places, rows, rounding, bound):  # type: ignore[no-untyped-def]
+    """Bound what the arrays from each on add to the power of the points of some cells."""
+    site_pair, first_row, weight = rows.site_pair, rows.first_row, rows.weight
+    cells, arrays = len(bound), len(weight)
+    total = np.empty(cells, np.float32)
+    bound[:, arrays] = rounding
+    for a in range(arrays - 1, -1, -1):
+        total[:] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            p = site_pair[r]
+            for c in range(cells):
+                total[c] += maxima[r, places[p, c]]
+        for c in range(cells):
+            bound[c, a] = bound[c, a + 1] + weight[a] * total[c]
+
+
+@_compiled
+def _covered(first, extent, shape, boxes):  # type: ignore[no-untyped-def]
+    """Whether a cube of grid points lies wholly in one of the boxes."""
     for box in boxes:
         inside = True
         for axis in range(3):
-            last = min(first[axis] + points, shape[axis]) - 1
+            last = min(first[axis] + extent, shape[axis]) - 1
             inside = inside and first[axis] >= box[axis, 0] and last <= box[axis, 1]
         if inside:
             return True
@@ -264,25 +297,33 @@ def _covered(first, points, shape, boxes):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _best_of_cell(first, edge, axes, rows, values, boxes, best, best_point, scratch):  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    """Find the best point of one cell, if it is better than the best so far."""
+def _best_of_leaf(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    first, stride, edge, axes, rows, values, boxes, rest, best, best_point, scratch
+):
+    """Find the best point of one leaf, if it is better than the best so far.
+
+    `rest` (A + 1,) bounds what the arrays from each on add: the others are skipped once they cannot make up for what is
+    missing.
+    """
     x_m, y_m, z_m = axes
     distance, total, power = scratch
     microphones_m, first_microphone, pairs = rows.microphones_m, rows.first_microphone, rows.pairs
-    n_x, n_y, n_z = min(edge, len(x_m) - first[0]), min(edge, len(y_m) - first[1]), min(edge, len(z_m) - first[2])
-    count = n_x * n_y * n_z
+    n_x = min(edge, -(-(len(x_m) - first[0]) // stride))
+    n_y = min(edge, -(-(len(y_m) - first[1]) // stride))
+    n_z = min(edge, -(-(len(z_m) - first[2]) // stride))
+    count, middle = n_x * n_y * n_z, stride // 2
     power[:count] = np.float32(0.0)
     for a in range(len(rows.weight)):
         for m in range(first_microphone[a], first_microphone[a + 1]):
             to = distance[m - first_microphone[a]]
             n = 0
-            for x in range(first[0], first[0] + n_x):
-                d_x = x_m[x] - microphones_m[m, 0]
-                for y in range(first[1], first[1] + n_y):
-                    d_y = y_m[y] - microphones_m[m, 1]
+            for x in range(n_x):
+                d_x = x_m[min(first[0] + x * stride + middle, len(x_m) - 1)] - microphones_m[m, 0]
+                for y in range(n_y):
+                    d_y = y_m[min(first[1] + y * stride + middle, len(y_m) - 1)] - microphones_m[m, 1]
                     flat = d_x * d_x + d_y * d_y
-                    for z in range(first[2], first[2] + n_z):
-                        d_z = z_m[z] - microphones_m[m, 2]
+                    for z in range(n_z):
+                        d_z = z_m[min(first[2] + z * stride + middle, len(z_m) - 1)] - microphones_m[m, 2]
                         to[n] = flat + d_z * d_z
                         n += 1
             for n in range(count):
@@ -293,11 +334,17 @@ def _best_of_cell(first, edge, axes, rows, values, boxes, best, best_point, scra
             nearer, further, row = distance[pairs[r, 0]], distance[pairs[r, 1]], values[r]
             for n in range(count):
                 total[n] += row[np.uint32(np.int32((further[n] - nearer[n]) * scale + offset))]
+        highest = np.float32(-np.inf)
         for n in range(count):
             power[n] += weight * total[n]
+            highest = max(highest, power[n])
+        if highest + rest[a + 1] < best:
+            return best, best_point
     for n in range(count):
         if power[n] >= best:
-            x, y, z = first[0] + n // (n_y * n_z), first[1] + n // n_z % n_y, first[2] + n % n_z
+            x = min(first[0] + n // (n_y * n_z) * stride + middle, len(x_m) - 1)
+            y = min(first[1] + n // n_z % n_y * stride + middle, len(y_m) - 1)
+            z = min(first[2] + n % n_z * stride + middle, len(z_m) - 1)
             point = (x * len(y_m) + y) * len(z_m) + z
             better = power[n] > best or point < best_point
             if better and not _covered((x, y, z), 1, (len(x_m), len(y_m), len(z_m)), boxes):
@@ -306,93 +353,120 @@ def _best_of_cell(first, edge, axes, rows, values, boxes, best, best_point, scra
 
 
 @_compiled
-def _best_of_cube(  # type: ignore[no-untyped-def]
-    cube, at, values, maxima, rows, cells, cell_bound, boxes, most_look_ups, spent, best, best_point, scratch
+def _best_of_cell(  # type: ignore[no-untyped-def]
+    first, cube, cell, values, maxima, rows, cells, boxes, rest, best, best_point, parts, rest_of_half, scratch
 ):
-    """Find the best point of the cells of one cube whose bounds are known, and whether the search gives up there."""
-    shape = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2]))
-    edge, per_cube, leaf_places = cells.edge, cells.per_cube, cells.leaf_places
-    halves = leaf_places.shape[2] > 0
-    leaf_edge = edge // 2 if halves else edge
-    leaf_bound = np.empty(max(1, leaf_places.shape[2]), np.float32)
-    left = cell_bound.copy()
+    """Find the best point of one cell, if it is better than the best so far."""
+    stride, site_pair, first_row, weight = cells.strides[cube], rows.site_pair, rows.first_row, rows.weight
+    count = len(weight)
+    if cells.leaf_places.shape[2] == 0:
+        return _best_of_leaf(
+            first, stride, cells.edge, cells.axes, rows, values, boxes, rest, best, best_point, scratch
+        )
+    bound, total = parts[count], parts[count + 1]
+    bound[:] = np.float32(0.0)
+    places = cells.leaf_places[cube * cells.per_cube**3 + cell]
+    for a in range(count):
+        total[:] = np.float32(0.0)
+        for r in range(first_row[a], first_row[a + 1]):
+            p = site_pair[r]
+            for h in range(8):
+                total[h] += maxima[r, places[p, h]]
+        highest = np.float32(-np.inf)
+        for h in range(8):
+            parts[a, h] = weight[a] * total[h]
+            bound[h] += parts[a, h]
+            highest = max(highest, bound[h])
+        if highest + rest[a + 1] < best:
+            return best, best_point
+    shape, edge = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2])), cells.edge // 2
+    rest_of_half[count] = rest[count]
     while True:
-        cell = np.argmax(left)
-        bound = left[cell]
-        if bound < best or bound == -np.inf:
-            return best, best_point, spent, False
-        left[cell] = -np.inf
-        c_x, c_y, c_z = cell // (per_cube * per_cube), cell // per_cube % per_cube, cell % per_cube
-        first = (at[0] + c_x * edge, at[1] + c_y * edge, at[2] + c_z * edge)
-        if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
-            continue  # a cube at the volume's edge has cells outside it
-        if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_point:
+        h = np.argmax(bound)
+        if bound[h] < best or bound[h] == -np.inf:
+            return best, best_point
+        bound[h] = -np.inf
+        step = edge * stride
+        corner = (first[0] + h // 4 * step, first[1] + h // 2 % 2 * step, first[2] + h % 2 * step)
+        if corner[0] >= shape[0] or corner[1] >= shape[1] or corner[2] >= shape[2]:
             continue
-        if _covered(first, edge, shape, boxes):
-            continue
-        if halves:
-            spent += len(leaf_bound) * len(rows.site_pair)
-            upper_bounds(maxima, leaf_places[cube * per_cube**3 + cell], rows, leaf_bound)
-        else:
-            leaf_bound[0] = bound
-        while True:
-            leaf = np.argmax(leaf_bound)
-            if leaf_bound[leaf] < best or leaf_bound[leaf] == -np.inf:
-                break
-            leaf_bound[leaf] = -np.inf
-            l_x, l_y, l_z = leaf // 4 * leaf_edge, leaf // 2 % 2 * leaf_edge, leaf % 2 * leaf_edge
-            corner = (first[0] + l_x, first[1] + l_y, first[2] + l_z)
-            if corner[0] >= shape[0] or corner[1] >= shape[1] or corner[2] >= shape[2]:
-                continue
-            if spent > most_look_ups and best > -np.inf:
-                return best, best_point, spent, True
-            spent += leaf_edge**3 * len(rows.site_pair)
-            best, best_point = _best_of_cell(
-                corner, leaf_edge, cells.axes, rows, values, boxes, best, best_point, scratch
-            )
+        for a in range(count - 1, -1, -1):
+            rest_of_half[a] = rest_of_half[a + 1] + parts[a, h]
+        best, best_point = _best_of_leaf(
+            corner, stride, edge, cells.axes, rows, values, boxes, rest_of_half, best, best_point, scratch
+        )
 
 
 @_compiled
-def highest(values, maxima, rows, cells, bounds, boxes, most_look_ups):  # type: ignore[no-untyped-def]
-    """Find the highest point outside some boxes, by branch and bound."""
+def highest(values, maxima, rows, cells, bounds, boxes, rounding):  # type: ignore[no-untyped-def]
+    """Find the highest point outside some boxes, by branch and bound.
+
+    Of every cube only the most promising cell is examined at first. When cells of all cubes are known, those that are
+    left are examined from the highest bounds down.
+    """
     shape = (len(cells.axes[0]), len(cells.axes[1]), len(cells.axes[2]))
     of_cubes, of_cells, known = bounds
-    cube_edge = cells.edge * cells.per_cube
-    cubes_y, cubes_z = -(-shape[1] // cube_edge), -(-shape[2] // cube_edge)
+    per_cube, edge = cells.per_cube, cells.edge
+    arrays, leaf = len(rows.weight), (edge // 2 if cells.leaf_places.shape[2] else edge) ** 3
     scratch = (
-        np.empty((np.diff(rows.first_microphone).max(), cells.edge**3), np.float32),
-        np.empty(cells.edge**3, np.float32),
-        np.empty(cells.edge**3, np.float32),
+        np.empty((np.diff(rows.first_microphone).max(), leaf), np.float32),
+        np.empty(leaf, np.float32),
+        np.empty(leaf, np.float32),
     )
-    spent = 0
+    parts, rest = np.empty((arrays + 2, 8), np.float32), np.empty(arrays + 1, np.float32)
     best, best_point = np.float32(-np.inf), np.int64(shape[0] * shape[1] * shape[2])
+    opened, waiting = np.empty(len(of_cubes), np.int64), np.empty((len(of_cubes), per_cube**3), np.float32)
+    count = 0
     first_cube = np.argmax(of_cubes)
     order = np.array([first_cube])
-    for turn in range(2):  # the most promising cube first: with its best point few others are left to be sorted
+    top = np.float32(-np.inf)
+    for turn in range(2 + _PASSES):  # the most promising cube first: with its best point few others are left
         if turn == 1:
-            left = np.flatnonzero(of_cubes >= best)
-            order = left[np.argsort(-of_cubes[left])]
+            others = np.flatnonzero(of_cubes >= best)
+            order = others[np.argsort(-of_cubes[others])]
+        elif turn >= 2:
+            order = opened[:count]
+            if turn == 2:
+                for cube in order:
+                    top = max(top, waiting[cube].max())
+        share = np.float32(1 + _PASSES - turn) / np.float32(_PASSES)
         for cube in order:
-            if of_cubes[cube] < best:
-                break
-            if turn == 1 and cube == first_cube:
-                continue
-            c_x, c_y, c_z = cube // (cubes_y * cubes_z), cube // cubes_z % cubes_y, cube % cubes_z
-            at = (c_x * cube_edge, c_y * cube_edge, c_z * cube_edge)
-            if of_cubes[cube] == best and (at[0] * shape[1] + at[1]) * shape[2] + at[2] > best_point:
-                continue
-            if _covered(at, cube_edge, shape, boxes):
-                continue
-            if not known[cube]:
-                if spent > most_look_ups and best > -np.inf:
-                    return best_point, best, False
-                spent += cells.per_cube**3 * len(rows.site_pair)
-                upper_bounds(maxima, cells.cell_places[cube], rows, of_cells[cube])
-                known[cube] = True
-            best, best_point, spent, gives_up = _best_of_cube(
-                cube, at, values, maxima, rows, cells, of_cells[cube], boxes, most_look_ups, spent, best, best_point,
-                scratch,
-            )  # fmt: skip
-            if gives_up:
-                return best_point, best, False
-    return best_point, best, True
+            if turn < 2:
+                if of_cubes[cube] < best:
+                    break
+                if (turn == 1 and cube == first_cube) or _covered(
+                    cells.corners[cube], per_cube * edge * cells.strides[cube], shape, boxes
+                ):
+                    continue
+                if not known[cube]:
+                    bounds_of_rest(maxima, cells.cell_places[cube], rows, rounding, of_cells[cube])
+                    known[cube] = True
+                opened[count] = cube
+                count += 1
+                waiting[cube] = of_cells[cube, :, 0]
+            while True:
+                cell = np.argmax(waiting[cube])
+                bound = waiting[cube, cell]
+                threshold = best if turn < 2 else best + share * max(top - best, np.float32(0.0))
+                if bound < threshold or bound == -np.inf:
+                    break
+                waiting[cube, cell] = -np.inf
+                step = edge * cells.strides[cube]
+                first = (
+                    cells.corners[cube, 0] + cell // (per_cube * per_cube) * step,
+                    cells.corners[cube, 1] + cell // per_cube % per_cube * step,
+                    cells.corners[cube, 2] + cell % per_cube * step,
+                )
+                if first[0] >= shape[0] or first[1] >= shape[1] or first[2] >= shape[2]:
+                    continue  # a cube at the volume's edge has cells outside it
+                if bound == best and (first[0] * shape[1] + first[1]) * shape[2] + first[2] > best_point:
+                    continue
+                if _covered(first, step, shape, boxes):
+                    continue
+                best, best_point = _best_of_cell(
+                    first, cube, cell, values, maxima, rows, cells, boxes, of_cells[cube, cell], best, best_point,
+                    parts, rest, scratch,
+                )  # fmt: skip
+                if turn == 1:
+                    break
+    return best_point, best

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from livessl.core.kernels.arguments import SILENT_POWER, OnsetParameters, OnsetState, SmoothRows
+from livessl.core.kernels.search_with_numpy import bounds_of_rest as bounds_of_rest
 from livessl.core.kernels.search_with_numpy import cell_intervals as cell_intervals
 from livessl.core.kernels.search_with_numpy import highest as highest
 from livessl.core.kernels.search_with_numpy import running_maxima as running_maxima

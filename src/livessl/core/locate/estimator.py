@@ -92,8 +92,6 @@ class Localization:
         0 to 1.
     evidence : tuple of Evidence
         One for each array, in the order of their names; power maps are drawn from it. May be empty.
-    proven : bool
-        Whether no grid point has a higher power; False if the search was given up.
     features : ConfidenceFeatures or None
         What the confidence was computed from; None if it is no probability.
     refused : str or None
@@ -116,7 +114,6 @@ class Localization:
     covariance_m2: FloatArray
     confidence: float
     evidence: tuple[Evidence, ...]
-    proven: bool = True
     features: ConfidenceFeatures | None = None
     refused: str | None = None
     outliers: Mapping[str, float] | None = None

@@ -141,11 +141,8 @@ class Onset(MapEstimator):
             covariance_m2=judgement.covariance_m2,
             confidence=judgement.features.confidence,
             evidence=answer.evidence,
-            proven=place.proven,
             features=judgement.features,
-            refused=(
-                answer.refused if place.proven else "no place stands out: the search was stopped before it was complete"
-            ),
+            refused=answer.refused,
             outliers=answer.consensus.outliers,
             candidates=judgement.candidates,
             ambiguity=ambiguity.reason(judgement.candidates, specs, self.c_m_s) if judgement.candidates else None,
@@ -162,7 +159,6 @@ class Onset(MapEstimator):
             covariance_m2=judgement.covariance_m2,
             confidence=features.confidence,
             evidence=answer.evidence,
-            proven=place.proven,
             features=features,
             refused=None if known else outside.reason,
             outliers={},

@@ -140,7 +140,7 @@ def find_outside(
     off_m = position_m - np.clip(position_m, grid.lower_m, grid.upper_m)
     if beyond < least or not off_m.any() or np.linalg.norm(position_m - inside.position_m) <= NEAR_M:
         return None
-    place = Place(evidence, functional, position_m, beyond, power, inside.proven)
+    place = Place(evidence, functional, position_m, beyond, power)
     return Outside(place, wide, surface=surface and beyond < (1.0 + GAIN) * power)
 
 

@@ -3,8 +3,8 @@
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
 pair can add at any point of the cell; the sum of these maxima bounds the cell, and a cell whose bound is below the best
 power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
-Usually about 2000 points out of millions are visited. The size of a cell in metres is fixed, so memory does not grow
-with a finer grid.
+Usually about 2000 points out of millions are visited. Where nothing stands out most cells are, and the search takes
+longer, but never much longer than the map. Memory is bounded whatever the grid (`livessl.core.locate.search_cubes`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
 from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, SearchBounds, SearchCells, SearchRows
 from livessl.core.locate.refine import FindPeaks, Peak, box_around, laplace_covariance_m2
+from livessl.core.locate.search_cubes import CELLS_PER_CUBE, search_cubes
 from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
 from livessl.core.types import (
     GCC,
@@ -32,21 +33,15 @@ from livessl.core.types import (
     UInt16Array,
 )
 
-CELL_M: Final = 0.2
-"""Approximate edge of a cell, in metres; larger where there would be more than `MOST_CELLS`."""
-
-MOST_CELLS: Final = 50_000
-"""Approximate number of cells above which cells become larger, to bound the memory of the tables."""
-
-MOST_LOOK_UPS: Final = 3_000_000
-"""Look-ups after which a search gives up, some 5 ms compiled. Two arrays never need so many, nor do many arrays with a
-clear sound; many arrays with nothing but noise do."""
-
 MOST_HALVES_BYTES: Final = 64_000_000
 """Largest tables, in bytes, with which cells are halved along each axis before their points are examined."""
 
-CELLS_PER_CUBE: Final = 4
-"""Cells along the edge of the cubes of cells that are bounded first."""
+_ROUNDING: Final = 4e-6
+"""Largest difference, relative to the sum of all pairs' greatest values, between sums over at most 16 arrays in
+different orders: four times 16 roundings of 6e-8."""
+
+_CUBES_AT_ONCE: Final = 512
+"""Cubes whose tables are computed at once, to bound the memory of doing so."""
 
 
 class PeakSearch:
@@ -65,33 +60,26 @@ class PeakSearch:
         self._grid = grid
         self._c_m_s = c_m_s
         x_m, y_m, z_m = (grid.axis_m(axis).astype(np.float32) for axis in range(3))
-        axes = (x_m, y_m, z_m)
-        volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
-        half = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / 2 / grid.spacing_m))
-        edge = 2 * half
-        self._cubes = [-(-n // (CELLS_PER_CUBE * edge)) for n in grid.shape]
+        self._cubes = cubes = search_cubes(arrays, grid, c_m_s)
         self._specs = {spec.name: spec for spec in arrays}
         self._pairs = {spec.name: microphone_pairs(len(spec.microphones_m)) for spec in arrays}
         counts = [len(pairs) for pairs in self._pairs.values()]
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
-        total = sum(counts)
-        cubes = int(np.prod(self._cubes))
+        total, count = sum(counts), len(cubes.corners)
         children = CELLS_PER_CUBE**3
-        self._halves = half > 1 and 2 * 8 * children * cubes * total <= MOST_HALVES_BYTES
+        self._halves = 2 * 8 * children * count * total <= MOST_HALVES_BYTES
         self._cells = SearchCells(
-            axes=axes,
-            edge=edge,
+            axes=(x_m, y_m, z_m),
+            corners=cubes.corners,
+            strides=cubes.strides,
+            edge=2 * cubes.half,
             per_cube=CELLS_PER_CUBE,
-            cell_places=np.zeros((cubes, total, children), np.uint16),
-            leaf_places=np.zeros((cubes * children, total, 8 if self._halves else 0), np.uint16),
+            cell_places=np.zeros((count, total, children), np.uint16),
+            leaf_places=np.zeros((count * children, total, 8 if self._halves else 0), np.uint16),
         )
-        self._cube_places = np.zeros((total, cubes), np.uint16)
-        self._bounds = SearchBounds(
-            of_cubes=np.zeros(cubes, np.float32),
-            of_cells=np.zeros((cubes, children), np.float32),
-            known=np.zeros(cubes, np.bool_),
-        )
-        self._values, self._maxima = _Buffer(), _Buffer()
+        self._cube_places = np.zeros((total, count), np.uint16)
+        self._of_cubes, self._known = np.zeros(count, np.float32), np.zeros(count, np.bool_)
+        self._values, self._maxima, self._of_cells = _Buffer(), _Buffer(), _Buffer()
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Among] = {}
 
@@ -109,28 +97,25 @@ class PeakSearch:
                 "its microphones are too far apart for its sampling rate"
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
-        rows = slice(first, first + len(pairs))
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
-        cells = self._cells
-        edge = cells.edge // 2 if self._halves else cells.edge
-        small = [-(-n // edge) for n in self._grid.shape]
-        low, high = (np.empty((len(pairs), *small), np.uint16) for _ in range(2))
-        kernels.cell_intervals(
-            cells.axes, spec.microphones_m.astype(np.float32), pairs.astype(np.int32), places.scale, places.offset,
-            edge, low.reshape(len(pairs), -1), high.reshape(len(pairs), -1),
-        )  # fmt: skip
-        block = block_lags(len(lags_s))
-        if self._halves:
-            children = CELLS_PER_CUBE * 2
-            leaf_places = _by_cube(run_places(low, high, block), self._cubes, children)
-            split = leaf_places.reshape(len(pairs), -1, *(n for _ in range(3) for n in (CELLS_PER_CUBE, 2)))
-            by_cell = split.transpose(1, 2, 4, 6, 0, 3, 5, 7)
-            cells.leaf_places[:, rows] = by_cell.reshape(len(cells.leaf_places), len(pairs), 8)
-            low, high = _extreme(low, 2, np.minimum), _extreme(high, 2, np.maximum)
-        places_of_cells = _by_cube(run_places(low, high, block), self._cubes, CELLS_PER_CUBE)
-        cells.cell_places[:, rows] = places_of_cells.swapaxes(0, 1)
-        low, high = _extreme(low, CELLS_PER_CUBE, np.minimum), _extreme(high, CELLS_PER_CUBE, np.maximum)
-        self._cube_places[rows] = run_places(low, high, block).reshape(len(pairs), -1)
+        block, rows = block_lags(len(lags_s)), slice(first, first + len(pairs))
+        cells, microphones_m = self._cells, spec.microphones_m.astype(np.float32)
+        along = CELLS_PER_CUBE * (2 if self._halves else 1)
+        for begin in range(0, len(cells.corners), _CUBES_AT_ONCE):
+            some = slice(begin, begin + _CUBES_AT_ONCE)
+            corners = cells.corners[some]
+            low, high = (np.empty((len(pairs), len(corners), along**3), np.uint16) for _ in range(2))
+            kernels.cell_intervals(
+                cells.axes, corners, cells.strides[some], CELLS_PER_CUBE * cells.edge // along, along,
+                microphones_m, pairs.astype(np.int32), places.scale, places.offset, low, high,
+            )  # fmt: skip
+            if self._halves:
+                by_cell = _parts(run_places(np.minimum(low, high), high, block))
+                own = slice(begin * CELLS_PER_CUBE**3, (begin + len(corners)) * CELLS_PER_CUBE**3)
+                cells.leaf_places[own, rows] = by_cell.reshape(len(pairs), -1, 8).swapaxes(0, 1)
+                low, high = _parts(low).min(axis=3), _parts(high).max(axis=3)
+            cells.cell_places[some, rows] = run_places(np.minimum(low, high), high, block).swapaxes(0, 1)
+            self._cube_places[rows, some] = run_places(low.min(axis=2), high.max(axis=2), block)
         self._sets.clear()
 
     @property
@@ -138,15 +123,13 @@ class PeakSearch:
         """Memory of the tables of all arrays, in bytes."""
         return self._cells.cell_places.nbytes + self._cells.leaf_places.nbytes + self._cube_places.nbytes
 
-    def among(self, evidence: Sequence[Evidence], most_look_ups: int = MOST_LOOK_UPS) -> FindPeaks:
+    def among(self, evidence: Sequence[Evidence]) -> FindPeaks:
         """Return a function that finds the peaks of some arrays' evidence; it is valid until the next call.
 
         Parameters
         ----------
         evidence : sequence of Evidence
             At least one, in the order in which the maps are to be summed. Each array must have been prepared.
-        most_look_ups : int
-            Look-ups for each peak after which the search gives up; the peak is then not proven to be the highest.
         """
         among = self._among(tuple(part.spec.name for part in evidence))
         rows = among.rows
@@ -157,21 +140,24 @@ class PeakSearch:
             count = part.gcc.values.shape[1]
             values[own, :count], values[own, count:] = part.gcc.values, 0.0
         kernels.running_maxima(values, among.block, maxima)
-        kernels.upper_bounds(maxima, self._cube_places, rows, self._bounds.of_cubes)
-        self._bounds.known[:] = False
+        kernels.upper_bounds(maxima, self._cube_places, rows, self._of_cubes)
+        self._known[:] = False
+        of_cells = self._of_cells.of(len(self._known) * CELLS_PER_CUBE**3, len(evidence) + 1)
+        bounds = SearchBounds(self._of_cubes, of_cells.reshape(len(self._known), -1, len(evidence) + 1), self._known)
+        greatest = np.abs(values).max(axis=1)
+        rounding = np.float32(_ROUNDING * (np.add.reduceat(greatest, rows.first_row[:-1]) @ rows.weight))
 
         def find(count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
             boxes = list(without)
             found: list[Peak] = []
             for _ in range(count):
                 left_out = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
-                point, power, proven = kernels.highest(
-                    values, maxima, rows, self._cells, self._bounds, left_out, most_look_ups
-                )
+                point, power = kernels.highest(values, maxima, rows, self._cells, bounds, left_out, rounding)
                 if power == -np.inf:
                     break
-                found.append(Peak(int(point), float(power), bool(proven)))
-                boxes.append(box_around(self._grid, int(point), apart_points))
+                stride = self._cubes.stride_at(np.array(np.unravel_index(point, self._grid.shape)))
+                found.append(Peak(int(point), float(power), stride))
+                boxes.append(box_around(self._grid, int(point), apart_points * stride))
             return found
 
         return find
@@ -251,19 +237,10 @@ def run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
     return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
 
 
-def _extreme(ends: UInt16Array, count: int, extreme: np.ufunc) -> UInt16Array:
-    """Extremes of intervals' ends (P, X, Y, Z) over cubes with `count` along an edge."""
-    for axis in (1, 2, 3):
-        ends = extreme.reduceat(ends, np.arange(0, ends.shape[axis], count), axis=axis)
-    return ends
-
-
-def _by_cube(table: UInt16Array, cubes: Sequence[int], count: int) -> UInt16Array:
-    """Reorder a table (P, X, Y, Z) cube after cube, (P, T, count^3), with zeros for what lies outside the table."""
-    padded = np.zeros((len(table), *(count * n for n in cubes)), table.dtype)
-    padded[:, : table.shape[1], : table.shape[2], : table.shape[3]] = table
-    split = padded.reshape(len(table), *(n for along in cubes for n in (along, count)))
-    return split.transpose(0, 1, 3, 5, 2, 4, 6).reshape(len(table), -1, count**3)
+def _parts(halves: UInt16Array) -> UInt16Array:
+    """Reorder the halves of cubes' cells (P, T, n^3) cell after cell: (P, T, (n/2)^3, 8)."""
+    split = halves.reshape(*halves.shape[:2], *(n for _ in range(3) for n in (CELLS_PER_CUBE, 2)))
+    return split.transpose(0, 1, 2, 4, 6, 3, 5, 7).reshape(*halves.shape[:2], CELLS_PER_CUBE**3, 8)
 
 
 _PLACE_OF_LENGTH: Final = np.array([BLOCKS * np.searchsorted(RUNS, blocks) for blocks in range(BLOCKS + 1)], np.uint16)

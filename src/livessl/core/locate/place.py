@@ -33,8 +33,6 @@ class Place:
         Metres.
     power, rival_power : float
         The functional there, and the highest power outside its `refine.neighbourhood`.
-    proven : bool
-        Whether no grid point has a higher power.
     """
 
     evidence: tuple[Evidence, ...]
@@ -42,7 +40,6 @@ class Place:
     position_m: FloatArray
     power: float
     rival_power: float
-    proven: bool
 
     @property
     def stands_out_everywhere(self) -> bool:
@@ -82,7 +79,6 @@ def highest_place(evidence: Sequence[Evidence], search: PeakSearch, grid: Grid, 
     find = search.among(evidence)
     found = find(_STARTS)
     functional = SRPFunctional(evidence, c_m_s)
-    starts_m = np.stack([grid.point_m(peak.point) for peak in found])
-    position_m, power = refine.refine(functional, starts_m, grid)
+    position_m, power = refine.refine_peaks(functional, found, grid)
     rival_power = refine.rival_power(find, grid, position_m)
-    return Place(evidence, functional, position_m, power, rival_power, found[0].proven)
+    return Place(evidence, functional, position_m, power, rival_power)

@@ -33,11 +33,11 @@ _SUBDIVISIONS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A grid point, the fused power there, and whether it is proven to be the highest, not only of those examined."""
+    """A grid point, the fused power there, and the distance to the next points that were examined, in grid points."""
 
     point: int
     power: float
-    proven: bool = True
+    stride: int = 1
 
 
 class FindPeaks(Protocol):
@@ -92,7 +92,13 @@ def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
     return box
 
 
-def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple[FloatArray, float]:
+def refine_peaks(functional: SRPFunctional, peaks: Sequence[Peak], grid: Grid) -> tuple[FloatArray, float]:
+    """Find the highest top near any of some peaks of a search: see `refine`."""
+    starts_m = np.stack([grid.point_m(peak.point) for peak in peaks])
+    return refine(functional, starts_m, grid, max(peak.stride for peak in peaks))
+
+
+def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: int = 1) -> tuple[FloatArray, float]:
     """Find the highest top near any of some grid points.
 
     Around every start a finer local grid is examined; from its best point Newton steps climb, and only upwards.
@@ -103,6 +109,8 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple
     starts_m : (N, 3) or (3,) float64
         Metres.
     grid : Grid
+    stride : int
+        Distance between points that were examined, in grid points.
 
     Returns
     -------
@@ -111,10 +119,10 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid) -> tuple
     value : float
         The functional there.
     """
-    near = np.atleast_2d(starts_m)[:, None] + _offsets_m(grid)
+    near = np.clip(np.atleast_2d(starts_m)[:, None] + stride * _offsets_m(grid), grid.lower_m, grid.upper_m)
     values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
     best = values.argmax(axis=1)
-    tops = [_climb(functional, near[n, k], float(values[n, k]), grid) for n, k in enumerate(best)]
+    tops = [_climb(functional, near[n, k], float(values[n, k]), grid, stride) for n, k in enumerate(best)]
     return max(tops, key=lambda top: top[1])
 
 
@@ -125,11 +133,13 @@ def _offsets_m(grid: Grid) -> FloatArray:
     return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
 
 
-def _climb(functional: SRPFunctional, position_m: FloatArray, value: float, grid: Grid) -> tuple[FloatArray, float]:
+def _climb(
+    functional: SRPFunctional, position_m: FloatArray, value: float, grid: Grid, stride: int
+) -> tuple[FloatArray, float]:
     axes = list(grid.free_axes)
     across = np.ix_(axes, axes)
     lower_m, upper_m = grid.lower_m, grid.upper_m
-    reach = float(grid.cell_m.max()) / _SUBDIVISIONS
+    reach = stride * float(grid.cell_m.max()) / _SUBDIVISIONS
     for _ in range(_NEWTON_STEPS):
         gradient, hessian = functional.derivatives(position_m)
         step = np.zeros(3)

@@ -281,7 +281,7 @@ class SecondSourceSearch:
             return None
         again, _ = self.beside(second, frames)
         second, confidence = self.beside(again, frames)
-        if confidence < LEAST_SECOND_SOURCE or not second.proven or again.apart_m(second) < APART_M:
+        if confidence < LEAST_SECOND_SOURCE or again.apart_m(second) < APART_M:
             return None
         return TwoSources(again, second, confidence)
 
@@ -300,12 +300,12 @@ class SecondSourceSearch:
             found = find(1, without=known)
             if not found:
                 break
-            position_m, power = refine.refine(functional, self._grid.point_m(found[0].point), self._grid)
+            position_m, power = refine.refine_peaks(functional, found, self._grid)
             terms = functional.pair_terms(position_m)
             each = zip(frames, terms, delays_s, strict=True)
             prominent = prominence([one.prominence(term.lags_s, taken_s) for one, term, taken_s in each])
             if power * prominent > best:
-                candidate = Place(evidence, functional, position_m, power, power, found[0].proven)
+                candidate = Place(evidence, functional, position_m, power, power)
                 best, chosen = power * prominent, (candidate, confidence(prominent))
             known.append(refine.box_around(self._grid, found[0].point, apart_points))
         other, other_confidence = chosen

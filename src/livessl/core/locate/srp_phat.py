@@ -58,13 +58,12 @@ class SrpPhat(MapEstimator):
         find = refine.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
         found = find(refine.CANDIDATES)
         functional = SRPFunctional(evidence, self.c_m_s)
-        position, _ = refine.refine(functional, np.stack([grid.point_m(peak.point) for peak in found]), grid)
+        position, _ = refine.refine_peaks(functional, found, grid)
         return Localization(
             position,
             refine.laplace_covariance_m2(functional, evidence, position, grid),
             refine.confidence(find, found[0], grid, position),
             evidence,
-            found[0].proven,
         )
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
