@@ -135,7 +135,7 @@ class ArrayStates:
                 "now_utc": now_utc,
                 "mode": self._site_time.mode,
                 "arrays": arrays,
-                "overload": self._overload.describe()["message"],
+                "overload": self._overload.message,
             }
         )
 

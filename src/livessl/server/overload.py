@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from livessl.clock import Clock, utc_text
@@ -24,6 +25,9 @@ _WORDS: Final = {
     "quiet": "frames of quiet",
 }
 
+CURE: Final = "Use a faster machine or fewer arrays per server, raise fusion.update_s, or stop other programs on it"
+"""What helps against an overload."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -33,7 +37,15 @@ class _Turn(NamedTuple):
     ended_ns: int
     lasted_ns: int
     waited_ns: int
-    frames: int
+    messages: int
+    delay_s: float
+
+
+class _Figures(NamedTuple):
+    """Figures over the last turns."""
+
+    busy: float
+    messages_per_s: float
     delay_s: float
 
 
@@ -51,7 +63,8 @@ class Overload:
         self._clock = clock
         self._policy = LoadPolicy()
         self._turns: deque[_Turn] = deque()
-        self._lock = threading.Lock()
+        self._lasted_ns = self._waited_ns = self._messages = 0  # sums over the turns
+        self._lock = threading.Lock()  # of the turns and their sums
         self._ended_ns = clock.monotonic_ns()
         self._since_ns: int | None = None
         self.relief = NOTHING_SHED
@@ -59,19 +72,14 @@ class Overload:
         self.updates_shed = 0
         """Windows that were not located for the load, since the start."""
 
-    @property
-    def level(self) -> int:
-        """Level of shedding: 0 sheds nothing."""
-        return self._policy.level
-
-    def note(self, delay_s: float, frames: int, waited_ns: int, *, sheds: bool) -> Relief:
+    def note(self, delay_s: float, messages: int, waited_ns: int, *, sheds: bool) -> Relief:
         """Take in a turn of the fusion thread; return what is shed from now on.
 
         Parameters
         ----------
         delay_s : float
             How long the first message of the turn had waited; 0 if there was none.
-        frames : int
+        messages : int
             Number of messages of the turn.
         waited_ns : int
             How long the thread waited for them.
@@ -79,12 +87,10 @@ class Overload:
             Whether anything may be shed: not in a replay, which can wait.
         """
         now_ns = self._clock.monotonic_ns()
-        turn = _Turn(now_ns, now_ns - self._ended_ns, waited_ns, frames, delay_s)
+        self._add(_Turn(now_ns, now_ns - self._ended_ns, waited_ns, messages, delay_s), 1)
         self._ended_ns = now_ns
-        with self._lock:
-            self._turns.append(turn)
-            while self._turns[0].ended_ns < now_ns - MEMORY_NS:
-                self._turns.popleft()
+        while self._turns[0].ended_ns < now_ns - MEMORY_NS:
+            self._add(self._turns[0], -1)
         before = self._policy.level
         if not sheds:
             self._policy = LoadPolicy()
@@ -93,53 +99,62 @@ class Overload:
             self._report(before, level)
         relief = LEVELS[level]
         if level and delay_s > PROMPT_S:
-            relief = Relief(None, relief.maps, relief.arrays, relief.ahead)
+            relief = replace(relief, update_every=None)
         self.relief = relief
         return relief
 
     def describe(self) -> JsonObject:
         """Return the figures as the API reports them."""
-        with self._lock:
-            turns = list(self._turns)
-        lasted_s = max(1e-9, sum(turn.lasted_ns for turn in turns) / 1e9)
-        relief = LEVELS[self._policy.level]
-        since_ns = self._since_ns
-        delay_s = max((turn.delay_s for turn in turns), default=0.0)
-        rate = sum(turn.frames for turn in turns) / lasted_s
-        message = None
-        if relief.shed:
-            what = " and ".join(_WORDS[name] for name in relief.shed)
-            message = (
-                f"overloaded: results are up to {delay_s:.2f} s behind and the fusion works {100 * self._busy():.0f} % "
-                f"of the time on {rate:.0f} messages a second; shed: {what}. {CURE}"
-            )
+        level, since_ns = self._policy.level, self._since_ns
+        busy, messages_per_s, delay_s = self._figures()
         return {
-            "state": "overloaded" if relief.shed else "normal",
-            "level": self._policy.level,
+            "state": "overloaded" if level else "normal",
+            "level": level,
             "since_utc": None if since_ns is None else utc_text(since_ns),
             "delay_s": round(delay_s, 4),
-            "busy": round(self._busy(), 3),
-            "messages_per_s": round(rate, 1),
-            "shed": list(relief.shed),
+            "busy": round(busy, 3),
+            "messages_per_s": round(messages_per_s, 1),
+            "shed": list(LEVELS[level].shed),
             "updates_shed": self.updates_shed,
-            "message": message,
+            "message": self.message,
         }
 
+    @property
+    def message(self) -> str | None:
+        """Figures and cure in words; None while nothing is shed."""
+        shed = LEVELS[self._policy.level].shed
+        if not shed:
+            return None
+        busy, messages_per_s, delay_s = self._figures()
+        what = " and ".join(filter(None, [", ".join(_WORDS[name] for name in shed[:-1]), _WORDS[shed[-1]]]))
+        return (
+            f"overloaded: sound waited up to {delay_s:.2f} s, and the fusion works {100 * busy:.0f} % of the time on "
+            f"{messages_per_s:.0f} messages a second; it sheds {what}. {CURE}"
+        )
+
+    def _add(self, turn: _Turn, sign: int) -> None:
+        """Add the newest turn, or with a negative sign take out the oldest."""
+        with self._lock:
+            if sign > 0:
+                self._turns.append(turn)
+            else:
+                self._turns.popleft()
+            self._lasted_ns += sign * turn.lasted_ns
+            self._waited_ns += sign * turn.waited_ns
+            self._messages += sign * turn.messages
+
+    def _figures(self) -> _Figures:
+        with self._lock:
+            delay_s = max((turn.delay_s for turn in self._turns), default=0.0)
+            return _Figures(self._busy(), 1e9 * self._messages / max(1, self._lasted_ns), delay_s)
+
     def _busy(self) -> float:
-        turns = self._turns
-        lasted_ns = sum(turn.lasted_ns for turn in turns)
-        return min(1.0, max(0.0, 1.0 - sum(turn.waited_ns for turn in turns) / lasted_ns)) if lasted_ns else 0.0
+        return min(1.0, max(0.0, 1.0 - self._waited_ns / max(1, self._lasted_ns)))
 
     def _report(self, before: int, level: int) -> None:
         if before == 0:
             self._since_ns = self._clock.now_ns()
-            _log.warning("%s", self.describe()["message"])
+            _log.warning("%s", self.message)
         elif level == 0:
             self._since_ns = None
             _log.info("no longer overloaded: nothing is shed")
-
-
-CURE: Final = (
-    "Use a faster machine, fewer arrays per server, or raise fusion.update_s; stop other programs on this machine"
-)
-"""What helps against an overload."""

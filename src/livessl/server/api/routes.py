@@ -155,7 +155,7 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
-    overload = parts.overload.describe()["message"]
+    overload = parts.overload.message
     if overload is not None:
         status, reasons = "overloaded", [overload, *reasons]
     if parts.failure is not None:
