@@ -83,6 +83,16 @@ def test_nothing_is_shed_while_the_queue_empties_between_peaks() -> None:
     assert policy.level == 0
 
 
+def test_a_single_long_turn_is_no_overload() -> None:
+    """When nodes join, their tables are computed, and what came meanwhile is worked off."""
+    policy = LoadPolicy()
+    now_ns = 0
+    for delay_s in (0.0, 6.0, 0.5, 0.0, 0.0, 0.0):
+        now_ns += 1_000_000_000
+        policy.note(delay_s, 1.0, now_ns)
+    assert policy.level == 0
+
+
 def test_a_queue_that_does_not_empty_raises_the_level_until_the_last() -> None:
     policy = LoadPolicy()
     hold(policy, 60.0, BEHIND_S)

@@ -17,6 +17,9 @@ not empty; the peaks of a queue that does are no overload (Nichols and Jacobson 
 BEHIND_S: Final = 0.1
 """Least delay, in seconds, at and above which more is shed: a fifth of the 0.5 s that live results may take."""
 
+TURNS: Final = 3
+"""Fewest measurements from which more is shed: a single long turn, as when nodes join, is no overload."""
+
 FAR_BEHIND_S: Final = 0.3
 """Least delay, in seconds, from which on two levels are taken at once."""
 
@@ -110,6 +113,7 @@ class LoadPolicy:
         """The level that applies now."""
         self._highest = levels - 1
         self._least_s: float | None = None  # least delay of the interval
+        self._turns = 0  # measurements in the interval
         self._began_ns: int | None = None  # when the interval began
         self._calm_ns: int | None = None  # since when the queue has emptied in every interval
         self._eased_ns: int | None = None  # when less was shed last
@@ -130,8 +134,9 @@ class LoadPolicy:
         if self._began_ns is None:
             self._began_ns = now_ns
         self._least_s = delay_s if self._least_s is None else min(self._least_s, delay_s)
-        if now_ns - self._began_ns >= INTERVAL_NS:
-            least_s, self._least_s, self._began_ns = self._least_s, None, now_ns
+        self._turns += 1
+        if now_ns - self._began_ns >= INTERVAL_NS and self._turns >= TURNS:
+            least_s, self._least_s, self._began_ns, self._turns = self._least_s, None, now_ns, 0
             self._judge(least_s, busy, now_ns)
         return self.level
 
