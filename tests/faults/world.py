@@ -184,6 +184,7 @@ class Post:
     """The receiver without its socket and thread."""
 
     endpoint = "nowhere"
+    delay_s = 0.0
 
     def __init__(self, site: Site, clock: HandClock) -> None:
         self.ingest = Ingest(site)

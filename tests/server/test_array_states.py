@@ -15,6 +15,7 @@ from livessl.core.types import FRAME_NS
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import REPORT_NS, WATCH_NS, ArrayStates
 from livessl.server.ingest import Ingest
+from livessl.server.overload import Overload
 from livessl.server.run import live_run
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Finalized, Store, StoreError
@@ -45,7 +46,9 @@ class Desk:
         self.published: list[JsonObject] = []
         self.store = Store() if store is None else store
         site_time = SiteTime(self.clock)
-        self.states = ArrayStates(SITE, self.clock, self.store, site_time, self.ingest, self.published.append)
+        self.states = ArrayStates(
+            SITE, self.clock, self.store, site_time, self.ingest, Overload(self.clock), self.published.append
+        )
         self.fusion = live_run(SITE, Finalized(None, None), for_each).fusion
         self.states.follow(self.fusion)
         self.pace = 0

@@ -13,7 +13,8 @@ from livessl import wire
 from livessl.capture.link import Link
 from livessl.clock import SystemClock
 from livessl.core.types import Frame
-from livessl.server.receiver import QUEUE_MESSAGES, BindError, Joined, Left, Receiver
+from livessl.server.inlet import QUEUE_MESSAGES
+from livessl.server.receiver import BindError, Joined, Left, Receiver
 from small_site import frame, mark, site_of, wait_until
 
 CLOCK = SystemClock()

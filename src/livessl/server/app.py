@@ -24,6 +24,7 @@ from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
+from livessl.server.overload import Overload
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
@@ -87,10 +88,11 @@ def assemble(
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
         latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
-        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, publish)
+        overload = Overload(clock)
+        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, publish)
         event_log = EventLog(site.site, clock, store, latency, publish_event)
-        publisher = Publisher(publish, receiver.request, site_time, event_log, tracks, maps, latency)
-        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher)
+        publisher = Publisher(publish, receiver.request, site_time, event_log, tracks, maps, latency, overload)
+        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload)
         undo.pop_all()
     return Parts(
         site=site,
@@ -104,6 +106,7 @@ def assemble(
         tracks=tracks,
         maps=maps,
         latency=latency,
+        overload=overload,
         store=store,
         sinks=sinks,
         fanout=fanout,

@@ -16,6 +16,7 @@ from livessl.core.stream.array_health import ArrayState, ArrayStatus, NodeReport
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
+from livessl.server.overload import Overload
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.site.build.pipeline import activity_parameters
@@ -44,6 +45,8 @@ class ArrayStates:
     site_time : SiteTime
     ingest : Ingest
         Counts what the nodes sent.
+    overload : Overload
+        Knows what is shed.
     publish : callable
         Gets the message `arrays` for subscribers.
     """
@@ -55,6 +58,7 @@ class ArrayStates:
         store: Store,
         site_time: SiteTime,
         ingest: Ingest,
+        overload: Overload,
         publish: Callable[[JsonObject], None],
     ) -> None:
         self._site = site
@@ -63,6 +67,7 @@ class ArrayStates:
         self._store = store
         self._site_time = site_time
         self._ingest = ingest
+        self._overload = overload
         self._publish = publish
         self._fusion: TwoPassFusion | None = None
         self._disabled = store.disabled(site.site)  # replaced as a whole, never changed, so that readers need no lock
@@ -124,7 +129,15 @@ class ArrayStates:
                 _log.info("array %r is %s%s", array["name"], array["state"], why)
             self._reported[array["name"]] = array["state"]
         now_utc = utc_text(self._site_time.now_ns())
-        self._publish({"kind": "arrays", "now_utc": now_utc, "mode": self._site_time.mode, "arrays": arrays})
+        self._publish(
+            {
+                "kind": "arrays",
+                "now_utc": now_utc,
+                "mode": self._site_time.mode,
+                "arrays": arrays,
+                "overload": self._overload.message,
+            }
+        )
 
     def _described(self, status: ArrayStatus, fusion: TwoPassFusion) -> JsonObject:
         status = replace(status, counters=self._counters(status, fusion))
@@ -148,4 +161,5 @@ class ArrayStates:
             "asked": fusion.asked.get(name, 0),
             "helped": fusion.helped.get(name, 0),
             "too_late": fusion.too_late.get(name, 0),
+            "shed": self._ingest.shed[name],
         }

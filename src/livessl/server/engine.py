@@ -13,6 +13,7 @@ from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
+from livessl.server.overload import Overload
 from livessl.server.parallel import Parallel
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Greeted, Inbox, Joined, Left
@@ -42,6 +43,7 @@ class Engine:
     event_log : EventLog
     maps : Maps
     publisher : Publisher
+    overload : Overload
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class Engine:
         event_log: EventLog,
         maps: Maps,
         publisher: Publisher,
+        overload: Overload,
     ) -> None:
         self._site = site
         self._clock = clock
@@ -63,6 +66,7 @@ class Engine:
         self._event_log = event_log
         self._maps = maps
         self._publisher = publisher
+        self._overload = overload
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -97,7 +101,10 @@ class Engine:
         The thread calls it for ever; without the thread, any other caller may.
         """
         batch: list[Message] = []
-        for item in self._receiver.take(BATCH, WAIT_S):
+        began_ns = self._clock.monotonic_ns()
+        items = self._receiver.take(BATCH, WAIT_S)
+        self._adapt(len(items), self._clock.monotonic_ns() - began_ns)
+        for item in items:
             if isinstance(item, Joined | Greeted | Left):
                 self._step(batch)
                 batch = []
@@ -112,6 +119,14 @@ class Engine:
         self._event_log.retry()
         self._array_states.watch()
 
+    def _adapt(self, items: int, waited_ns: int) -> None:
+        """Shed what the load demands; a replay waits instead, and nothing of it is shed."""
+        run, live = self._run, not self._site_time.is_replay
+        relief = self._overload.note(self._receiver.delay_s, items, waited_ns, sheds=live)
+        run.fusion.relieve(relief)
+        self._overload.updates_shed = self._updates_shed + run.fusion.updates_shed
+        self._receiver.ingest.keep_samples_of(run.fusion.located if relief.arrays is not None else None)
+
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
@@ -122,6 +137,7 @@ class Engine:
             raise
 
     def _begin(self, run: Run) -> None:
+        self._updates_shed = self._overload.updates_shed
         self._run = run
         self._array_states.follow(run.fusion)
         self._maps.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from livessl import wire
@@ -95,9 +95,12 @@ class Ingest:
         self._notice_ns = -NOTICE_NS
         self.malformed = 0
         """Malformed messages since the start."""
+        self._kept: frozenset[str] | None = None  # replaced as a whole, never changed
         names = [spec.name for spec in site.processed]
         self.duplicates = dict.fromkeys(names, 0)
         self.sequence_gaps = dict.fromkeys(names, 0)
+        self.shed = dict.fromkeys(names, 0)
+        """Live frames of each array whose samples were dropped for the load."""
 
     def note_final(self, until: Mapping[str, int]) -> None:
         """Acknowledge from now on that nodes may delete the frames before these.
@@ -108,6 +111,13 @@ class Ingest:
             Frame index, by the array's own clock, before which all events are final.
         """
         self._final_until = until
+
+    def keep_samples_of(self, arrays: frozenset[str] | None) -> None:
+        """Drop the samples of live frames of all arrays but these from now on; None keeps all.
+
+        The rest of such a frame is used: it is acknowledged, and its array takes part in the activity.
+        """
+        self._kept = arrays
 
     def problem_of(self, array: str) -> str | None:
         """Return what an array's node reports to be wrong with its device, None if nothing is."""
@@ -164,7 +174,15 @@ class Ingest:
             return Received(reply=wire.Ack(run_id="?", received={}, who_are_you=True))  # the node then sends them again
         if isinstance(message, Frame):
             peer.take(message)
+            message = self._relieved(message)
         return Received(message=message)
+
+    def _relieved(self, frame: Frame) -> Frame:
+        kept = self._kept
+        if kept is None or frame.array in kept:
+            return frame
+        self.shed[frame.array] += 1
+        return replace(frame, samples=frame.samples[:, :0].copy())
 
     def _wrong_rate(self, peer: Peer, frame: Frame) -> str | None:
         """Return what is wrong with a frame's sampling rate; a backlog may have another rate than was announced."""

@@ -11,6 +11,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
+from livessl.server.overload import Overload
 from livessl.server.receiver import Inbox
 from livessl.server.refusals import Refusals
 from livessl.server.sinks import Sinks
@@ -35,6 +36,7 @@ class Parts:
     tracks: Tracks
     maps: Maps
     latency: Latency
+    overload: Overload
     store: Store
     sinks: Sinks
     fanout: Fanout

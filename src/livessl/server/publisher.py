@@ -11,6 +11,7 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.event_log import EventLog
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
+from livessl.server.overload import Overload
 from livessl.server.run import Run
 from livessl.server.site_time import SiteTime
 from livessl.server.tracks import Tracks
@@ -30,6 +31,8 @@ class Publisher:
     tracks : Tracks
     maps : Maps
     latency : Latency
+    overload : Overload
+        Knows whether maps are drawn.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class Publisher:
         tracks: Tracks,
         maps: Maps,
         latency: Latency,
+        overload: Overload,
     ) -> None:
         self._publish = publish
         self._request = request
@@ -49,6 +53,7 @@ class Publisher:
         self._tracks = tracks
         self._maps = maps
         self._latency = latency
+        self._overload = overload
 
     def publish(self, outputs: Iterable[Output | FinalResults], run: Run) -> None:
         """Publish what one step of a run has found; a run that has not received anything finds nothing."""
@@ -69,7 +74,8 @@ class Publisher:
                     self._tracks.note(output, message)
                     self._publish(message)
                 case Window():
-                    self._maps.show(output, run.fusion.power_maps)
+                    if self._overload.relief.maps:
+                        self._maps.show(output, run.fusion.power_maps)
                 case BackfillRequest():
                     self._request(output)
                 case _:

@@ -8,17 +8,17 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from queue import Empty, Full, Queue
 from typing import Final, Protocol
 
 import zmq
 
 from livessl import wire
 from livessl.clock import Clock
-from livessl.core.types import BackfillRequest, Message
+from livessl.core.types import BackfillRequest, Frame, Message
 from livessl.errors import RunError
 from livessl.server.guard import guard
 from livessl.server.ingest import Ingest
+from livessl.server.inlet import Inlet
 from livessl.server.latency import Arrival, Arrivals
 from livessl.server.refusals import Refusals
 from livessl.site.addresses import needs_ipv6
@@ -28,8 +28,13 @@ from livessl.site.models import Site
 POLL_MS: Final = 20
 """Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
-QUEUE_MESSAGES: Final = 1000
-"""Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
+PEER_MESSAGES: Final = 8
+"""Messages of one node that ZeroMQ receives before they are read: 0.2 s of two arrays. The rest waits with the node,
+whose memory is bounded, while by ZeroMQ's default each node would fill 35 MB here."""
+
+DRAIN: Final = 64
+"""Most messages that are read before they are put into the queue: one frame index of 64 arrays. Waking the fusion for
+each of them costs more than decoding it."""
 
 BUSY_MESSAGES: Final = 100
 """Queue length from which the fast acknowledgements (`ingest.SOON_NS`) pause, so that backlogs do not delay live
@@ -110,6 +115,11 @@ class Inbox(Protocol):
         """The error that has ended its thread, if it has ended."""
         ...
 
+    @property
+    def delay_s(self) -> float:
+        """How long the first item of the last `take` had waited, in seconds; 0 if there was none."""
+        ...
+
     def start(self) -> None:
         """Begin to receive."""
         ...
@@ -151,7 +161,7 @@ class Receiver:
         self.enrolled = [] if keys is None else sorted(keys.nodes)
         self._guarded = keys is not None
         self._clock = clock
-        self._queue: Queue[Item] = Queue(QUEUE_MESSAGES)
+        self._inlet: Inlet[Item] = Inlet(clock)
         self._requests: deque[BackfillRequest] = deque()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
@@ -159,6 +169,7 @@ class Receiver:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, PEER_MESSAGES)
         self._socket.setsockopt(zmq.IPV6, needs_ipv6(site.server.bind))
         self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_MESSAGE_BYTES)
         if keys is not None:
@@ -189,7 +200,17 @@ class Receiver:
     @property
     def queued(self) -> int:
         """Number of items in the queue."""
-        return self._queue.qsize()
+        return len(self._inlet)
+
+    @property
+    def queued_bytes(self) -> int:
+        """Bytes of sound in the queue."""
+        return self._inlet.nbytes
+
+    @property
+    def delay_s(self) -> float:
+        """How long the first item of the last `take` had waited, in seconds; 0 if there was none."""
+        return self._inlet.delay_s
 
     def request(self, request: BackfillRequest) -> None:
         """Send a request for missing frames to the node of an array; from any thread."""
@@ -197,20 +218,14 @@ class Receiver:
 
     def take(self, most: int, wait_s: float) -> list[Item]:
         """Return up to `most` items that have arrived, in order; wait up to `wait_s` for the first one."""
-        items: list[Item] = []
-        try:
-            items.append(self._queue.get(timeout=wait_s))
-            while len(items) < most:
-                items.append(self._queue.get_nowait())
-        except Empty:
-            pass
-        return items
+        return self._inlet.take(most, wait_s)
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
                 if self._socket.poll(POLL_MS):
-                    self._drain()
+                    while not self._stop.is_set() and self._drain():
+                        self._acknowledge()
                 self._acknowledge()
                 self._send_requests()
         except BaseException as error:
@@ -221,37 +236,44 @@ class Receiver:
     def _fail(self, error: BaseException) -> None:
         self.failure = error
 
-    def _drain(self) -> None:
-        for _ in range(QUEUE_MESSAGES):
+    def _drain(self) -> bool:
+        """Read up to `DRAIN` messages and put them into the queue; return whether there may be more."""
+        read: list[tuple[int, Item]] = []
+        more = True
+        while more and len(read) < DRAIN:
             try:
                 address, *parts = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
-                return
-            routing_id, data = address.bytes, b"".join(part.bytes for part in parts)
+                more = False
+                break
             enrolled = str(parts[0].get("User-Id")) if self._guarded else None
-            received = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
-            if received.joined is not None:
-                self._put(Joined(received.joined))
-            if received.greeted is not None:
-                self._put(Greeted(received.greeted))
-            if received.left is not None:
-                self._put(Left(received.left))
-            if received.message is not None:
-                self.arrivals.note(received.message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
-                self._put(received.message)
-            if received.offer is not None:
-                self._reply(routing_id, received.offer)
-            if received.reply is not None:
-                self._reply(routing_id, received.reply)
+            self._take_in(address.bytes, b"".join(part.bytes for part in parts), enrolled, read)
+        self._put(read)
+        return more
 
-    def _put(self, item: Item) -> None:
-        while not self._stop.is_set():
-            try:
-                self._queue.put(item, timeout=0.1)
-            except Full:
+    def _take_in(self, routing_id: bytes, data: bytes, enrolled: str | None, read: list[tuple[int, Item]]) -> None:
+        """Take in one message; add what the fusion gets of it to `read`, each with its bytes."""
+        received = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
+        if received.joined is not None:
+            read.append((0, Joined(received.joined)))
+        if received.greeted is not None:
+            read.append((0, Greeted(received.greeted)))
+        if received.left is not None:
+            read.append((0, Left(received.left)))
+        message = received.message
+        if message is not None:
+            self.arrivals.note(message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+            read.append((message.samples.nbytes if isinstance(message, Frame) else 0, message))
+        if received.offer is not None:
+            self._reply(routing_id, received.offer)
+        if received.reply is not None:
+            self._reply(routing_id, received.reply)
+
+    def _put(self, items: Sequence[tuple[int, Item]]) -> None:
+        while items and not self._stop.is_set():
+            items = items[self._inlet.put(items, 0.1) :]
+            if items:
                 self._acknowledge()
-            else:
-                return
 
     def _acknowledge(self) -> None:
         soon = self.queued < BUSY_MESSAGES

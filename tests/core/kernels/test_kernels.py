@@ -103,6 +103,17 @@ def test_windows_are_a_hop_apart_and_padded_with_zeros(kernels: ModuleType) -> N
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
+@pytest.mark.parametrize(("factor", "length", "count"), [(1, 50, 42), (3, 50, 14), (3, 9, 1), (4, 8, 0)])
+def test_every_so_many_filtered_values_are_kept(kernels: ModuleType, factor: int, length: int, count: int) -> None:
+    rng = np.random.default_rng(1)
+    samples, taps = rng.standard_normal((2, length)).astype(np.float32), rng.standard_normal(9).astype(np.float32)
+    lower = np.full((2, count), np.nan, np.float32)
+    kernels.decimate(samples, taps, factor, lower)
+    expected = [[samples[k, factor * n : factor * n + 9] @ taps for n in range(count)] for k in range(2)]
+    np.testing.assert_allclose(lower, np.reshape(expected, (2, count)), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kernels", KERNELS)
 def test_mean_square_excludes_lags_near_the_peak(kernels: ModuleType) -> None:
     lags_s = np.arange(-20, 21) / 1000.0
     values = np.ones((2, 41), np.float32)

@@ -277,7 +277,7 @@ class LagSampling:
         self.room = int(np.ceil(self._reach * step))
         self._lags_s = np.arange(-self._reach, self._reach + 1) * np.float64(step / sample_rate_hz)
         self._weights = _least_squares(self._lags_s, self.fine_lags_s, band_hz)
-        self._matrices: dict[tuple[int, bool], Float32Array] = {}
+        self._matrices: dict[tuple[int, float, bool], Float32Array] = {}
 
     @classmethod
     def shared(cls, band_hz: tuple[float, float], sample_rate_hz: float, largest_lag_s: float) -> LagSampling:
@@ -289,7 +289,7 @@ class LagSampling:
     ) -> ComplexArray | Float32Array:
         """GCC at the near-Nyquist lags, (P, count) float32, or its analytic signal, complex64."""
         kept, bins = cross.bins_below(cut_off_hz), cross.whitened.shape[1]
-        if bins > _PRODUCT_BINS:
+        if bins > _PRODUCT_BINS and cross.sample_rate_hz == self._rate_hz:
             count = cross.n_fft // FFT_FACTOR * self._per_factor
             return cross.around_zero(count, self._reach, cut_off_hz, envelope=envelope)
         matrix = self._matrix(cross, envelope=envelope)
@@ -305,9 +305,9 @@ class LagSampling:
 
     def _matrix(self, cross: CrossSpectra, *, envelope: bool) -> Float32Array:
         """Real form of e^{j 2 pi f tau}: rows (Re, Im) for each bin, columns for the lags, or (Re, Im) of them."""
-        key = (cross.n_fft, envelope)
+        key = (cross.n_fft, cross.sample_rate_hz, envelope)
         if key not in self._matrices:
-            frequency_hz = (cross.low + np.arange(cross.whitened.shape[1])) * (self._rate_hz / cross.n_fft)
+            frequency_hz = (cross.low + np.arange(cross.whitened.shape[1])) * (cross.sample_rate_hz / cross.n_fft)
             phase = 2.0 * np.pi * frequency_hz[:, None] * self._lags_s
             cosine, sine = np.cos(phase), np.sin(phase)
             real = np.stack([cosine, -sine], axis=1).reshape(-1, self.count)

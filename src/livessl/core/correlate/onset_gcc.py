@@ -27,6 +27,7 @@ import numpy as np
 import scipy.fft
 
 from livessl.core.correlate.band import band_bins
+from livessl.core.correlate.decimation import Decimator, decimation
 from livessl.core.correlate.gcc_phat import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
 from livessl.core.correlate.spectra import Spectra, fast_length
 from livessl.core.kernels import kernels
@@ -121,15 +122,21 @@ class OnsetFrontEnd:
         self._band_hz = spec.band_hz
         self._pairs = microphone_pairs(len(spec.microphones_m))
         self._envelope = uses_envelope(spec.band_hz)
-        usual, least = round(WINDOW_S * sample_rate_hz), _WINDOW_LAGS * sampling.room
+        factor = decimation(sample_rate_hz, spec.band_hz)
+        self._rate_hz = sample_rate_hz / factor  # of what is correlated
+        self._decimator = (
+            Decimator(len(spec.microphones_m), factor, sample_rate_hz, spec.band_hz[1]) if factor > 1 else None
+        )
+        room = -(-sampling.room // factor)
+        usual, least = round(WINDOW_S * self._rate_hz), _WINDOW_LAGS * room
         self._wide, length = least > usual, max(least, usual)
         self._hop = round(HOP_S / WINDOW_S * length)
-        self._n_fft = fast_length(length + sampling.room)
+        self._n_fft = fast_length(length + room)
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
-        self._band = slice(*band_bins(self._n_fft, sample_rate_hz, spec.band_hz))
-        hop_s = self._hop / sample_rate_hz
+        self._band = slice(*band_bins(self._n_fft, self._rate_hz, spec.band_hz))
+        hop_s = self._hop / self._rate_hz
         self._parameters = OnsetParameters(
-            least=np.float32(_LEAST_POWER * np.square(self._window).sum()),
+            least=np.float32(_LEAST_POWER / factor * np.square(self._window).sum()),
             decay=np.float32(np.exp(-hop_s / PAST_S)),
             loud=_LOUD,
             strongest=_STRONGEST,
@@ -155,6 +162,8 @@ class OnsetFrontEnd:
         """Start over after a gap: the next frame does not continue the last one."""
         self._tail = self._tail[:, :0]
         self._state.windows[:] = 0
+        if self._decimator is not None:
+            self._decimator.reset()
 
     def push(self, samples: Float32Array, *, quiet: bool) -> OnsetGCC:
         """Return the onset GCC of the windows that the next frame completes.
@@ -166,7 +175,8 @@ class OnsetFrontEnd:
         quiet : bool
             Whether there is no sound in it; the noise is learned from quiet frames.
         """
-        joined = np.concatenate([self._tail, samples], axis=1)
+        kept = samples if self._decimator is None else self._decimator.push(samples)
+        joined = np.concatenate([self._tail, kept], axis=1)
         length = len(self._window)
         hops = max(0, (joined.shape[1] - length) // self._hop + 1)
         self._tail = joined[:, hops * self._hop :].copy()
@@ -182,7 +192,7 @@ class OnsetFrontEnd:
 
     def _cross(self, spectra: Spectra, weights: Float32Array, noises: Float32Array) -> CrossSpectra:
         noisy = None if self._wide else _NOISY * noises
-        return CrossSpectra(spectra, self._pairs, self.sample_rate_hz, self._band_hz, weights, noise=noisy)
+        return CrossSpectra(spectra, self._pairs, self._rate_hz, self._band_hz, weights, noise=noisy)
 
     def push_segments(self, segments: Iterable[Float32Array]) -> OnsetGCC:
         """Return the sum over segments (K, n) whose context is unknown: each is taken to begin after silence."""

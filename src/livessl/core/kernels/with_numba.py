@@ -63,6 +63,24 @@ def cell_intervals(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
 
 
 @_compiled
+def decimate(samples, taps, factor, lower):  # type: ignore[no-untyped-def]
+    """Filter samples by taps and keep every value in `factor`."""
+    count, length = lower.shape[1], samples.shape[1]
+    phases = np.empty((factor, -(-length // factor)), np.float32)
+    for k in range(len(samples)):
+        row, out = samples[k], lower[k]
+        for p in range(factor):  # apart, so that the loop over the values has no gaps
+            phase = phases[p]
+            for n in range((length - p + factor - 1) // factor):
+                phase[n] = row[p + n * factor]
+        out[:] = np.float32(0.0)
+        for t in range(len(taps)):
+            tap, phase = taps[t], phases[t % factor][t // factor :]
+            for n in range(count):
+                out[n] += tap * phase[n]
+
+
+@_compiled
 def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
     """Cut weighed windows out of samples, with zeros after them."""
     length = len(window)

@@ -23,6 +23,15 @@ if TYPE_CHECKING:
 NAME: Final = "NumPy"
 
 
+def decimate(samples: Float32Array, taps: Float32Array, factor: int, lower: Float32Array) -> None:
+    """Filter samples (K, N) by taps and keep every value in `factor`: lower (K, m), m >= 1 only where all taps fit."""
+    reach = (lower.shape[1] - 1) * factor + 1
+    lower[:] = 0.0
+    if lower.shape[1]:
+        for t, tap in enumerate(taps):
+            lower += tap * samples[:, t : t + reach : factor]
+
+
 def cut_windows(samples: Float32Array, hop: int, window: Float32Array, windows: Float32Array) -> None:
     """Cut windows (T, K, n) out of samples (K, N), `hop` samples apart: weighed by `window`, then zeros."""
     length = len(window)

@@ -127,6 +127,8 @@ class ArrayHealth:
     def take_frame(self, frame: Frame, now_ns: int) -> None:
         """Take in the newest frame."""
         self.power, self.active = frame.power, frame.active
+        if not frame.samples.size:
+            return
         self._find_dead(now_ns, _alive(frame.samples))
         if frame.active and frame.frame_index % WEAK_FRAMES == 0:
             self._find_weak(now_ns, frame.samples)

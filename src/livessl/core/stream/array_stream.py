@@ -157,6 +157,6 @@ class ArrayStream:
     def _channel_power(self) -> tuple[float, ...]:
         """Return the channels' powers at the newest frame index, from its frame or mark."""
         newest = self.frames.get(self.complete_until) if self.complete_until is not None else None
-        if newest is not None:
+        if newest is not None and newest.samples.size:
             return tuple(float(power) for power in band_power(newest.samples, newest.sample_rate_hz, self.spec.band_hz))
         return self.health.mark.channel_power if self.health.mark else ()

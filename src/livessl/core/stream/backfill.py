@@ -67,7 +67,7 @@ class Backfill:
         excerpt = event.excerpt
         if excerpt is None or is_sure(event.results[0]) or not excerpt.sounds.has_onsets:
             return {}  # without onsets the estimator gives every array the same weight, whatever it received
-        silent = [name for name in present if self._state.may_request(name) and name not in excerpt.sounds]
+        silent = [name for name in present if self._state.may_request(name) and name not in excerpt.powers]
         if not silent:
             return {}
         span = span[: round(MOST_REQUESTED_S / FRAME_S)]

@@ -79,7 +79,7 @@ class CorrelationCache:
             if frame_index in correlations.onsets:
                 continue
             frame = frames.get(frame_index)
-            if frame is None:
+            if frame is None or not frame.samples.size:
                 correlations.run = None
                 continue
             before = correlations.run

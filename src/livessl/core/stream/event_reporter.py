@@ -104,7 +104,7 @@ class EventReporter:
             return
         span = range(self._alignment.pre_roll_start(event.start), event.closed + 1)
         excerpt = self._collector.event(span)
-        if not excerpt.sounds:
+        if not excerpt.powers:
             return
         verdict = self._verdicts.locate_event(event, excerpt, self._alignment.now_ns)
         event.set_results(verdict.events, excerpt)

@@ -17,6 +17,7 @@ from livessl.core.locate.estimator import Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_stream import ArrayStream
+from livessl.core.stream.load_policy import Clearest
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, FloatArray, Frame
 
@@ -124,7 +125,8 @@ class Excerpt:
     start_ns, end_ns : int
         Site time of its first frame's start and of its last frame's end.
     powers : dict of array to (n,) float64
-        In-band mean power of each frame, full scale squared.
+        In-band mean power of each frame, full scale squared, of every array that detected it: also of those that it is
+        not located from, because it is clearer to enough others.
     """
 
     sounds: Sounds
@@ -175,6 +177,7 @@ class EvidenceCollector:
     """
 
     def __init__(self, state: SiteState, alignment: Alignment, *, correlates_ahead: bool) -> None:
+        self._state = state
         self._cache = state.cache
         self._votes = state.votes
         self._parameters = state.parameters
@@ -182,6 +185,50 @@ class EvidenceCollector:
         self._correlates_ahead = correlates_ahead
         self._ahead: range | None = None  # frame indices that the streams' upcoming correlations have followed
         self._onset_strength: dict[str, float] = {}  # of each array, in the event that goes on
+        self._clearest = Clearest()  # of the event that goes on
+        self._begin = 0  # frame index at which it begins, pre-roll included
+        self._postponed: list[int] = []  # quiet frame indices of the event that are correlated if sound follows
+        self._located: frozenset[str] | None = None
+
+    # --- the arrays that an event is located from
+
+    @property
+    def located(self) -> frozenset[str] | None:
+        """Arrays that the event that goes on is located from; None for all."""
+        return self._located
+
+    def end_event(self) -> None:
+        """Forget which arrays the event was located from."""
+        self._located = None
+
+    def _choose(self, frame_indices: Iterable[int]) -> list[ArrayStream]:
+        """Choose the arrays that the event is located from; return those of them that were not chosen before.
+
+        Parameters
+        ----------
+        frame_indices : iterable of int
+            Frame indices that have closed since the last choice.
+        """
+        streams = self._alignment.streams
+        for frame_index in frame_indices:
+            for name, stream in streams.items():
+                frame = stream.frames.get(frame_index)
+                if frame is not None:
+                    self._clearest.note(name, frame.power, active=frame.active)
+        limit = self._state.most_arrays
+        if len(streams) <= limit:
+            self._located = None
+            return []
+        joined = self._clearest.choose(limit)
+        self._located = self._clearest.chosen
+        return [streams[name] for name in joined]
+
+    def _is_located(self, stream: ArrayStream) -> bool:
+        return self._located is None or stream.spec.name in self._located
+
+    def _streams(self) -> list[ArrayStream]:
+        """Return the streams of the arrays that the event is located from."""
+        return [stream for stream in self._alignment.streams.values() if self._is_located(stream)]
 
     # --- correlations
 
@@ -192,26 +239,43 @@ class EvidenceCollector:
         because of its length, they continue.
         """
         self._onset_strength = {}
-        span, streams = range(self._alignment.pre_roll_start(start), start), self._alignment.streams.values()
-        if start != self._alignment.reported_until:
-            is_ready = self._ahead == span and all(
-                stream.upcoming.has(k for k in span if k in stream.frames) for stream in streams
-            )
-            for stream in streams:
-                stream.begin_correlations(from_upcoming=is_ready)
-            if not is_ready:
-                self._correlate(streams, span)
+        self._postponed.clear()
+        self._begin = self._alignment.pre_roll_start(start)
+        span = range(self._begin, start)
+        goes_on = start == self._alignment.reported_until
+        if not goes_on:
+            self._clearest = Clearest()
+        self._choose([*span, start])
+        if not goes_on:
+            streams = self._streams()
+            is_ready = self._ahead == span
+            late: list[ArrayStream] = []
+            for stream in self._alignment.streams.values():
+                is_ahead = is_ready and stream.upcoming.has(k for k in span if k in stream.frames)
+                stream.begin_correlations(from_upcoming=is_ahead)
+                if not is_ahead:
+                    late.append(stream)
+            self._correlate([stream for stream in streams if stream in late], span)
         self._ahead = None
 
-    def correlate(self, frame_index: int) -> None:
-        """Correlate the frames of all arrays at a frame index that belongs to an event."""
-        self._correlate(self._alignment.streams.values(), [frame_index])
+    def correlate(self, frame_index: int, *, active: bool) -> None:
+        """Correlate the frames of an event at a frame index, of which `active` says whether any array is active.
+
+        While the server is overloaded, quiet frames are correlated only once sound follows them.
+        """
+        joined = self._choose([frame_index])
+        if not (active or self._state.relief.ahead):
+            self._postponed.append(frame_index)
+            return
+        self._correlate(joined, range(self._begin, frame_index))
+        self._correlate(self._streams(), [*self._postponed, frame_index])
+        self._postponed.clear()
 
     def correlate_arrived(self, frame_index: int) -> None:
         """Correlate the frames that have arrived of a frame index that still waits for other arrays."""
-        streams = self._alignment.streams.values()
-        here = [s for s in streams if frame_index in s.frames and frame_index not in s.correlations.onsets]
-        self._correlate(here, [frame_index])
+        here = [s for s in self._streams() if frame_index in s.frames and frame_index not in s.correlations.onsets]
+        if here and not self._postponed and (self._state.relief.ahead or any(s.has_active(frame_index) for s in here)):
+            self._correlate(here, [frame_index])
 
     def correlate_ahead(self, frame_index: int, begin: int | None) -> None:
         """Correlate a quiet frame index, which may be in the pre-roll of the next sound.
@@ -224,13 +288,13 @@ class EvidenceCollector:
             First frame index after the last sound. The pre-roll of the next sound begins there if that sound comes
             soon; otherwise its start is not known yet.
         """
-        if not self._correlates_ahead or begin is None:
+        if begin is None or not (self._correlates_ahead and self._state.relief.ahead):
             return
         if frame_index - begin >= self._parameters.activity.pre_roll_frames:
             return
-        streams = self._alignment.streams.values()
+        streams = self._streams()
         if frame_index == begin:
-            for stream in streams:
+            for stream in self._alignment.streams.values():
                 stream.begin_upcoming()
         elif self._ahead != range(begin, frame_index):
             return
@@ -252,16 +316,21 @@ class EvidenceCollector:
         Call it every `RELEASE_FRAMES` of an event.
         """
         streams = self._alignment.streams
-        if len(streams) <= KEPT_ARRAYS:
+        kept = min(KEPT_ARRAYS, self._state.most_arrays)
+        if len(streams) <= kept:
             return
         lately, strength = range(frame_index - RELEASE_FRAMES + 1, frame_index + 1), self._onset_strength
         for name, stream in streams.items():
-            strength[name] = strength.get(name, 0.0) + sum(onsets.weight for onsets in stream.correlations.at(lately))
+            if self._is_located(stream):
+                onsets = stream.correlations.at(lately)
+                strength[name] = strength.get(name, 0.0) + sum(one.weight for one in onsets)
+            else:
+                strength[name] = -1.0
         strongest = sorted(strength, key=lambda name: -strength[name])
         window_s, hang_over_s = self._parameters.window_s, self._parameters.activity.hang_over_s
         before = frame_index - round((window_s + hang_over_s) / FRAME_S)
-        for name in strongest[KEPT_ARRAYS:]:
-            if streams[name].correlations.onsets:
+        for name in strongest[kept:]:
+            if streams[name].correlations.onsets or strength[name] < 0.0:
                 streams[name].release_samples(before)
 
     # --- excerpts
@@ -274,8 +343,10 @@ class EvidenceCollector:
         for name, stream in self._alignment.streams.items():
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
             if segments and not self._votes.is_suspect(name):
-                powers = np.array([stream.frames[k].power for k in there])
-                excerpt.add(name, segments, stream.correlations.at(window), powers)
+                excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
+                onsets = stream.correlations.at(window)
+                if self._is_located(stream) and (onsets or Segments(segments)):
+                    excerpt.sounds.add(name, segments, onsets)
         return excerpt
 
     def whole_sounds(self, arrays: Iterable[str], span: range) -> list[tuple[ArraySpec, list[Frame]]]:
@@ -303,9 +374,14 @@ class EvidenceCollector:
         segments, _ = stream.segments(frame_indices)
         if not segments:
             return
-        if not stream.correlations.has(there) and stream.has_samples(there):  # some frames came late
-            stream.begin_correlations()
-            self._correlate([stream], span)
         start, end = frame_indices[0], frame_indices[-1] + 1
-        excerpt.add(stream.spec.name, segments, stream.correlations.at(range(span.start, end)), power[mask])
+        excerpt.powers[stream.spec.name] = power[mask]
+        if self._is_located(stream):
+            needed = [frame_index for frame_index in there if frame_index < end]
+            if not stream.correlations.has(needed) and stream.has_samples(needed):  # some frames came late
+                stream.begin_correlations()
+                self._correlate([stream], range(span.start, end))
+            onsets = stream.correlations.at(range(span.start, end))
+            if onsets or Segments(segments):
+                excerpt.sounds.add(stream.spec.name, segments, onsets)
         excerpt.extend(start * FRAME_NS - stream.rest_ns, end * FRAME_NS - stream.rest_ns)

@@ -17,6 +17,7 @@ from livessl.core.stream.alignment import is_ahead_of_clock, is_too_old
 from livessl.core.stream.array_health import ArrayStatus, NodeReport
 from livessl.core.stream.fusion import Fusion, Role
 from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
+from livessl.core.stream.load_policy import Relief
 from livessl.core.stream.reception import FinalReception, earlier, later
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Mark, Message, Output, Window
@@ -95,6 +96,20 @@ class TwoPassFusion:
     def updates_left_out(self) -> int:
         """Number of windows that were not located, because newer ones were due."""
         return self._early.updates_left_out
+
+    @property
+    def updates_shed(self) -> int:
+        """Number of windows that were not located, because the server was overloaded."""
+        return self._early.updates_shed
+
+    @property
+    def located(self) -> frozenset[str] | None:
+        """Arrays that the event that goes on is located from; None for all, and while there is no event."""
+        return self._early.located
+
+    def relieve(self, relief: Relief) -> None:
+        """Shed this from now on: see `load_policy`."""
+        self._state.relieve(relief)
 
     @property
     def held_bytes(self) -> int:
@@ -229,7 +244,7 @@ class TwoPassFusion:
 
         Arrays that are away are awaited until the frames of the others are overdue.
         """
-        self._held.expire(now_ns, self._position)
+        self._held.expire(now_ns, self._position, shedding=self._state.relief.arrays is not None)
         connected: list[int | None] = []
         away: list[int | None] = []
         for name, reception in self._receptions.items():

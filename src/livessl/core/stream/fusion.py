@@ -75,6 +75,8 @@ class Fusion:
         self._due: int | None = None  # last frame index of the window that is to be located in this step
         self.updates_left_out = 0
         """Number of windows that were not located, because newer ones were due."""
+        self.updates_shed = 0
+        """Number of windows that were not located, because the server was overloaded."""
         self._correct_clocks()
 
     # --- steps
@@ -153,6 +155,11 @@ class Fusion:
     def is_in_event(self) -> bool:
         """True while an event has begun and has not been reported."""
         return self._event is not None
+
+    @property
+    def located(self) -> frozenset[str] | None:
+        """Arrays that the event that goes on is located from; None for all, and while there is no event."""
+        return self._collector.located
 
     @property
     def needed_from(self) -> int | None:
@@ -239,7 +246,7 @@ class Fusion:
             self._collector.correlate_ahead(frame_index, self._alignment.reported_until)
             return []
         event.close(frame_index, active=active)
-        self._collector.correlate(frame_index)
+        self._collector.correlate(frame_index, active=active)
         if active:
             self._collector.discard_ahead()
         else:
@@ -248,7 +255,10 @@ class Fusion:
             return self._end(event, became_quiet=True)
         outputs: list[Output] = []
         if self._role.updates and active and event.length % self._parameters.update_frames == 0:
-            outputs += self._update_now_or_later(event)
+            if self._is_update_shed(event):
+                self.updates_shed += 1
+            else:
+                outputs += self._update_now_or_later(event)
         if event.length * FRAME_S >= self._parameters.max_event_s:
             return outputs + self._end(event, became_quiet=False)
         if event.length % RELEASE_FRAMES == 0:
@@ -269,6 +279,10 @@ class Fusion:
         if due is None or event is None or event.state is not EventState.OPEN or due < event.start:
             return []
         return self._update(event, due)
+
+    def _is_update_shed(self, event: PendingEvent) -> bool:
+        every = self._state.relief.update_every
+        return every is None or event.length // self._parameters.update_frames % every != 0
 
     def _update_now_or_later(self, event: PendingEvent) -> list[Output]:
         if not self._role.newest_only:
@@ -309,6 +323,7 @@ class Fusion:
         """Report an event now, with the frames that have come."""
         results = self._reporter.report(event)
         self._event = None
+        self._collector.end_event()
         self._alignment.note_reported(event.last_active + 1)
         if event.became_quiet:
             self._correct_clocks()

@@ -14,6 +14,9 @@ HOLD_NS: Final = 600_000_000_000
 """Longest time, in nanoseconds, that frames are held for an array that is away. A restart, or the change of a cable or
 switch, takes less. Early results are reported meanwhile."""
 
+SHEDDING: Final = 4
+"""Divisor of the memory of frames that are held while arrays are shed, so that the server stays small."""
+
 HOLD_BYTES: Final = 256 * 1024 * 1024
 """Most memory, in bytes, of the frames that are held: five minutes of one array that is never quiet."""
 
@@ -62,7 +65,7 @@ class HeldFrames:
             frames.append(frame)
         return frames
 
-    def expire(self, now_ns: int, position: int | None) -> None:
+    def expire(self, now_ns: int, position: int | None, *, shedding: bool = False) -> None:
         """Advance `overdue_until` and `forced_until`.
 
         Parameters
@@ -70,8 +73,10 @@ class HeldFrames:
         now_ns : int
         position : int or None
             Frame index up to which the final pass has gone.
+        shedding : bool
+            Whether the server is overloaded and holds less.
         """
-        excess = self.nbytes - self._hold_bytes
+        excess = self.nbytes - (self._hold_bytes // SHEDDING if shedding else self._hold_bytes)
         while self._came:
             came_ns, frame_index, size = self._came[0]
             if excess > 0:

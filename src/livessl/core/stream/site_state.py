@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Final
 
 from livessl.core.locate.estimator import Estimator
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
+from livessl.core.stream.load_policy import NOTHING_SHED, Relief
 from livessl.core.stream.outlier_votes import OutlierVotes
 from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import ArraySpec, Frame, Message
+
+MOST_CORRELATED: Final = 32
+"""Most arrays whose frames are correlated for an event: those to which it is clearest, twice as many as the default
+method locates with. Correlating the others costs most of what an array costs, and does not move the position."""
 
 
 class SiteState:
@@ -48,6 +54,19 @@ class SiteState:
         self.votes = OutlierVotes(self.arrays)
         self._answering: set[str] = set()
         self._excluded: Collection[str] = ()
+        self.relief = NOTHING_SHED
+        """What is shed while the server is overloaded."""
+
+    def relieve(self, relief: Relief) -> None:
+        """Shed this from now on."""
+        self.relief = relief
+
+    @property
+    def most_arrays(self) -> int:
+        """Most arrays that an event or a window is located from; never fewer than `min_arrays`."""
+        shed = self.relief.arrays
+        least = self.parameters.min_arrays
+        return MOST_CORRELATED if shed is None else max(least, min(shed, MOST_CORRELATED))
 
     def exclude(self, arrays: Collection[str]) -> None:
         """Exclude these arrays from now on, and include all others again.

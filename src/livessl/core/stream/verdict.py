@@ -26,6 +26,9 @@ RANGE_APERTURES: Final = 2.0
 """Ratio of distance to aperture beyond which one array gives no distance: reverberation shifts its delays, which can
 move the position by metres along the line of sight and is not in the covariance."""
 
+NO_SOUND: Final = "the server was overloaded and kept none of its sound"
+"""Reason for which an event is refused if no array's samples are left."""
+
 
 def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
     """Decide whether a location is a position, only a direction, or neither, and why.
@@ -96,7 +99,8 @@ class Verdicts:
         backfilled = backfilled or {}
         used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
         count = "1 array" if len(used.sounds) == 1 else f"{len(used.sounds)} arrays"
-        first = self._refused(event, excerpt, now_ns, f"detected by {count}; fusion.min_arrays is {least}")
+        why = f"detected by {count}; fusion.min_arrays is {least}" if used.sounds else NO_SOUND
+        first = self._refused(event, excerpt, now_ns, why)
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
@@ -130,7 +134,7 @@ class Verdicts:
             estimate=None,
             power=excerpt.greatest_power,
             method=self._state.estimator.name,
-            heard_by=tuple(excerpt.sounds),
+            heard_by=tuple(excerpt.powers),
             late_frames=event.late_frames,
             latency_s=(now_ns - excerpt.end_ns) / 1e9,
             complete_ns=(event.closed + 1) * FRAME_NS,
@@ -202,7 +206,8 @@ def _contribution(
 ) -> Contribution:
     azimuth_deg, elevation_deg, distance_m = direction_deg(spec.centre_m, estimate.position_m)
     agrees: bool | None = None
-    if found.outliers is not None and len(found.evidence) > 1 and spec.name not in found.unneeded:
+    is_used = spec.name not in found.unneeded and any(part.spec.name == spec.name for part in found.evidence)
+    if found.outliers is not None and len(found.evidence) > 1 and is_used:
         agrees = spec.name not in found.outliers
     return Contribution(
         array=spec.name,

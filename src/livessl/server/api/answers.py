@@ -29,12 +29,14 @@ class HealthState(StrEnum):
     """Condition of the server.
 
     `ok`: every enabled array is healthy. `starting`: some have not sent anything yet. `degraded`: `reasons` says why.
-    `failed`: the server stops.
+    `overloaded`: sound arrives faster than the machine can locate it, and `load` says what is shed. `failed`: the
+    server stops.
     """
 
     OK = "ok"
     STARTING = "starting"
     DEGRADED = "degraded"
+    OVERLOADED = "overloaded"
     FAILED = "failed"
 
 
@@ -165,6 +167,45 @@ class Refused(BaseModel):
     http: int = Field(ge=0, description="Refused by the HTTP server.", examples=[0])
 
 
+class LoadState(StrEnum):
+    """Whether the server keeps up with the sound: `normal`, or `overloaded` while it sheds work."""
+
+    NORMAL = "normal"
+    OVERLOADED = "overloaded"
+
+
+class Shed(StrEnum):
+    """Work that is given up under overload, in this order.
+
+    `updates`: only some windows of a sound that goes on are located. `maps`: no power maps are drawn. `arrays`: sounds
+    are located from the few arrays to which they are clearest. `quiet`: frames of quiet are correlated only if sound
+    follows.
+    """
+
+    UPDATES = "updates"
+    MAPS = "maps"
+    ARRAYS = "arrays"
+    QUIET = "quiet"
+
+
+class Load(BaseModel):
+    """Load of the fusion, over the last five seconds."""
+
+    state: LoadState
+    level: int = Field(ge=0, description="How much is shed: 0 is nothing, each level is more.", examples=[0])
+    since_utc: UtcTime | None = Field(description="Since when the server is overloaded; null while it keeps up.")
+    delay_s: float = Field(
+        ge=0, description="Longest wait of a message before it was processed, in seconds.", examples=[0.012]
+    )
+    busy: float = Field(ge=0, le=1, description="Share of the time that the fusion works.", examples=[0.31])
+    messages_per_s: float = Field(ge=0, description="Messages of the nodes processed a second.", examples=[320.0])
+    shed: list[Shed] = Field(description="What is shed now.", examples=[[]])
+    updates_shed: int = Field(ge=0, description="Updates that were shed since the start.", examples=[0])
+    message: str | None = Field(
+        description="Figures and cure in words, while the server is overloaded; otherwise null.", examples=[None]
+    )
+
+
 class HealthStatus(_Versioned):
     """Health as everyone may read it, without a token."""
 
@@ -181,6 +222,7 @@ class Health(HealthStatus):
     reasons: list[str] = Field(
         description="What is wrong or worth knowing, one sentence each.", examples=[["north: its node has ended"]]
     )
+    load: Load
     privacy: Privacy
     secured: Secured
     refused: Refused

@@ -93,6 +93,7 @@ def _hello(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
         "last_seq": parts.fanout.last_seq,
         "role": role,
         "arrays": arrays,
+        "overload": parts.overload.message,
     }
 
 

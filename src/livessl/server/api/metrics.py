@@ -63,6 +63,19 @@ def server_metrics(parts: Parts) -> Iterator[Metric]:
         "Windows of this live run that were not localized, because newer ones were due.",
         parts.engine.updates_left_out,
     )
+    load = parts.overload.describe()
+    yield GaugeMetricFamily(
+        "livessl_overload_level", "How much work is shed; 0 while the server keeps up.", load["level"]
+    )
+    yield GaugeMetricFamily(
+        "livessl_fusion_delay_seconds", "Longest wait of a message before it was processed.", load["delay_s"]
+    )
+    yield GaugeMetricFamily("livessl_fusion_busy", "Share of the time that the fusion works.", load["busy"])
+    yield CounterMetricFamily(
+        "livessl_updates_shed",
+        "Windows that were not localized because the server was overloaded.",
+        load["updates_shed"],
+    )
     malformed = parts.receiver.ingest.malformed
     yield CounterMetricFamily("livessl_messages_refused", "Malformed messages from nodes.", malformed)
     refused = CounterMetricFamily("livessl_refused", "Peers and requests refused.", labels=["door", "reason"])

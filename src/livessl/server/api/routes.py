@@ -133,6 +133,7 @@ def state_routes(parts: Parts) -> APIRouter:
             "uptime_s": round(parts.site_time.uptime_s(), 3),
             "arrays": {a["name"]: a["state"] for a in arrays},
             "reasons": reasons,
+            "load": parts.overload.describe(),
             "privacy": _privacy(site),
             "secured": _secured(site),
             "refused": {door: parts.refusals.count(door) for door in ("nodes", "http")},
@@ -154,6 +155,9 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
+    overload = parts.overload.message
+    if overload is not None:
+        status, reasons = "overloaded", [overload, *reasons]
     if parts.failure is not None:
         return "failed", [f"fusion: {parts.failure!r}", *reasons]
     return status, reasons

@@ -285,6 +285,9 @@ class Counters(BaseModel):
     too_late: int = Field(
         ge=0, description="Buffered frames of a time whose final results were published without them.", examples=[0]
     )
+    shed: int = Field(
+        ge=0, description="Frames whose sound was not used because the server was overloaded.", examples=[0]
+    )
 
 
 class Array(BaseModel):
@@ -325,6 +328,15 @@ class Array(BaseModel):
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])
 
 
+Overloaded = Annotated[
+    str | None,
+    Field(
+        description="What an overloaded server sheds, with figures and the cure; null while it keeps up.",
+        examples=[None],
+    ),
+]
+
+
 class _Numbered(BaseModel):
     v: Version
     seq: Seq
@@ -340,6 +352,7 @@ class Hello(_Numbered):
     last_seq: Seq = Field(description="Number of the last message published before this connection.")
     role: RoleName = Field(description="Role of the client's token; `admin` where the site uses no tokens.")
     arrays: list[Array] = Field(description="State of every array.")
+    overload: Overloaded
 
 
 class EventMessage(_Numbered, Event):
@@ -379,6 +392,7 @@ class ArraysMessage(_Numbered):
     now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
     mode: Mode
     arrays: list[Array] = Field(description="State of every array.")
+    overload: Overloaded
 
 
 class Gap(BaseModel):

@@ -73,6 +73,7 @@ const HANDLERS = {
   arrays(message) {
     if (message.mode !== model.mode) changeMode(message.mode);
     model.takeArrays(message);
+    header.showOverload(message.overload);
     arraysPanel.show(model.arrays, Date.now(), "live");
     mapPanel.offer(model.arrays.map(({ array }) => array.name));
   },

@@ -64,6 +64,12 @@ export class Header {
     write(find("banner-for"), silence === null ? "" : suffix);
   }
 
+  /** Show what the server sheds because it is overloaded; `message` is null while it keeps up. */
+  showOverload(message) {
+    write(find("overload"), message ? `Server ${message}` : "");
+    find("overload").hidden = !message;
+  }
+
   /** Report that messages were skipped; `missed` is null where the server does not know how many. */
   showGap({ missed, reason }) {
     this.skipped = missed === null || this.skipped === null ? null : this.skipped + missed;
