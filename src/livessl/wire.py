@@ -177,13 +177,13 @@ def decode(data: bytes) -> WireMessage:
         raise WireError(f"expected a message of livessl beginning with {_MAGIC!r}, got {magic!r}")
     if version != VERSION:
         raise WireError(f"expected wire version {VERSION}, got {version}; run the same livessl on nodes and server")
-    body = data[_HEAD.size :]
+    body = memoryview(data)[_HEAD.size :]
     if kind == _FRAME_KIND:
         return _decode_frame(body)
     if kind == _MARK_KIND:
         return _decode_mark(body)
     if kind in _JSON_KINDS:
-        return _decode_json(_JSON_KINDS[kind], body)
+        return _decode_json(_JSON_KINDS[kind], bytes(body))
     raise WireError(f"expected a known kind of message, got {kind}")
 
 
@@ -218,7 +218,7 @@ def _encode_frame(frame: Frame) -> bytes:
     return b"".join([_head(_FRAME_KIND), fixed, name, frame.samples.astype("<f4", copy=False).tobytes()])
 
 
-def _decode_frame(body: bytes) -> Frame:
+def _decode_frame(body: memoryview) -> Frame:
     fixed = _unpack(_FRAME, body, "frame")
     name_length, sequence, frame_index, time_ns, rate, power, active, channels, n = fixed
     if not MIN_MICROPHONES <= channels <= MAX_MICROPHONES:
@@ -233,8 +233,9 @@ def _decode_frame(body: bytes) -> Frame:
     name, start = _name(body, _FRAME.size, name_length)
     if len(body) - start != 4 * channels * n:
         raise WireError(f"frame: expected {4 * channels * n} bytes of samples, got {len(body) - start}")
-    samples = np.frombuffer(body, dtype="<f4", offset=start).reshape(channels, n).astype(np.float32, copy=False)
-    largest = float(np.abs(samples).max())  # NaN if any sample is NaN
+    # copied once, so that the samples are aligned and the message can be freed
+    samples = np.frombuffer(body, dtype="<f4", offset=start).reshape(channels, n).astype(np.float32)
+    largest = max(float(samples.max()), -float(samples.min()))  # NaN if any sample is NaN
     if not math.isfinite(largest):
         raise WireError(f"frame of array {name!r}: samples hold NaN or infinity")
     if largest > MAX_SAMPLE:
@@ -259,7 +260,7 @@ def _encode_mark(mark: Mark) -> bytes:
     return b"".join([_head(_MARK_KIND), fixed, name, np.asarray(mark.channel_power, dtype="<f8").tobytes()])
 
 
-def _decode_mark(body: bytes) -> Mark:
+def _decode_mark(body: memoryview) -> Mark:
     fixed = _unpack(_MARK, body, "mark")
     name_length, sequence, frame_index, power, noise, overflows, lost, drift, clock, channels = fixed
     if clock >= len(_CLOCK_STATES) or channels > MAX_MICROPHONES:
@@ -359,7 +360,7 @@ _FIELDS: Final[dict[type[_Json], dict[str, Any]]] = {
 }
 
 
-def _unpack(form: struct.Struct, body: bytes, what: str) -> tuple[Any, ...]:
+def _unpack(form: struct.Struct, body: memoryview, what: str) -> tuple[Any, ...]:
     if len(body) < form.size:
         raise WireError(f"{what} of {len(body)} bytes: expected at least {form.size}")
     return form.unpack_from(body)
@@ -372,10 +373,10 @@ def _name_bytes(name: str) -> bytes:
     return data
 
 
-def _name(body: bytes, start: int, length: int) -> tuple[str, int]:
+def _name(body: memoryview, start: int, length: int) -> tuple[str, int]:
     if not 0 < length <= MAX_NAME_BYTES or len(body) < start + length:
         raise WireError(f"expected a name of 1 to {MAX_NAME_BYTES} bytes, got {length}")
     try:
-        return body[start : start + length].decode(), start + length
+        return str(body[start : start + length], "utf-8"), start + length
     except UnicodeDecodeError as error:
         raise WireError("expected a name in UTF-8") from error

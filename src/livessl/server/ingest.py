@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 from livessl import wire
@@ -182,7 +182,7 @@ class Ingest:
         if kept is None or frame.array in kept:
             return frame
         self.shed[frame.array] += 1
-        return replace(frame, samples=frame.samples[:, :0].copy())
+        return frame.without_samples()
 
     def _wrong_rate(self, peer: Peer, frame: Frame) -> str | None:
         """Return what is wrong with a frame's sampling rate; a backlog may have another rate than was announced."""

@@ -14,8 +14,8 @@ T = TypeVar("T")
 QUEUE_MESSAGES: Final = 1000
 """Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
 
-QUEUE_BYTES: Final = 40_000_000
-"""Most bytes in the queue, which matter if frames are long: 1000 frames of four microphones at 44.1 kHz have 35 MB."""
+QUEUE_BYTES: Final = 24_000_000
+"""Most bytes in the queue: half a second of 64 arrays of four microphones at 44.1 kHz. More waits with the nodes."""
 
 
 class Inlet(Generic[T]):

@@ -38,6 +38,7 @@ GOOD = Outcome(
     pictures=0,
     cpu_percent=12.0,
     rss_mb=(100.0, 101.0, 102.0),
+    shed={"updates": 0, "frames": 0, "level": 0},
 )
 
 

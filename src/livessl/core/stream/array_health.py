@@ -27,7 +27,7 @@ TROUBLE_NS: Final = 10_000_000_000
 DEAD_CHANNEL_NS: Final = 1_000_000_000
 """Time, in nanoseconds, after which a channel of all-zero samples is a dead microphone; every live one has noise."""
 
-WEAK_FRAMES: Final = 4
+WEAK_FRAMES: Final = 10
 """Channels are checked for missing sound in one active frame out of this many; a fault is reported after a second."""
 
 _ZERO_STRIDE: Final = 64
@@ -236,5 +236,7 @@ def _disagreement(votes: Votes) -> str | None:
 
 def _alive(samples: Float32Array) -> list[bool]:
     """Return which channels are not all zeros."""
+    if all(samples[:, 0].tolist()):
+        return [True] * len(samples)
     alive: list[bool] = np.asarray(np.any(samples[:, ::_ZERO_STRIDE], axis=1)).tolist()
     return alive if all(alive) else np.asarray(np.any(samples, axis=1)).tolist()

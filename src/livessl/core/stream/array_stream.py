@@ -87,7 +87,7 @@ class ArrayStream:
         """Release the samples of the frames before a frame index; the rest of these frames stays."""
         for frame_index, frame in self.frames.items():
             if frame_index < before and frame.samples.size:
-                self.frames[frame_index] = replace(frame, samples=frame.samples[:, :0].copy())
+                self.frames[frame_index] = frame.without_samples()
 
     def has_samples(self, frame_indices: Iterable[int]) -> bool:
         """Return whether all frames at these indices still have their samples."""

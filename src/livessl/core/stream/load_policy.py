@@ -10,9 +10,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-INTERVAL_NS: Final = 500_000_000
+INTERVAL_NS: Final = 1_000_000_000
 """Time, in nanoseconds, of which the least delay is judged. A delay that never falls in that time is a queue that does
-not empty; the peaks of a queue that does are no overload (Nichols and Jacobson 2012, "Controlling queue delay")."""
+not empty; the peaks of a queue that does are no overload (Nichols and Jacobson 2012, "Controlling queue delay"). With
+half a second the location of an event, on a busy machine, counted as overload."""
 
 BEHIND_S: Final = 0.1
 """Least delay, in seconds, at and above which more is shed: a fifth of the 0.5 s that live results may take."""
@@ -23,8 +24,8 @@ TURNS: Final = 3
 FAR_BEHIND_S: Final = 0.3
 """Least delay, in seconds, from which on two levels are taken at once."""
 
-CALM_S: Final = 0.03
-"""Least delay, in seconds, below which the queue empties: one and a half waits of the fusion thread."""
+CALM_S: Final = 0.05
+"""Least delay, in seconds, up to which the queue empties: one frame."""
 
 IDLE: Final = 0.5
 """Share of the time that the fusion works, below which less is shed after `IDLE_HOLD_NS`: the load has ended."""
@@ -32,7 +33,7 @@ IDLE: Final = 0.5
 IDLE_HOLD_NS: Final = 1_000_000_000
 """Calm, in nanoseconds, after which less is shed if the fusion is idle."""
 
-HOLD_NS: Final = 5_000_000_000
+HOLD_NS: Final = 3_000_000_000
 """Calm, in nanoseconds, after which less is shed if the fusion is busy. A level that turned out to be needed is held
 twice as long the next time."""
 

@@ -119,6 +119,20 @@ class Frame:
             )
         read_only(self.samples)
 
+    def without_samples(self) -> Frame:
+        """Return this frame with no samples, for what is known of it without them."""
+        return Frame(
+            self.array,
+            self.sequence,
+            self.frame_index,
+            self.time_ns,
+            self.sample_rate_hz,
+            np.empty((len(self.samples), 0), dtype=np.float32),
+            self.power,
+            self.active,
+            self.requested,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Mark:

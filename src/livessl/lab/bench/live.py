@@ -98,6 +98,9 @@ class Outcome:
         Mean use of the server over the measured time, in percent of one core.
     rss_mb : tuple of float
         Resident memory of the server at the beginning of the measured time, at its end, and at most, in megabytes.
+    shed : dict of str to int
+        What the server gave up for the load in the measured time: `updates`, and the sound of `frames`; and the level
+        of shedding at its end.
     """
 
     demand: Demand
@@ -114,11 +117,13 @@ class Outcome:
     pictures: int
     cpu_percent: float
     rss_mb: tuple[float, float, float]
+    shed: dict[str, int]
 
     @property
     def nothing_dropped(self) -> bool:
         """True if every frame was used and every client received every message."""
-        return not (self.frames_dropped or any(self.lost.values())) and self.updates >= self.updates_due
+        lost = self.frames_dropped or any(self.lost.values()) or any(self.shed.values())
+        return not lost and self.updates >= self.updates_due
 
     def json(self) -> JsonObject:
         """Return the outcome as an object for JSON."""
@@ -163,15 +168,21 @@ def measure(
         listening.send((from_ns, until_ns))
         while not clock.sleep_until_ns(from_ns):
             pass
-        before = _counters(url)
+        before, load_before = _counters(url), _load(url)
         usage = list(_sampled(server.pid, from_ns, until_ns, clock, progress))
         received: Received = listening.recv()
+        load_after = _load(url)
         sounding.send("end")
         report: load.Report = sounding.recv()
         after = _final_counters(url, report.sent - report.dropped, clock)
     due = len(load.windows_ns(site, from_ns, until_ns))
     lost = {name: after[name] - before[name] for name in LOST}
-    return _outcome(demand, report, after["frames"], lost, received, usage, due)
+    shed = {
+        "updates": load_after["updates_shed"] - load_before["updates_shed"],
+        "frames": after["shed"] - before["shed"],
+        "level": load_after["level"],
+    }
+    return _outcome(demand, report, after["frames"], lost, received, usage, due, shed)
 
 
 def _final_counters(url: str, frames: int, clock: Clock) -> dict[str, int]:
@@ -192,6 +203,7 @@ def table(outcome: Outcome) -> str:
         + (", a foreign process spinning on each" if demand.spin else ""),
         f"frames     {outcome.frames_sent} sent, {outcome.frames_received} received, {outcome.frames_dropped} dropped"
         + "".join(f", {count} {name}" for name, count in lost.items()),
+        *([f"shed       {shed}"] if (shed := _words(outcome.shed)) else []),
         f"updates    {outcome.updates:.1f} of {outcome.updates_due} per client; {outcome.events:g} events",
         f"server     {outcome.cpu_percent:.0f} % of a core; "
         "{:.0f} MB resident at the beginning, {:.0f} at the end, {:.0f} at most".format(*outcome.rss_mb),
@@ -205,6 +217,12 @@ def table(outcome: Outcome) -> str:
     return "\n".join(lines)
 
 
+def _words(shed: dict[str, int]) -> str:
+    """Return what was shed as text; empty if nothing was."""
+    each = [f"{shed['updates']} updates", f"the sound of {shed['frames']} frames", f"level {shed['level']} at the end"]
+    return ", ".join(each) if any(shed.values()) else ""
+
+
 def _outcome(
     demand: Demand,
     report: load.Report,
@@ -213,6 +231,7 @@ def _outcome(
     received: Received,
     usage: Sequence[tuple[int, float, float]],
     due: int,
+    shed: dict[str, int],
 ) -> Outcome:
     (first_ns, first_s, first_mb), *_, (last_ns, last_s, last_mb) = usage
     stages = {"load": report.lateness_s, **received.stages_s}
@@ -231,6 +250,7 @@ def _outcome(
         pictures=received.pictures,
         cpu_percent=100.0 * (last_s - first_s) / ((last_ns - first_ns) / 1e9),
         rss_mb=(first_mb, last_mb, max(mb for _, _, mb in usage)),
+        shed=shed,
     )
 
 
@@ -300,6 +320,12 @@ def _counters(url: str) -> dict[str, int]:
     for array in _arrays(url):
         total.update(array["counters"])
     return total
+
+
+def _load(url: str) -> JsonObject:
+    """Return the figures of the server's load."""
+    with urllib.request.urlopen(f"{url}/api/v1/health", timeout=60.0) as response:  # noqa: S310 - our own http address
+        return dict(json.load(response)["load"])
 
 
 def _arrays(url: str) -> list[JsonObject]:
