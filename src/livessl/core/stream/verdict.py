@@ -11,12 +11,24 @@ from typing import Final
 
 import numpy as np
 
+from livessl.core.commission.observe import observe
 from livessl.core.geometry import direction_deg
 from livessl.core.locate.estimator import Localization
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
 from livessl.core.stream.site_state import SiteState
-from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Contribution, Estimate, Event, FloatArray, Status, Update
+from livessl.core.types import (
+    FRAME_NS,
+    FRAME_S,
+    ArraySpec,
+    Contribution,
+    Estimate,
+    Event,
+    FloatArray,
+    Observation,
+    Status,
+    Update,
+)
 
 RANGE_UNKNOWN: Final = 0.25
 """Ratio of the position's standard deviation to its distance from the nearest array beyond which only the direction is
@@ -106,7 +118,7 @@ class Verdicts:
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
-        first = replace(first, status=status, reason=reason)
+        first = replace(first, status=status, reason=reason, observations=_observations(found, used))
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
@@ -117,6 +129,7 @@ class Verdicts:
                 source=source,
                 status=Status.LOCATED,
                 reason=None,
+                observations=(),
                 estimate=other,  # the power stays that of both sources: it cannot be divided
                 contributions=self._contributions(used.powers, other, found, backfilled),
             )
@@ -194,6 +207,12 @@ def _estimate(found: Localization, excerpt: Excerpt) -> Estimate:
 
 def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in arrays if name not in (found.outliers or ()) and name not in found.unneeded)
+
+
+def _observations(found: Localization, excerpt: Excerpt) -> tuple[Observation, ...]:
+    """Return what the channels of each array received; arrays without an exact delay are left out."""
+    observed = (observe(part, excerpt.sounds[part.spec.name].segments) for part in found.evidence)
+    return tuple(one for one in observed if one is not None)
 
 
 def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:

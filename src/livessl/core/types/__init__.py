@@ -38,6 +38,7 @@ from livessl.core.types.sound import (
     Frame,
     Mark,
     Message,
+    Observation,
 )
 
 __all__ = [
@@ -64,6 +65,7 @@ __all__ = [
     "IntArray",
     "Mark",
     "Message",
+    "Observation",
     "Output",
     "RealArray",
     "Status",

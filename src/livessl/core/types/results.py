@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from livessl.core.types.arrays import FloatArray, read_only
-from livessl.core.types.sound import Evidence
+from livessl.core.types.sound import Evidence, Observation
 
 
 class Status(StrEnum):
@@ -179,6 +179,8 @@ class Event:
         Site time at which the last sound needed for the answer ended: the end of the hang-over.
     source : int
         1, or 2 for the second of two sources that sounded at the same time, each of which has an event.
+    observations : tuple of Observation
+        What each array's channels received, for the examination of the set-up; empty for a second source.
     """
 
     id: str
@@ -196,6 +198,7 @@ class Event:
     late: bool = False
     complete_ns: int = 0
     source: int = 1
+    observations: tuple[Observation, ...] = ()
 
     @property
     def duration_s(self) -> float:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.types.arrays import Float32Array, FloatArray, IntArray, RealArray, read_only
+from livessl.core.types.arrays import BoolArray, Float32Array, FloatArray, IntArray, RealArray, read_only
 
 FRAME_NS: Final = 50_000_000
 """Length of a frame, and step of the grid of frames in site time, in nanoseconds: the paper's 50 ms."""
@@ -271,3 +271,39 @@ class Evidence:
     spec: ArraySpec
     gcc: GCC
     below: tuple[GCC, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What the channels of one array received of one sound, measured without knowing where the microphones are.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array.
+    delays_s : (K,) float64
+        Delay of each channel against the mean of all that have one, seconds; NaN for a channel without sound.
+    inverted : (K,) bool
+        Channels of opposite polarity to most.
+    coherence : (K,) float64
+        Mean height of the correlations of each channel with the others at these delays: about 1 for a single direct
+        sound, about 0 for a channel that received something else.
+    powers : (K,) float64
+        Mean power of each channel, with hum and rumble attenuated, full scale squared.
+    sharpness : float
+        Mean height of all pairs' correlations at these delays over their root mean square; noise gives 1 to 3.
+    closure_s : float
+        Root mean square by which the pairs' own peaks differ from the delays, seconds.
+    """
+
+    array: str
+    delays_s: FloatArray
+    inverted: BoolArray
+    coherence: FloatArray
+    powers: FloatArray
+    sharpness: float
+    closure_s: float
+
+    def __post_init__(self) -> None:
+        for array in (self.delays_s, self.inverted, self.coherence, self.powers):
+            read_only(array)

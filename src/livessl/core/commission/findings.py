@@ -1,0 +1,276 @@
+"""Turns what arrays observed of some sounds into findings: what is wrong, where, how sure, and what cures it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from livessl.core.commission.alternatives import LEAST_SOUNDS, Alternative, Diagnosis, diagnose
+from livessl.core.commission.places import Microphones, stacked
+from livessl.core.types import BoolArray, FloatArray, Observation
+
+LEAST_SHARPNESS: Final = 3.5
+"""Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
+
+MOST_SHARE: Final = 0.6
+"""Share of the sounds in which a channel must show a fault."""
+
+DEAF_COHERENCE: Final = 0.35
+"""Coherence, relative to the array's clearest channels, below which a channel did not receive the sound."""
+
+LEVEL_DB: Final = 3.0
+"""Median difference of level within an array, in decibels, that is told after `LEVEL_SOUNDS` sounds: the medians of ten
+sounds differ by less than 0.7 dB between good channels."""
+
+LEVEL_DB_AT_ONCE: Final = 6.0
+"""The same after fewer sounds, of which single ones differ by up to 3 dB."""
+
+LEVEL_SOUNDS: Final = 8
+
+SAME_SIGNAL_S: Final = 2e-6
+"""Delay, in seconds, that two channels with the same signal never exceed."""
+
+APART_M: Final = 0.02
+"""Distance between microphones, in metres, from which sounds from different directions differ by more than that."""
+
+SILENT: Final = 1e-9
+"""Power relative to the array's median below which a channel is dead: converters leave more noise."""
+
+
+class Severity(StrEnum):
+    """Weight of a finding: with an error, positions are wrong or refused; with a warning, they are worse."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a set-up.
+
+    Parameters
+    ----------
+    fault : str
+        Code of the fault, such as `swapped`.
+    array : str or None
+        The array; None for the whole site.
+    channel : int or None
+        Channel of the array, from 1; None for all.
+    severity : Severity
+    confidence : float
+        0 to 1.
+    message : str
+        What is wrong, in one sentence without a full stop.
+    cure : str
+        What to do.
+    input : int or None
+        Input of the device that carries the channel, from 1, where the site file says so.
+    """
+
+    fault: str
+    array: str | None
+    channel: int | None
+    severity: Severity
+    confidence: float
+    message: str
+    cure: str
+    input: int | None = None
+
+
+def find_faults(
+    microphones: Microphones, sounds: Sequence[Sequence[Observation]], bounds_m: FloatArray, c_m_s: float
+) -> list[Finding]:
+    """Find what is wrong with a set-up.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As the site file has them, metres.
+    sounds : sequence of sequences of Observation
+        What the arrays observed of each sound.
+    bounds_m : (3, 2) float64
+        Search volume, metres.
+    c_m_s : float
+        Speed of sound as the site file has it, m/s.
+    """
+    findings: list[Finding] = []
+    unusable: dict[str, BoolArray] = {}
+    for array, at_m in microphones.items():
+        observed = [one for sound in sounds for one in sound if one.array == array]
+        unusable[array] = np.zeros(len(at_m), dtype=bool)
+        for finding in _of_channels(array, at_m, observed):
+            findings.append(finding)
+            if finding.channel is not None and finding.fault in ("dead", "deaf", "duplicate"):
+                unusable[array][finding.channel - 1] = True
+    sharp = [_usable(sound, unusable) for sound in sounds]
+    delays = stacked([sound for sound in sharp if len(sound) > 1], microphones)
+    known = {array for array in microphones if len(delays[array]) and np.isfinite(delays[array]).any()}
+    microphones = {array: at_m for array, at_m in microphones.items() if array in known}
+    delays = {array: measured for array, measured in delays.items() if array in known}
+    if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
+        findings += _of_site(diagnose(microphones, delays, bounds_m, c_m_s))
+    return sorted(findings, key=lambda one: (list(Severity).index(one.severity), one.array or "", one.channel or 0))
+
+
+def _usable(sound: Sequence[Observation], unusable: Mapping[str, BoolArray]) -> dict[str, FloatArray]:
+    return {
+        one.array: np.where(unusable[one.array], np.nan, one.delays_s)
+        for one in sound
+        if one.array in unusable and one.sharpness >= LEAST_SHARPNESS
+    }
+
+
+def _of_channels(array: str, at_m: FloatArray, observed: Sequence[Observation]) -> Iterator[Finding]:
+    """Yield the faults of single channels of an array."""
+    if len(observed) < LEAST_SOUNDS:
+        return
+    powers = np.array([one.powers for one in observed])
+    median = np.median(powers, axis=1, keepdims=True)
+    silent = (powers <= SILENT * median).mean(axis=0)
+    coherence = np.array([one.coherence for one in observed])
+    clearest = np.sort(coherence, axis=1)[:, -2:].mean(axis=1, keepdims=True)
+    deaf = (coherence < DEAF_COHERENCE * clearest).mean(axis=0)
+    level_db = 10.0 * np.log10(np.maximum(powers, 1e-20) / np.maximum(median, 1e-20))
+    inverted = np.array([one.inverted for one in observed]).mean(axis=0)
+    needed_db = LEVEL_DB if len(observed) >= LEVEL_SOUNDS else LEVEL_DB_AT_ONCE
+    copies = _copies(at_m, observed)
+    for index in range(len(at_m)):
+        where = f"channel {index + 1} of {array!r}"
+        off_db = float(np.median(level_db[:, index]))
+        if silent[index] >= MOST_SHARE:
+            yield _channel_fault(
+                "dead", array, index, silent[index], f"{where} is silent", "check its cable, phantom power and gain"
+            )
+        elif index in copies:
+            other, share = copies[index]
+            yield _channel_fault(
+                "duplicate",
+                array,
+                index,
+                share,
+                f"{where} carries the same signal as channel {other + 1}",
+                "check the cables, and the routing of the interface; each microphone needs an input of its own",
+            )
+        elif deaf[index] >= MOST_SHARE and len(at_m) > 2:
+            yield _channel_fault(
+                "deaf",
+                array,
+                index,
+                deaf[index],
+                f"{where} has noise but not the sounds that its neighbours receive",
+                "check its microphone, cable and phantom power",
+            )
+        elif abs(off_db) >= needed_db:
+            how = "weaker" if off_db < 0.0 else "louder"
+            yield Finding(
+                "level",
+                array,
+                index + 1,
+                Severity.WARNING,
+                min(0.99, 0.5 + abs(off_db) / 20.0),
+                f"{where} is {abs(off_db):.0f} dB {how} than its neighbours",
+                "set the gains of the array's inputs alike",
+            )
+        if inverted[index] >= MOST_SHARE and silent[index] < MOST_SHARE and deaf[index] < MOST_SHARE:
+            yield _channel_fault(
+                "inverted",
+                array,
+                index,
+                inverted[index],
+                f"{where} has the opposite polarity of its neighbours",
+                "exchange the two signal wires of its cable, or switch the polarity of its input",
+            )
+
+
+def _channel_fault(fault: str, array: str, index: int, share: float, message: str, cure: str) -> Finding:
+    return Finding(fault, array, index + 1, Severity.ERROR, min(0.99, float(share)), message, cure)
+
+
+def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tuple[int, float]]:
+    """Channels that carry the signal of another, with that channel and the share of sounds in which they do."""
+    delays_s = np.array([one.delays_s for one in observed])
+    found = {}
+    for k in range(1, len(at_m)):
+        for i in range(k):
+            if np.linalg.norm(at_m[i] - at_m[k]) < APART_M:
+                continue
+            same = np.abs(delays_s[:, k] - delays_s[:, i]) < SAME_SIGNAL_S
+            share = float(same.mean())
+            if share >= max(MOST_SHARE, 0.8) and k not in found:
+                found[k] = i, share
+    return found
+
+
+def _of_site(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Yield what the delays say about the order of channels, the poses and the speed of sound."""
+    misfit_us = 1e6 * diagnosis.misfit_s
+    if diagnosis.best is not None:
+        what, cure = _words(diagnosis.best)
+        better = f"{misfit_us:.0f} -> {1e6 * diagnosis.best.misfit_s:.0f} us over {diagnosis.sounds} sounds"
+        yield Finding(
+            diagnosis.best.fault,
+            diagnosis.best.array,
+            None,
+            Severity.ERROR,
+            min(0.99, diagnosis.confidence),
+            f"{what}: misfit {better}",
+            cure,
+        )
+    elif diagnosis.contradicts and diagnosis.rivals[0].is_large:
+        likely = " or ".join(dict.fromkeys(_words(one)[0] for one in diagnosis.rivals[:2]))
+        yield Finding(
+            diagnosis.rivals[0].fault,
+            None,
+            None,
+            Severity.ERROR,
+            0.5,
+            f"the arrays contradict each other by {misfit_us:.0f} us over {diagnosis.sounds} sounds; perhaps {likely}",
+            "clap at places that you know, and run livessl calibrate verify",
+        )
+
+
+def _words(alternative: Alternative) -> tuple[str, str]:
+    """What an alternative is, and its cure."""
+    array = alternative.array
+    if alternative.fault == "swapped":
+        moved = [index for index, channel in enumerate(alternative.order) if channel != index + 1]
+        order = ", ".join(str(channel) for channel in alternative.order)
+        if len(moved) == 2:
+            first, second = (index + 1 for index in moved)
+            what = f"channels {first} and {second} of {array!r} are swapped"
+        else:
+            what = f"the channels of {array!r} are in the order {order}"
+        return what, "exchange the plugs, or give the channels in this order in the site file (nodes.NAME.arrays)"
+    if alternative.fault == "mirrored":
+        return (
+            "the arrays are wired the other way round",
+            f"plug in the microphones in the order {', '.join(str(channel) for channel in alternative.order)}, "
+            "or give the channels so in the site file (nodes.NAME.arrays)",
+        )
+    if alternative.fault == "turned":
+        axis = np.array(alternative.turn_deg)
+        about = float(axis[2])
+        angle = float(np.linalg.norm(axis))
+        if abs(about) >= 0.9 * angle:
+            sense = "counter-clockwise" if about > 0.0 else "clockwise"
+            return (
+                f"{array!r} is turned by {angle:.0f} degrees {sense}, seen from above",
+                f"turn it back, or add {about:.0f} to arrays.{array}.orientation_deg.yaw",
+            )
+        return f"{array!r} is turned by {angle:.0f} degrees", f"check arrays.{array}.orientation_deg"
+    if alternative.fault == "moved":
+        shift = ", ".join(f"{x:+.2f}" for x in alternative.shift_m)
+        distance_m = float(np.linalg.norm(alternative.shift_m))
+        return (
+            f"{array!r} is {distance_m:.2f} m from where the site file has it",
+            f"measure its position again; the sounds suggest a shift of ({shift}) m in arrays.{array}.position_m",
+        )
+    return (
+        f"the speed of sound is {alternative.speed_m_s or 0.0:.0f} m/s, {alternative.speed_off_m_s:+.0f} m/s off",
+        "correct temperature_c or speed_of_sound_m_s in the site file",
+    )

@@ -1,0 +1,178 @@
+"""Delays of one sound between the microphones of one array, measured without knowing where they are.
+
+The poses, the geometry and the order of the channels in the site file have no part in it, so that they can be examined
+with the result. The polarity of each microphone is measured with its delay: an inverted one turns the peaks of its
+pairs upside down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.correlate.band import uses_envelope
+from livessl.core.types import Evidence, Float32Array, FloatArray, IntArray, Observation
+
+PEAKS: Final = 4
+"""Peaks of each pair, up and down, that are tried as its delay: reverberation and tones have several."""
+
+BEAM: Final = 24
+"""Most partial solutions that are kept while one microphone after the other is added."""
+
+NEAR_STEPS: Final = 4
+"""Steps of the lag axis within which each pair's own peak is searched for around the common delays."""
+
+INVERSION: Final = 1.15
+"""Ratio by which the peaks must be higher with some microphones inverted than with none: reverberation alone gives
+some pairs a deeper trough than a peak."""
+
+
+def observe(evidence: Evidence, segments: Iterable[Float32Array]) -> Observation | None:
+    """Measure what the channels of one array received of a sound.
+
+    The delays t and polarities s are those for which the sum over all pairs (i, k) of s_i s_k R_ik(t_k - t_i) is
+    highest. Microphones are added one by one; the candidates of each are the highest peaks of its pairs.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    segments : iterable of (K, n) float32
+        Its samples.
+
+    Returns
+    -------
+    Observation or None
+        None if fewer than two channels carry sound, or the correlations are envelopes, which have no polarity and no
+        exact peak.
+    """
+    if uses_envelope(evidence.spec.band_hz):
+        return None
+    pairs = _Pairs(evidence)
+    if len(pairs.live) < 2:
+        return None
+    upright = pairs.best(signs=(1.0,))
+    free = pairs.best(signs=(1.0, -1.0))
+    return pairs.observation(free if free.score > INVERSION * upright.score else upright, _powers(segments))
+
+
+def _powers(segments: Iterable[Float32Array]) -> FloatArray:
+    """Mean power (K,) of the first differences, which attenuate hum and rumble and leave out a constant."""
+    differences = [np.diff(segment, axis=1) for segment in segments]
+    count = max(1, sum(one.shape[1] for one in differences))
+    sums = [np.einsum("kn,kn->k", one, one, dtype=np.float64) for one in differences]
+    return np.asarray(np.sum(sums, axis=0) / count)
+
+
+@dataclass(frozen=True, slots=True)
+class _Partial:
+    """Delays and polarities of the microphones placed so far, and the sum of their pairs' correlations there."""
+
+    delays_s: tuple[float, ...]
+    signs: tuple[float, ...]
+    score: float
+
+
+class _Pairs:
+    """The correlations of an array's pairs, in both directions."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        gcc = evidence.gcc
+        self._name = evidence.spec.name
+        self._count = len(evidence.spec.microphones_m)
+        self._first_s, self._step_s = float(gcc.lags_s[0]), float(gcc.lags_s[1] - gcc.lags_s[0])
+        self._lags = len(gcc.lags_s)
+        self._values: dict[tuple[int, int], FloatArray] = {}
+        heard = np.zeros(self._count, dtype=bool)
+        for (i, k), values in zip(gcc.pairs, gcc.values, strict=True):
+            if values.any():
+                heard[[i, k]] = True
+                self._values[int(i), int(k)] = np.asarray(values, dtype=np.float64)
+        self.live: IntArray = np.flatnonzero(heard)
+        self._rms = float(np.sqrt(np.mean([np.mean(v**2) for v in self._values.values()]))) if self._values else 0.0
+
+    def best(self, signs: tuple[float, ...]) -> _Partial:
+        """Return the delays with the highest sum, with these polarities allowed."""
+        beam = [_Partial((0.0,), (1.0,), 0.0)]
+        for placed, k in enumerate(self.live[1:], start=1):
+            grown = [grown for one in beam for grown in self._grown(one, placed, int(k), signs)]
+            beam = sorted(grown, key=lambda one: -one.score)[:BEAM]
+        return beam[0]
+
+    def observation(self, found: _Partial, powers: FloatArray) -> Observation:
+        """Return the delays that fit the pairs' own peaks best, weighted by their heights."""
+        index = {int(k): place for place, k in enumerate(self.live)}
+        rows, lags_s, heights = [], [], []
+        coherence, pair_count = np.zeros(self._count), np.zeros(self._count)
+        for (i, k), values in self._values.items():
+            a, b = index[i], index[k]
+            sign = found.signs[a] * found.signs[b]
+            at_s, height = self._peak_near(sign * values, found.delays_s[b] - found.delays_s[a])
+            row = np.zeros(len(self.live))
+            row[a], row[b] = -1.0, 1.0
+            rows.append(row)
+            lags_s.append(at_s)
+            heights.append(max(height, 0.0) + 1e-9)
+            coherence[[i, k]] += height
+            pair_count[[i, k]] += 1.0
+        matrix, measured_s, weight = np.array(rows), np.array(lags_s), np.array(heights)
+        solution, *_ = np.linalg.lstsq(matrix * weight[:, None], measured_s * weight, rcond=None)
+        misfit_s = matrix @ solution - measured_s
+        delays_s, inverted = np.full(self._count, np.nan), np.zeros(self._count, dtype=bool)
+        delays_s[self.live] = solution - solution.mean()
+        signs = np.array(found.signs)
+        inverted[self.live] = signs != (1.0 if signs.sum() >= 0 else -1.0)
+        closure_s = float(np.sqrt(np.average(misfit_s**2, weights=weight)))
+        sharpness = float(weight.mean() / max(self._rms, 1e-12))
+        coherence /= np.maximum(pair_count, 1.0)
+        return Observation(self._name, delays_s, inverted, coherence, powers, sharpness, closure_s)
+
+    def _grown(self, one: _Partial, placed: int, k: int, signs: tuple[float, ...]) -> list[_Partial]:
+        """Return the partial solutions with one more microphone, at each peak of its pairs with those placed."""
+        pairs = [
+            (place, values)
+            for place in range(placed)
+            if (values := self._between(int(self.live[place]), k)) is not None
+        ]
+        if not pairs:
+            return [_Partial((*one.delays_s, 0.0), (*one.signs, 1.0), one.score)]
+        grown = []
+        for sign in signs:
+            turned = [(one.delays_s[place], sign * one.signs[place] * values) for place, values in pairs]
+            tried_s = np.unique([from_s + lag_s for from_s, values in turned for lag_s in self._peaks(values)])
+            scores = sum((self._at(values, tried_s - from_s) for from_s, values in turned), np.zeros(len(tried_s)))
+            grown += [
+                _Partial((*one.delays_s, float(tried)), (*one.signs, sign), one.score + float(score))
+                for tried, score in zip(tried_s, scores, strict=True)
+            ]
+        return grown
+
+    def _between(self, i: int, k: int) -> FloatArray | None:
+        """Correlation of microphones i and k, which are in ascending order in `live`; positive lag: k hears later."""
+        return self._values.get((i, k))
+
+    def _peaks(self, values: FloatArray) -> list[float]:
+        """Return the lags of the highest local maxima, seconds."""
+        inner = values[1:-1]
+        tops = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0.0)) + 1
+        highest = tops[np.argsort(-values[tops])[:PEAKS]]
+        return [self._first_s + self._step_s * float(top) for top in highest]
+
+    def _at(self, values: FloatArray, lags_s: FloatArray) -> FloatArray:
+        """Interpolated correlation at lags; 0 outside the axis."""
+        places = (lags_s - self._first_s) / self._step_s
+        return np.interp(places, np.arange(self._lags), values, left=0.0, right=0.0)
+
+    def _peak_near(self, values: FloatArray, lag_s: float) -> tuple[float, float]:
+        """Lag and height of the highest point near a lag, between the steps by a parabola."""
+        place = round((lag_s - self._first_s) / self._step_s)
+        low, high = max(1, place - NEAR_STEPS), min(self._lags - 2, place + NEAR_STEPS)
+        if low > high:
+            return lag_s, 0.0
+        top = low + int(np.argmax(values[low : high + 1]))
+        before, here, after = values[top - 1 : top + 2]
+        bend = before - 2.0 * here + after
+        shift = float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
+        return self._first_s + self._step_s * (top + shift), float(here)

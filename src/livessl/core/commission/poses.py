@@ -1,0 +1,326 @@
+"""Measures the poses of arrays from the delays of sounds: bundle adjustment.
+
+The unknowns are the turn and the shift of each array that may move, the speed of sound if it may differ, and the places
+of the sounds. Places that are known, and poses as far as they are known, enter as priors. The arrays need no common
+clock, for only delays within an array are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from livessl.core.commission.places import Delays, Microphones, centred
+from livessl.core.types import BoolArray, FloatArray
+
+DELAY_STD_S: Final = 20e-6
+"""Standard deviation of a measured delay in a room, seconds."""
+
+UNKNOWN_M: Final = 100.0
+UNKNOWN_DEG: Final = 360.0
+"""Standard deviations, in metres and degrees, that stand for "unknown"."""
+
+_TOLERANCE: Final = 1e-5
+"""Relative change of cost and unknowns below which the adjustment ends."""
+
+_MOST_STEPS: Final = 40
+_STEP: Final = 1e-4
+"""Step of the differences, in units of these scales of the unknowns."""
+
+_SHIFT_SCALE_M: Final = 0.1
+_TURN_SCALE_RAD: Final = 0.1
+_SPEED_SCALE_M_S: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """How far the set-up may differ from the site file.
+
+    Parameters
+    ----------
+    arrays : mapping of array to (float, float)
+        Standard deviations of the position in metres and of the orientation in degrees; arrays that are not named stay.
+    speed_std_m_s : float
+        Standard deviation of the speed of sound, m/s; 0 if it is known.
+    upright : bool
+        Whether arrays may turn about the vertical only.
+    """
+
+    arrays: Mapping[str, tuple[float, float]]
+    speed_std_m_s: float = 0.0
+    upright: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """How far an array is from where the site file says it is.
+
+    Parameters
+    ----------
+    shift_m : (3,) float64
+        Shift of its centre, metres.
+    turn_deg : (3,) float64
+        Turn about its centre: a vector along the axis, its length in degrees.
+    covariance : (6, 6) float64
+        Of the shift (m) and the turn (radians).
+    """
+
+    shift_m: FloatArray
+    turn_deg: FloatArray
+    covariance: FloatArray
+
+    @property
+    def angle_deg(self) -> float:
+        """Size of the turn, degrees."""
+        return float(np.linalg.norm(self.turn_deg))
+
+    @property
+    def distance_m(self) -> float:
+        """Size of the shift, metres."""
+        return float(np.linalg.norm(self.shift_m))
+
+    def applied(self, microphones_m: FloatArray) -> FloatArray:
+        """Positions (K, 3) of the microphones after the turn and the shift, metres."""
+        return _moved(microphones_m, self.shift_m, np.radians(self.turn_deg))
+
+
+@dataclass(frozen=True, slots=True)
+class Adjusted:
+    """The set-up that explains some sounds best.
+
+    Parameters
+    ----------
+    poses : mapping of array to Pose
+    c_m_s : float
+        Speed of sound, m/s.
+    c_std_m_s : float
+        Its standard deviation; 0 if it was known.
+    places_m : (S, 3) float64
+        Where the sounds were, metres.
+    misfits_s : (S,) float64
+        Root mean square of what remains of each sound's delays, seconds.
+    """
+
+    poses: Mapping[str, Pose]
+    c_m_s: float
+    c_std_m_s: float
+    places_m: FloatArray
+    misfits_s: FloatArray
+
+
+def adjust(
+    microphones: Microphones,
+    delays: Delays,
+    places_m: FloatArray,
+    c_m_s: float,
+    freedom: Freedom,
+    place_std_m: float = UNKNOWN_M,
+) -> Adjusted:
+    """Find the poses, the speed of sound and the places that explain delays best.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As in the site file, or a rough guess, metres.
+    delays : mapping of array to (S, K) float64
+        Seconds.
+    places_m : (S, 3) float64
+        Where the sounds were, or where to begin, metres.
+    c_m_s : float
+        Speed of sound as in the site file, m/s.
+    freedom : Freedom
+    place_std_m : float
+        Standard deviation of the given places along each axis, metres.
+    """
+    problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m)
+    solved = least_squares(
+        problem.residuals,
+        problem.start,
+        problem.slopes,
+        x_scale=problem.scale,
+        loss="soft_l1",
+        f_scale=2.5,
+        ftol=_TOLERANCE,
+        xtol=_TOLERANCE,
+        max_nfev=_MOST_STEPS,
+    )
+    return problem.result(solved.x, solved.jac)
+
+
+def from_known_places(
+    microphones_m: FloatArray, delays_s: FloatArray, places_m: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Find a rough pose of one array from sounds at known places: where to begin an adjustment.
+
+    Each sound's delays give its direction in the array's own frame. A position is tried at each point of a grid around
+    the places; the turn that takes the directions to those towards the places is Wahba's problem.
+
+    Parameters
+    ----------
+    microphones_m : (K, 3) float64
+        Metres.
+    delays_s : (S, K) float64
+        Seconds.
+    places_m : (S, 3) float64
+        Metres.
+
+    Returns
+    -------
+    (3,) float64 and (3,) float64, or None
+        Shift of the array's centre in metres, and turn about it as a vector in radians. None if fewer than two sounds
+        have a direction, or the array is a line or a plane, whose delays have none.
+    """
+    centre_m = microphones_m.mean(axis=0)
+    arms_m = microphones_m - centre_m
+    there = np.isfinite(delays_s).all(axis=1)
+    if there.sum() < 2 or np.linalg.matrix_rank(arms_m, tol=0.01) < 3:
+        return None
+    slowness, *_ = np.linalg.lstsq(arms_m, -centred(delays_s[there]).T, rcond=None)
+    directions = (slowness / np.maximum(np.linalg.norm(slowness, axis=0), 1e-12)).T
+    low, high = places_m.min(axis=0) - 6.0, places_m.max(axis=0) + 6.0
+    best: tuple[float, FloatArray, FloatArray] | None = None
+    for step_m in (1.0, 0.25):
+        if best is not None:
+            low, high = best[1] - 1.0, best[1] + 1.0
+        axes = [np.arange(a, b + step_m / 2.0, step_m) for a, b in zip(low, high, strict=True)]
+        for at_m in np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3):
+            towards = places_m[there] - at_m
+            away_m = np.linalg.norm(towards, axis=1, keepdims=True)
+            if away_m.min() < 0.1:
+                continue
+            turn, rssd = Rotation.align_vectors(towards / away_m, directions)
+            if best is None or rssd < best[0]:
+                best = float(rssd), at_m, turn.as_rotvec()
+    assert best is not None
+    return best[1] - centre_m, best[2]
+
+
+class _Problem:
+    """The adjustment as a vector of unknowns and one of residuals in standard deviations."""
+
+    def __init__(
+        self,
+        microphones: Microphones,
+        delays: Delays,
+        places_m: FloatArray,
+        c_m_s: float,
+        freedom: Freedom,
+        place_std_m: float,
+    ) -> None:
+        self._microphones, self._delays, self._places_m = microphones, delays, places_m
+        self._c_m_s, self._freedom, self._place_std_m = c_m_s, freedom, place_std_m
+        self._free = [name for name in microphones if name in freedom.arrays]
+        self._measured = {name: centred(one) for name, one in delays.items()}
+        self._there = {name: np.isfinite(one) for name, one in delays.items()}
+        self._turns = 1 if freedom.upright else 3
+        count = len(self._free) * (3 + self._turns) + (freedom.speed_std_m_s > 0.0)
+        self.start = np.concatenate([np.zeros(count), places_m.ravel()])
+        pose_scale = [_SHIFT_SCALE_M] * 3 + [_TURN_SCALE_RAD] * self._turns
+        self.scale = np.array(
+            [*pose_scale * len(self._free), *([_SPEED_SCALE_M_S] if freedom.speed_std_m_s > 0.0 else [])]
+            + [1.0] * places_m.size
+        )
+
+    def residuals(self, unknowns: FloatArray) -> FloatArray:
+        """Delays and priors, in standard deviations."""
+        poses, speed_m_s, places_m = self._unpack(unknowns)
+        parts = [self._off(poses, speed_m_s, places_m).ravel() / DELAY_STD_S]
+        for name, (shift_m, turn) in poses.items():
+            position_std_m, orientation_std_deg = self._freedom.arrays[name]
+            parts += [shift_m / position_std_m, turn / np.radians(orientation_std_deg)]
+        if self._freedom.speed_std_m_s > 0.0:
+            parts.append(np.array([(speed_m_s - self._c_m_s) / self._freedom.speed_std_m_s]))
+        parts.append(((places_m - self._places_m) / self._place_std_m).ravel())
+        return np.concatenate(parts)
+
+    def slopes(self, unknowns: FloatArray) -> FloatArray:
+        """Slope of the residuals: by differences for poses and speed, which are few, exact for the places."""
+        here = self.residuals(unknowns)
+        slopes = np.zeros((len(here), len(unknowns)))
+        few = len(unknowns) - self._places_m.size
+        for column in range(few):
+            step = _STEP * self.scale[column]
+            moved = unknowns.copy()
+            moved[column] += step
+            slopes[:, column] = (self.residuals(moved) - here) / step
+        poses, speed_m_s, places_m = self._unpack(unknowns)
+        sounds = np.arange(len(places_m))
+        of_places = _by_place(self._moved(poses), self._there, places_m, speed_m_s) / DELAY_STD_S
+        rows = of_places.shape[1]
+        blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
+        blocks[sounds, :, sounds] = of_places
+        slopes[-places_m.size :, few:] = np.eye(places_m.size) / self._place_std_m
+        return slopes
+
+    def result(self, unknowns: FloatArray, jacobian: FloatArray) -> Adjusted:
+        """The unknowns as a result, with the covariance from the slope of the residuals."""
+        poses, speed_m_s, places_m = self._unpack(unknowns)
+        covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+        off = self._off(poses, speed_m_s, places_m)
+        count = sum(there.sum(axis=1) - 1 for there in self._there.values())
+        misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
+        size = 3 + self._turns
+        found = {}
+        for index, name in enumerate(self._free):
+            own = covariance[index * size : (index + 1) * size, index * size : (index + 1) * size]
+            full = np.zeros((6, 6))
+            axes = [0, 1, 2, 5] if self._freedom.upright else list(range(6))
+            full[np.ix_(axes, axes)] = own
+            shift_m, turn = poses[name]
+            found[name] = Pose(shift_m, np.degrees(turn), full)
+        at = len(self._free) * size
+        c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
+        return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
+
+    def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
+        poses, at = {}, 0
+        for name in self._free:
+            shift_m, turn = unknowns[at : at + 3], unknowns[at + 3 : at + 3 + self._turns]
+            poses[name] = shift_m, np.array([0.0, 0.0, turn[0]]) if self._freedom.upright else turn
+            at += 3 + self._turns
+        speed_m_s = self._c_m_s
+        if self._freedom.speed_std_m_s > 0.0:
+            speed_m_s, at = self._c_m_s + unknowns[at], at + 1
+        return poses, float(speed_m_s), unknowns[at:].reshape(-1, 3)
+
+    def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, FloatArray]:
+        return {
+            name: _moved(self._microphones[name], *poses[name]) if name in poses else self._microphones[name]
+            for name in self._measured
+        }
+
+    def _off(
+        self, poses: Mapping[str, tuple[FloatArray, FloatArray]], c_m_s: float, places_m: FloatArray
+    ) -> FloatArray:
+        """What the delays are off by, (S, R) seconds; R counts all channels."""
+        parts = []
+        for name, at_m in self._moved(poses).items():
+            away_m = np.linalg.norm(places_m[:, None] - at_m[None], axis=2)
+            parts.append(centred(np.where(self._there[name], away_m / c_m_s, np.nan)) - self._measured[name])
+        return np.concatenate(parts, axis=1)
+
+
+def _moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
+    """Positions after a turn (a vector, radians) about their centre and a shift, metres."""
+    centre_m = microphones_m.mean(axis=0)
+    return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
+
+
+def _by_place(
+    microphones: Microphones, there: Mapping[str, BoolArray], places_m: FloatArray, c_m_s: float
+) -> FloatArray:
+    """Slope (S, R, 3) of the centred delays by the places, seconds per metre."""
+    parts = []
+    for name, at_m in microphones.items():
+        towards = places_m[:, None] - at_m[None]
+        away_m = np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
+        here = there[name][..., None]
+        slopes = np.where(here, towards / (away_m * c_m_s), 0.0)
+        mean = slopes.sum(axis=1, keepdims=True) / np.maximum(here.sum(axis=1, keepdims=True), 1)
+        parts.append(np.where(here, slopes - mean, 0.0))
+    return np.concatenate(parts, axis=1)
