@@ -10,12 +10,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from livessl.core.commission.findings import Finding
     from livessl.core.geometry import Grid
     from livessl.core.locate.estimator import Estimator, Localization, Sound, register
     from livessl.core.locate.map_estimator import MapEstimator
     from livessl.core.methods import METHODS
     from livessl.core.types import ArraySpec, Estimate, Event
     from livessl.errors import ConfigError
+    from livessl.examination import Examination, examine
     from livessl.offline import PowerMap, locate, power_map
     from livessl.simulation.of_site import Simulation, simulate
     from livessl.site.load import load_site
@@ -30,6 +32,8 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Event",
+    "Examination",
+    "Finding",
     "Grid",
     "Localization",
     "MapEstimator",
@@ -38,6 +42,7 @@ __all__ = [
     "Site",
     "Sound",
     "__version__",
+    "examine",
     "load_site",
     "locate",
     "power_map",
@@ -52,6 +57,8 @@ _HOMES: Final = {
     "Estimate": "core.types",
     "Estimator": "core.locate.estimator",
     "Event": "core.types",
+    "Examination": "examination",
+    "Finding": "core.commission.findings",
     "Grid": "core.geometry",
     "Localization": "core.locate.estimator",
     "MapEstimator": "core.locate.map_estimator",
@@ -59,6 +66,7 @@ _HOMES: Final = {
     "Simulation": "simulation.of_site",
     "Site": "site.models",
     "Sound": "core.locate.estimator",
+    "examine": "examination",
     "load_site": "site.load",
     "locate": "offline",
     "power_map": "offline",

@@ -101,8 +101,7 @@ def locate(
     DeviceError
         If a recording does not fit the site.
     """
-    loaded = _site(site)
-    parts = _parts(loaded, recordings, sample_rate_hz)
+    loaded, parts = assigned(site, recordings, sample_rate_hz)
     outputs = run(loaded, parts, UnpacedClock(), method=method)
     return [output for output in outputs if isinstance(output, Event)]
 
@@ -129,9 +128,9 @@ def power_map(
     ConfigError, DeviceError
         As in `locate`; `DeviceError` also if the segment is silent.
     """
-    loaded = _site(site)
+    loaded, parts = assigned(site, recordings, sample_rate_hz)
     sounds = {}
-    for part in _parts(loaded, recordings, sample_rate_hz):
+    for part in parts:
         rate_hz = part.recording.sample_rate_hz
         samples = np.concatenate([block.samples for block in part.recording.blocks(0)], axis=1)
         stop = None if stop_s is None else round(stop_s * rate_hz)
@@ -149,6 +148,14 @@ def power_map(
     )
     arrays = {name: power.reshape(shape) for name, power in maps.arrays.items()}
     return PowerMap(maps.fused.reshape(shape), arrays, x_m, y_m, z_m)
+
+
+def assigned(
+    site: SiteOrPath, recordings: Mapping[str, Given], sample_rate_hz: float | None = None
+) -> tuple[Site, list[AssignedRecording]]:
+    """Return the site, and the recordings assigned to its arrays: see `locate`."""
+    loaded = _site(site)
+    return loaded, _parts(loaded, recordings, sample_rate_hz)
 
 
 def run(

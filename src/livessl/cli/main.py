@@ -69,6 +69,11 @@ COMMANDS: Final = (
         "predict the error everywhere in the room, and suggest where arrays should go",
         "livessl plan --site site.yaml --rt60 0.7 --out plan/",
     ),
+    Command(
+        "doctor",
+        "find what is wrong with a set-up, from recordings of some sounds",
+        "livessl doctor --session session/",
+    ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),

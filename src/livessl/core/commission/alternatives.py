@@ -14,10 +14,11 @@ from itertools import combinations, permutations
 from typing import Final
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.places import Delays, Microphones, Places, PlaceSearch, degrees_of_freedom
-from livessl.core.commission.poses import Adjusted, Freedom, adjust
+from livessl.core.commission.poses import DELAY_STD_S, Adjusted, Freedom, adjust
 from livessl.core.types import FloatArray, IntArray
 
 ALL_ORDERS: Final = 4
@@ -25,6 +26,9 @@ ALL_ORDERS: Final = 4
 
 REFINED: Final = 6
 """Alternatives, the best at first sight, whose places are refined."""
+
+MIN_FOR_ONE: Final = 4
+"""Fewest microphones of an array of which a single one is examined: the others must say what it ought to receive."""
 
 LEAST_SOUNDS: Final = 3
 """Fewest sounds from which anything is concluded."""
@@ -48,11 +52,17 @@ LEAST_TURN_DEG: Final = 4.0
 LEAST_SHIFT_M: Final = 0.1
 """Smallest shift that is told, metres."""
 
+LEAST_DISPLACEMENT_M: Final = 0.02
+"""Smallest displacement of a single microphone that is told, metres."""
+
+LEAST_LATE_S: Final = 40e-6
+"""Smallest delay of a single channel that is told, seconds: two samples at 48 kHz."""
+
 LEAST_SPEED_M_S: Final = 6.0
 """Smallest error of the speed of sound that is told, m/s: some 10 degrees of temperature."""
 
-_TURNED: Final = (0.005, 180.0)
-_MOVED: Final = (1.0, 0.3)
+_TURNED: Final = (0.02, 180.0)
+_MOVED: Final = (1.0, 1.5)
 _SPEED_STD_M_S: Final = 20.0
 """What an alternative leaves free: standard deviations in metres, degrees and m/s."""
 
@@ -64,9 +74,13 @@ class Alternative:
     Parameters
     ----------
     fault : str
-        Code of the fault: swapped, mirrored, turned, moved, temperature.
+        Code of the fault: swapped, mirrored, exchanged, turned, moved, late_channel, geometry, temperature.
     array : str or None
         The array that is other than filed; None for the whole site.
+    other : str or None
+        The array that it is exchanged with.
+    channel : int or None
+        The channel, from 1, that is late or whose microphone is elsewhere.
     misfit_s : float
         Misfit of the sounds with it, seconds.
     criterion : float
@@ -74,7 +88,9 @@ class Alternative:
     order : tuple of int
         For each microphone of the site file, the channel from 1 that carries it; empty if channels are as filed.
     turn_deg, shift_m : (3,) tuple of float
-        Turn of the array about its centre (a vector along the axis) and its shift.
+        Turn of the array about its centre (a vector along the axis), and its shift or that of the microphone.
+    late_s : float
+        Delay of the channel, seconds.
     speed_m_s : float or None
         Speed of sound, if it is what differs.
     speed_off_m_s : float
@@ -85,19 +101,30 @@ class Alternative:
     array: str | None
     misfit_s: float
     criterion: float
+    other: str | None = None
+    channel: int | None = None
     order: tuple[int, ...] = ()
     turn_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     shift_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    late_s: float = 0.0
     speed_m_s: float | None = None
     speed_off_m_s: float = 0.0
+
+    @property
+    def concerns(self) -> tuple[str | None, str | None]:
+        """The arrays that it is about: alternatives of the same arrays are no rivals of each other."""
+        return self.array, self.other
 
     @property
     def is_large(self) -> bool:
         """Whether it differs from what is filed by more than a careful set-up may."""
         if self.fault == "turned":
             return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
-        if self.fault == "moved":
-            return float(np.linalg.norm(self.shift_m)) >= LEAST_SHIFT_M
+        if self.fault in ("moved", "geometry"):
+            least_m = LEAST_SHIFT_M if self.fault == "moved" else LEAST_DISPLACEMENT_M
+            return float(np.linalg.norm(self.shift_m)) >= least_m
+        if self.fault == "late_channel":
+            return abs(self.late_s) >= LEAST_LATE_S
         return self.fault != "temperature" or abs(self.speed_off_m_s) >= LEAST_SPEED_M_S
 
 
@@ -152,11 +179,12 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
     trial = _Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
     if trial.sounds < LEAST_SOUNDS or len(microphones) < 2 or trial.filed.misfit_s <= MIN_RATIO * FLOOR_S:
         return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    rivals = sorted([*trial.orders(), *trial.poses(), *trial.speeds()], key=lambda one: one.criterion)
+    tried = (*trial.orders(), *trial.exchanges(), *trial.channels(), *trial.poses(), *trial.speeds())
+    rivals = sorted(tried, key=lambda one: one.criterion)
     gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
     contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, FLOOR_S)
     best = rivals[0]
-    others = [one for one in rivals if one.array != best.array]
+    others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
     named = contradicts and lead > MIN_LEAD and best.is_large
     return Diagnosis(
@@ -209,32 +237,86 @@ class _Trial:
                 order=tuple(int(channel) + 1 for channel in order),
             )
 
+    def exchanges(self) -> Iterator[Alternative]:
+        """Yield each two arrays of as many microphones exchanged."""
+        for one, other in combinations(self._delays, 2):
+            if self._delays[one].shape[1] != self._delays[other].shape[1]:
+                continue
+            delays = dict(self._delays) | {one: self._delays[other], other: self._delays[one]}
+            places = self._search.fit(self._microphones, delays)
+            yield Alternative("exchanged", one, places.misfit_s, self.criterion(places, 0.5), other=other)
+
+    def channels(self) -> Iterator[Alternative]:
+        """Yield each channel late, and each microphone elsewhere, as the other channels say best."""
+        for name, delays in self._delays.items():
+            if delays.shape[1] < MIN_FOR_ONE:
+                continue
+            for index in range(delays.shape[1]):
+                if np.isfinite(delays[:, index]).sum() < LEAST_SOUNDS:
+                    continue
+                yield from self._channel(name, index)
+
+    def _channel(self, name: str, index: int) -> Iterator[Alternative]:
+        others = self._delays[name].copy()
+        others[:, index] = np.nan
+        places = self._search.refine(self._microphones, dict(self._delays) | {name: others}, self.filed.positions_m)
+        at_m, c_m_s = self._microphones[name], self._search.c_m_s
+        towards = places.positions_m[:, None] - at_m
+        away_m = np.linalg.norm(towards, axis=2)
+        there = np.isfinite(others)
+        off_s = np.where(there, self._delays[name] - away_m / c_m_s, np.nan)
+        rest_s = np.nansum(off_s, axis=1) / np.maximum(there.sum(axis=1), 1)
+        late_s = self._delays[name][:, index] - away_m[:, index] / c_m_s - rest_s
+        known = np.isfinite(late_s)
+        constant_s = float(np.median(late_s[known]))
+        delays = self._delays[name].copy()
+        delays[:, index] -= constant_s
+        found = self._search.refine(self._microphones, dict(self._delays) | {name: delays}, places.positions_m)
+        yield Alternative(
+            "late_channel", name, found.misfit_s, self.criterion(found, 1.5), channel=index + 1, late_s=constant_s
+        )
+        unit = towards[:, index] / away_m[:, index, None]
+        shift_m = least_squares(
+            lambda shift: (late_s + unit @ shift / c_m_s)[known] / DELAY_STD_S, np.zeros(3), loss="soft_l1"
+        ).x
+        moved_m = at_m.copy()
+        moved_m[index] += shift_m
+        microphones = dict(self._microphones) | {name: moved_m}
+        found = self._search.refine(microphones, self._delays, places.positions_m)
+        yield Alternative(
+            "geometry",
+            name,
+            found.misfit_s,
+            self.criterion(found, 3.5),
+            channel=index + 1,
+            shift_m=tuple(float(part) for part in shift_m),
+        )
+
     def poses(self) -> Iterator[Alternative]:
         """Yield each array turned, and each array moved, as the sounds say best."""
         for name in self._microphones:
             adjusted, turn = self._turned(name)
-            pose = adjusted.poses[name]
-            whole = Rotation.from_rotvec(np.radians(pose.turn_deg)) * turn
-            places = self._placed(name, adjusted, turn)
-            yield Alternative(
-                "turned",
-                name,
-                places.misfit_s,
-                self.criterion(places, 2.0),
-                turn_deg=tuple(float(part) for part in np.degrees(whole.as_rotvec())),
-                shift_m=tuple(float(part) for part in pose.shift_m),
-            )
+            yield from self._posed("turned", name, adjusted, turn)
             adjusted = self._adjusted(self._microphones, self.filed.positions_m, Freedom({name: _MOVED}))
-            pose = adjusted.poses[name]
-            places = self._placed(name, adjusted, Rotation.identity())
-            yield Alternative(
-                "moved",
-                name,
-                places.misfit_s,
-                self.criterion(places, 3.0),
-                turn_deg=tuple(float(part) for part in pose.turn_deg),
-                shift_m=tuple(float(part) for part in pose.shift_m),
-            )
+            yield from self._posed("moved", name, adjusted, Rotation.identity())
+
+    def _posed(self, fault: str, name: str, adjusted: Adjusted, turn: Rotation) -> Iterator[Alternative]:
+        """Yield an adjusted pose, unless what it is not named after is large as well."""
+        pose = adjusted.poses[name]
+        whole = Rotation.from_rotvec(np.radians(pose.turn_deg)) * turn
+        turn_deg = np.degrees(whole.as_rotvec())
+        is_turned = fault == "turned"
+        if pose.distance_m > LEAST_SHIFT_M if is_turned else np.linalg.norm(turn_deg) > LEAST_TURN_DEG:
+            return
+        places = self._placed(name, adjusted, turn)
+        yield Alternative(
+            fault,
+            name,
+            places.misfit_s,
+            self.criterion(places, 3.0 if is_turned else 4.0),
+            turn_deg=tuple(float(part) for part in turn_deg),
+            shift_m=tuple(float(part) for part in pose.shift_m),
+        )
 
     def speeds(self) -> Iterator[Alternative]:
         """Yield the speed of sound that the sounds say best."""

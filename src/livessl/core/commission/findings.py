@@ -215,7 +215,7 @@ def _of_site(diagnosis: Diagnosis) -> Iterator[Finding]:
         yield Finding(
             diagnosis.best.fault,
             diagnosis.best.array,
-            None,
+            diagnosis.best.channel,
             Severity.ERROR,
             min(0.99, diagnosis.confidence),
             f"{what}: misfit {better}",
@@ -252,6 +252,22 @@ def _words(alternative: Alternative) -> tuple[str, str]:
             f"plug in the microphones in the order {', '.join(str(channel) for channel in alternative.order)}, "
             "or give the channels so in the site file (nodes.NAME.arrays)",
         )
+    if alternative.fault == "exchanged":
+        return (
+            f"the inputs of {array!r} and {alternative.other!r} are exchanged",
+            "exchange the plugs of the two arrays, or their channels in the site file (nodes.NAME.arrays)",
+        )
+    if alternative.fault == "late_channel":
+        return (
+            f"channel {alternative.channel} of {array!r} is {1e6 * alternative.late_s:+.0f} us late",
+            "use inputs of one kind (all analogue, or all by the same converter) for an array",
+        )
+    if alternative.fault == "geometry":
+        return (
+            f"microphone {alternative.channel} of {array!r} is "
+            f"{100.0 * float(np.linalg.norm(alternative.shift_m)):.0f} cm from where the site file has it",
+            f"measure the array again; the sounds suggest a shift of ({_metres(alternative.shift_m)}) m",
+        )
     if alternative.fault == "turned":
         axis = np.array(alternative.turn_deg)
         about = float(axis[2])
@@ -264,13 +280,17 @@ def _words(alternative: Alternative) -> tuple[str, str]:
             )
         return f"{array!r} is turned by {angle:.0f} degrees", f"check arrays.{array}.orientation_deg"
     if alternative.fault == "moved":
-        shift = ", ".join(f"{x:+.2f}" for x in alternative.shift_m)
         distance_m = float(np.linalg.norm(alternative.shift_m))
         return (
             f"{array!r} is {distance_m:.2f} m from where the site file has it",
-            f"measure its position again; the sounds suggest a shift of ({shift}) m in arrays.{array}.position_m",
+            f"measure arrays.{array}.position_m again; the sounds suggest a shift of "
+            f"({_metres(alternative.shift_m)}) m",
         )
     return (
         f"the speed of sound is {alternative.speed_m_s or 0.0:.0f} m/s, {alternative.speed_off_m_s:+.0f} m/s off",
         "correct temperature_c or speed_of_sound_m_s in the site file",
     )
+
+
+def _metres(shift_m: Sequence[float]) -> str:
+    return ", ".join(f"{x:+.2f}" for x in shift_m)

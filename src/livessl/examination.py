@@ -1,0 +1,125 @@
+"""Examines a site's set-up with recordings: what is wrong, on which channel of which array, and what cures it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livessl import offline
+from livessl.clock import UnpacedClock
+from livessl.core.commission.channels import ChannelMeter
+from livessl.core.commission.findings import Finding, Severity, find_faults
+from livessl.core.types import Event, Observation
+from livessl.recordings.assign import AssignedRecording
+from livessl.site.build.grid import search_grid
+from livessl.site.models import Site
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What recordings say about a set-up.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        Errors first.
+    sounds : int
+        Number of sounds that were examined.
+    """
+
+    findings: tuple[Finding, ...]
+    sounds: int
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether no finding is an error."""
+        return all(finding.severity is not Severity.ERROR for finding in self.findings)
+
+
+def examine(
+    site: offline.SiteOrPath,
+    recordings: Mapping[str, offline.Given],
+    sample_rate_hz: float | None = None,
+) -> Examination:
+    """Examine a site's set-up with recordings.
+
+    Parameters
+    ----------
+    site : Site, Path or str
+        A site, or the path of a site file.
+    recordings, sample_rate_hz
+        As in `livessl.locate`. Ten sounds from different places show most; three are the least.
+
+    Raises
+    ------
+    ConfigError, DeviceError
+        As in `livessl.locate`.
+    """
+    loaded, parts = offline.assigned(site, recordings, sample_rate_hz)
+    return examine_parts(loaded, parts)
+
+
+def examine_parts(
+    site: Site, parts: Sequence[AssignedRecording], progress: Callable[[int], None] | None = None
+) -> Examination:
+    """Examine a site's set-up with recordings that are assigned to its arrays: see `examine`.
+
+    Raises
+    ------
+    DeviceError
+        If recordings of arrays that the site joins do not belong together.
+    """
+    outputs = offline.run(site, parts, UnpacedClock(), progress=progress)
+    sounds = [output.observations for output in outputs if isinstance(output, Event) and output.observations]
+    findings = [finding for part in parts for finding in _of_samples(part)] + find_set_up_faults(site, sounds)
+    order = list(Severity)
+    told = sorted(with_inputs(site, _without_consequences(findings)), key=lambda one: order.index(one.severity))
+    return Examination(tuple(told), len(sounds))
+
+
+def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
+    """Find what the observations of some sounds say about a site's channels, poses and speed of sound."""
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    return find_faults(microphones, sounds, np.array(search_grid(site).bounds_m), site.c_m_s)
+
+
+def with_inputs(site: Site, findings: Sequence[Finding]) -> list[Finding]:
+    """Add the input of the device to each finding about a channel, where the site file says which one it is."""
+    return [replace(one, input=_input(site, one)) for one in findings]
+
+
+def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
+    """Leave out what follows from another finding: whatever a silent channel shows, and the noise of a loud one."""
+    faults: dict[tuple[str | None, int | None], set[str]] = {}
+    for one in findings:
+        faults.setdefault((one.array, one.channel), set()).add(one.fault)
+    return [
+        one
+        for one in findings
+        if "dead" not in (others := faults[one.array, one.channel] - {one.fault})
+        and not (one.fault == "noisy" and others & {"level", "clipping"})
+    ]
+
+
+def _input(site: Site, finding: Finding) -> int | None:
+    if finding.array is None or finding.channel is None:
+        return None
+    channel = finding.channel
+    for array in site.members(finding.array):
+        count = len(site.array(array).microphones_m)
+        if channel <= count:
+            node = site.node_of(array)
+            inputs = site.nodes[node].arrays[array] if node is not None else []
+            return inputs[channel - 1] if len(inputs) >= channel else None
+        channel -= count
+    return None
+
+
+def _of_samples(part: AssignedRecording) -> list[Finding]:
+    meter = ChannelMeter(len(part.channels), part.recording.sample_rate_hz)
+    rows = np.array(part.channels) - 1
+    for block in part.recording.blocks(0):
+        meter.push(block.samples[rows])
+    return list(meter.faults(part.array))
