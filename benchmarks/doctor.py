@@ -106,7 +106,7 @@ def _hum(samples: Float32Array, _rng: np.random.Generator) -> Float32Array:
 
 
 def _clip(samples: Float32Array, _rng: np.random.Generator) -> Float32Array:
-    return np.clip(samples * np.float32(8.0 / max(1e-9, np.abs(samples).max())), -1.0, 1.0)
+    return np.asarray(np.clip(samples * np.float32(8.0 / max(1e-9, np.abs(samples).max())), -1.0, 1.0))
 
 
 def _late(samples: Float32Array, _rng: np.random.Generator) -> Float32Array:

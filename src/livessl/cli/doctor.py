@@ -12,8 +12,8 @@ from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.core.commission.alternatives import LEAST_SOUNDS
 from livessl.core.commission.findings import Finding
+from livessl.core.commission.trial import LEAST_SOUNDS
 from livessl.errors import UseError
 from livessl.examination import examine_parts
 from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions, span_ns

@@ -23,6 +23,9 @@ MAINS_HZ: Final = (50.0, 60.0)
 HARMONICS: Final = 6
 """Harmonics of the mains that are looked at."""
 
+LEAST_LINES: Final = 2
+"""Fewest of these that are hum without the first: a single one may be any tone."""
+
 HUM_DB: Final = 15.0
 """Height, in decibels, of a line over the spectrum beside it, from which it is hum."""
 
@@ -98,8 +101,8 @@ class ChannelMeter:
             if abs(mean[index]) > MOST_CONSTANT:
                 what = f"{where} has a constant of {mean[index]:+.3f} of full scale"
                 yield _warning("dc", array, index, what, "check the input and its microphone; a high-pass filter helps")
-            if hum[index] is not None:
-                mains_hz, dbfs = hum[index]
+            if (found := hum[index]) is not None:
+                mains_hz, dbfs = found
                 what = f"{where} hums at {mains_hz:.0f} Hz, {dbfs:.0f} dBFS"
                 yield _warning("hum", array, index, what, "use balanced cables, and keep them away from mains cables")
             if floor_db[index] > NOISY_DB:
@@ -113,10 +116,12 @@ class ChannelMeter:
         for channel in spectrum:
             best: tuple[float, float] | None = None
             for mains_hz in MAINS_HZ:
-                lines = [line for n in range(1, HARMONICS + 1) if (line := self._line(channel, n * mains_hz)) > 0.0]
-                level = 10.0 * np.log10(sum(lines)) if lines else -np.inf
+                lines = [self._line(channel, n * mains_hz) for n in range(1, HARMONICS + 1)]
+                if lines[0] == 0.0 and np.count_nonzero(lines) < LEAST_LINES:
+                    continue
+                level = 10.0 * float(np.log10(sum(lines)))
                 if level >= HUM_DBFS and (best is None or level > best[1]):
-                    best = mains_hz, float(level)
+                    best = mains_hz, level
             found.append(best)
         return found
 

@@ -9,8 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.commission.alternatives import LEAST_SOUNDS, Alternative, Diagnosis, diagnose
+from livessl.core.commission.alternative import Alternative
+from livessl.core.commission.diagnosis import Diagnosis, diagnose
 from livessl.core.commission.places import Microphones, stacked
+from livessl.core.commission.trial import LEAST_SOUNDS
 from livessl.core.types import BoolArray, FloatArray, Observation
 
 LEAST_SHARPNESS: Final = 3.5

@@ -61,13 +61,13 @@ def centred(delays_s: FloatArray) -> FloatArray:
     there = np.isfinite(delays_s)
     count = np.maximum(there.sum(axis=-1, keepdims=True), 1)
     mean = np.where(there, delays_s, 0.0).sum(axis=-1, keepdims=True) / count
-    return np.where(there, delays_s - mean, 0.0)
+    return np.asarray(np.where(there, delays_s - mean, 0.0))
 
 
 def degrees_of_freedom(delays: Delays) -> FloatArray:
     """Number of independent delays of each sound beyond the three of its place, at least 1, (S,)."""
     counts = [np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in delays.values()]
-    return np.maximum(np.sum(counts, axis=0) - 3, 1).astype(np.float64)
+    return np.asarray(np.maximum(np.sum(counts, axis=0) - 3, 1), dtype=np.float64)
 
 
 class PlaceSearch:

@@ -149,7 +149,7 @@ def adjust(
         xtol=_TOLERANCE,
         max_nfev=_MOST_STEPS,
     )
-    return problem.result(solved.x, solved.jac)
+    return problem.result(solved.x, np.asarray(solved.jac))
 
 
 def from_known_places(

@@ -1,15 +1,8 @@
-"""Finds what explains the contradictions between the delays of sounds: other orders of channels, other poses.
-
-With the set-up as filed, the arrays' delays of a sound fit no place if something is wrong. Each alternative is tried:
-every order of an array's channels, turns and shifts of an array, another speed of sound. The one that explains the
-sounds best is named, provided that it explains them far better than the set-up as filed, and better than every
-alternative of another kind.
-"""
+"""Tries other set-ups than the one that is filed against the delays of some sounds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Final
 
@@ -17,6 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from livessl.core.commission.alternative import LEAST_SHIFT_M, LEAST_TURN_DEG, Alternative
 from livessl.core.commission.places import Delays, Microphones, Places, PlaceSearch, degrees_of_freedom
 from livessl.core.commission.poses import DELAY_STD_S, Adjusted, Freedom, adjust
 from livessl.core.types import FloatArray, IntArray
@@ -33,33 +27,9 @@ MIN_FOR_ONE: Final = 4
 LEAST_SOUNDS: Final = 3
 """Fewest sounds from which anything is concluded."""
 
-MIN_GAIN: Final = 12.0
-"""Least gain in the Bayesian information criterion for which a set-up is said to be other than filed."""
-
-MIN_LEAD: Final = 6.0
-"""Least lead in the same measure over the best alternative of another array, or of the whole site."""
-
-MIN_RATIO: Final = 1.3
-"""Least ratio between the misfit as filed and that of the alternative."""
-
 FLOOR_S: Final = 12e-6
 """Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
 to 2 cm and 1.5 degrees. A smaller one is no reason to prefer an alternative."""
-
-LEAST_TURN_DEG: Final = 4.0
-"""Smallest turn that is told."""
-
-LEAST_SHIFT_M: Final = 0.1
-"""Smallest shift that is told, metres."""
-
-LEAST_DISPLACEMENT_M: Final = 0.02
-"""Smallest displacement of a single microphone that is told, metres."""
-
-LEAST_LATE_S: Final = 40e-6
-"""Smallest delay of a single channel that is told, seconds: two samples at 48 kHz."""
-
-LEAST_SPEED_M_S: Final = 6.0
-"""Smallest error of the speed of sound that is told, m/s: some 10 degrees of temperature."""
 
 _TURNED: Final = (0.02, 180.0)
 _MOVED: Final = (1.0, 1.5)
@@ -67,133 +37,17 @@ _SPEED_STD_M_S: Final = 20.0
 """What an alternative leaves free: standard deviations in metres, degrees and m/s."""
 
 
-@dataclass(frozen=True, slots=True)
-class Alternative:
-    """A set-up other than the one that is filed.
-
-    Parameters
-    ----------
-    fault : str
-        Code of the fault: swapped, mirrored, exchanged, turned, moved, late_channel, geometry, temperature.
-    array : str or None
-        The array that is other than filed; None for the whole site.
-    other : str or None
-        The array that it is exchanged with.
-    channel : int or None
-        The channel, from 1, that is late or whose microphone is elsewhere.
-    misfit_s : float
-        Misfit of the sounds with it, seconds.
-    criterion : float
-        Bayesian information criterion; the lowest is best.
-    order : tuple of int
-        For each microphone of the site file, the channel from 1 that carries it; empty if channels are as filed.
-    turn_deg, shift_m : (3,) tuple of float
-        Turn of the array about its centre (a vector along the axis), and its shift or that of the microphone.
-    late_s : float
-        Delay of the channel, seconds.
-    speed_m_s : float or None
-        Speed of sound, if it is what differs.
-    speed_off_m_s : float
-        Its difference from the filed one, m/s.
-    """
-
-    fault: str
-    array: str | None
-    misfit_s: float
-    criterion: float
-    other: str | None = None
-    channel: int | None = None
-    order: tuple[int, ...] = ()
-    turn_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
-    shift_m: tuple[float, ...] = (0.0, 0.0, 0.0)
-    late_s: float = 0.0
-    speed_m_s: float | None = None
-    speed_off_m_s: float = 0.0
-
-    @property
-    def concerns(self) -> tuple[str | None, str | None]:
-        """The arrays that it is about: alternatives of the same arrays are no rivals of each other."""
-        return self.array, self.other
-
-    @property
-    def is_large(self) -> bool:
-        """Whether it differs from what is filed by more than a careful set-up may."""
-        if self.fault == "turned":
-            return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
-        if self.fault in ("moved", "geometry"):
-            least_m = LEAST_SHIFT_M if self.fault == "moved" else LEAST_DISPLACEMENT_M
-            return float(np.linalg.norm(self.shift_m)) >= least_m
-        if self.fault == "late_channel":
-            return abs(self.late_s) >= LEAST_LATE_S
-        return self.fault != "temperature" or abs(self.speed_off_m_s) >= LEAST_SPEED_M_S
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """What the delays of some sounds say about the set-up.
-
-    Parameters
-    ----------
-    sounds : int
-        Number of sounds.
-    misfit_s : float
-        Misfit with the set-up as filed, seconds.
-    best : Alternative or None
-        The alternative to believe; None if the set-up as filed is as good, or no alternative stands out.
-    rivals : tuple of Alternative
-        All that were refined, best first.
-    contradicts : bool
-        Whether the sounds contradict the set-up as filed, explained or not.
-    lead : float
-        Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the Bayesian
-        information criterion.
-    """
-
-    sounds: int
-    misfit_s: float
-    best: Alternative | None
-    rivals: tuple[Alternative, ...]
-    contradicts: bool
-    lead: float = 0.0
-
-    @property
-    def confidence(self) -> float:
-        """Probability of the best alternative against the next best one."""
-        return float(1.0 / (1.0 + np.exp(-self.lead / 2.0)))
-
-
-def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float) -> Diagnosis:
-    """Compare the set-up as filed with its alternatives.
+class Trial:
+    """The sounds, and the set-up as filed, against which alternatives are tried.
 
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
         As filed, metres.
     delays : mapping of array to (S, K) float64
-        Delays of the same S sounds at each array, seconds; NaN where an array did not receive one.
-    bounds_m : (3, 2) float64
-        Search volume, metres.
-    c_m_s : float
-        Speed of sound as filed, m/s.
+        Seconds.
+    search : PlaceSearch
     """
-    trial = _Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
-    if trial.sounds < LEAST_SOUNDS or len(microphones) < 2 or trial.filed.misfit_s <= MIN_RATIO * FLOOR_S:
-        return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    tried = (*trial.orders(), *trial.exchanges(), *trial.channels(), *trial.poses(), *trial.speeds())
-    rivals = sorted(tried, key=lambda one: one.criterion)
-    gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
-    contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, FLOOR_S)
-    best = rivals[0]
-    others = [one for one in rivals if one.concerns != best.concerns]
-    lead = others[0].criterion - best.criterion if others else gained
-    named = contradicts and lead > MIN_LEAD and best.is_large
-    return Diagnosis(
-        trial.sounds, trial.filed.misfit_s, best if named else None, tuple(rivals), contradicts, min(gained, lead)
-    )
-
-
-class _Trial:
-    """The sounds, and the set-up as filed, against which alternatives are tried."""
 
     def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
         self._microphones, self._delays, self._search = microphones, delays, search
@@ -223,15 +77,15 @@ class _Trial:
                     for name, delays in self._delays.items()
                 }
                 tried.append((self._lowest(together), None, dict.fromkeys(self._delays, order)))
-        for _, name, orders in sorted(tried, key=lambda one: one[0])[:REFINED]:
-            delays = dict(self._delays) | {array: self._delays[array][:, order] for array, order in orders.items()}
-            places = self._search.fit(self._microphones, delays)
+        for _, array, orders in sorted(tried, key=lambda one: one[0])[:REFINED]:
+            changed = {name: self._delays[name][:, order] for name, order in orders.items()}
+            places = self._search.fit(self._microphones, dict(self._delays) | changed)
             order = next(iter(orders.values()))
             moved = int((order != np.arange(len(order))).sum())
-            fault = "swapped" if name is not None else "mirrored"
+            fault = "swapped" if array is not None else "mirrored"
             yield Alternative(
                 fault,
-                name,
+                array,
                 places.misfit_s,
                 self.criterion(places, 0.5 * moved),
                 order=tuple(int(channel) + 1 for channel in order),
@@ -275,10 +129,12 @@ class _Trial:
         yield Alternative(
             "late_channel", name, found.misfit_s, self.criterion(found, 1.5), channel=index + 1, late_s=constant_s
         )
-        unit = towards[:, index] / away_m[:, index, None]
-        shift_m = least_squares(
-            lambda shift: (late_s + unit @ shift / c_m_s)[known] / DELAY_STD_S, np.zeros(3), loss="soft_l1"
-        ).x
+        unit, late_s = (towards[:, index] / away_m[:, index, None])[known], late_s[known]
+
+        def misfits(shift_m: FloatArray) -> FloatArray:
+            return np.asarray((late_s + unit @ shift_m / c_m_s) / DELAY_STD_S)
+
+        shift_m = least_squares(misfits, np.zeros(3), loss="soft_l1").x
         moved_m = at_m.copy()
         moved_m[index] += shift_m
         microphones = dict(self._microphones) | {name: moved_m}

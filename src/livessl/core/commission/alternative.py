@@ -1,0 +1,84 @@
+"""A set-up other than the one that is filed, and how large a difference is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+LEAST_TURN_DEG: Final = 4.0
+"""Smallest turn that is told."""
+
+LEAST_SHIFT_M: Final = 0.1
+"""Smallest shift that is told, metres."""
+
+LEAST_DISPLACEMENT_M: Final = 0.02
+"""Smallest displacement of a single microphone that is told, metres."""
+
+LEAST_LATE_S: Final = 40e-6
+"""Smallest delay of a single channel that is told, seconds: two samples at 48 kHz."""
+
+LEAST_SPEED_M_S: Final = 6.0
+"""Smallest error of the speed of sound that is told, m/s: some 10 degrees of temperature."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """A set-up other than the one that is filed.
+
+    Parameters
+    ----------
+    fault : str
+        Code of the fault: swapped, mirrored, exchanged, turned, moved, late_channel, geometry, temperature.
+    array : str or None
+        The array that is other than filed; None for the whole site.
+    other : str or None
+        The array that it is exchanged with.
+    channel : int or None
+        The channel, from 1, that is late or whose microphone is elsewhere.
+    misfit_s : float
+        Misfit of the sounds with it, seconds.
+    criterion : float
+        Bayesian information criterion; the lowest is best.
+    order : tuple of int
+        For each microphone of the site file, the channel from 1 that carries it; empty if channels are as filed.
+    turn_deg, shift_m : (3,) tuple of float
+        Turn of the array about its centre (a vector along the axis), and its shift or that of the microphone.
+    late_s : float
+        Delay of the channel, seconds.
+    speed_m_s : float or None
+        Speed of sound, if it is what differs.
+    speed_off_m_s : float
+        Its difference from the filed one, m/s.
+    """
+
+    fault: str
+    array: str | None
+    misfit_s: float
+    criterion: float
+    other: str | None = None
+    channel: int | None = None
+    order: tuple[int, ...] = ()
+    turn_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    shift_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    late_s: float = 0.0
+    speed_m_s: float | None = None
+    speed_off_m_s: float = 0.0
+
+    @property
+    def concerns(self) -> tuple[str | None, str | None]:
+        """The arrays that it is about: alternatives of the same arrays are no rivals of each other."""
+        return self.array, self.other
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it differs from what is filed by more than a careful set-up may."""
+        if self.fault == "turned":
+            return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
+        if self.fault in ("moved", "geometry"):
+            least_m = LEAST_SHIFT_M if self.fault == "moved" else LEAST_DISPLACEMENT_M
+            return float(np.linalg.norm(self.shift_m)) >= least_m
+        if self.fault == "late_channel":
+            return abs(self.late_s) >= LEAST_LATE_S
+        return self.fault != "temperature" or abs(self.speed_off_m_s) >= LEAST_SPEED_M_S

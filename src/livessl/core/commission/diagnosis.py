@@ -1,0 +1,92 @@
+"""Finds what explains the contradictions between the delays of sounds: other orders of channels, other poses.
+
+With the set-up as filed, the arrays' delays of a sound fit no place if something is wrong. Each alternative is tried:
+every order of an array's channels, turns and shifts of an array, another speed of sound. The one that explains the
+sounds best is named, provided that it explains them far better than the set-up as filed, and better than every
+alternative of another array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.commission.alternative import Alternative
+from livessl.core.commission.places import Delays, Microphones, PlaceSearch
+from livessl.core.commission.trial import FLOOR_S, LEAST_SOUNDS, Trial
+from livessl.core.types import FloatArray
+
+MIN_GAIN: Final = 12.0
+"""Least gain in the Bayesian information criterion for which a set-up is said to be other than filed."""
+
+MIN_LEAD: Final = 6.0
+"""Least lead in the same measure over the best alternative of another array, or of the whole site."""
+
+MIN_RATIO: Final = 1.3
+"""Least ratio between the misfit as filed and that of the alternative."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the delays of some sounds say about the set-up.
+
+    Parameters
+    ----------
+    sounds : int
+        Number of sounds.
+    misfit_s : float
+        Misfit with the set-up as filed, seconds.
+    best : Alternative or None
+        The alternative to believe; None if the set-up as filed is as good, or no alternative stands out.
+    rivals : tuple of Alternative
+        All that were refined, best first.
+    contradicts : bool
+        Whether the sounds contradict the set-up as filed, explained or not.
+    lead : float
+        Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the Bayesian
+        information criterion.
+    """
+
+    sounds: int
+    misfit_s: float
+    best: Alternative | None
+    rivals: tuple[Alternative, ...]
+    contradicts: bool
+    lead: float = 0.0
+
+    @property
+    def confidence(self) -> float:
+        """Probability of the best alternative against the next best one."""
+        return float(1.0 / (1.0 + np.exp(-self.lead / 2.0)))
+
+
+def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float) -> Diagnosis:
+    """Compare the set-up as filed with its alternatives.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As filed, metres.
+    delays : mapping of array to (S, K) float64
+        Delays of the same S sounds at each array, seconds; NaN where an array did not receive one.
+    bounds_m : (3, 2) float64
+        Search volume, metres.
+    c_m_s : float
+        Speed of sound as filed, m/s.
+    """
+    trial = Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
+    if trial.sounds < LEAST_SOUNDS or len(microphones) < 2 or trial.filed.misfit_s <= MIN_RATIO * FLOOR_S:
+        return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
+    tried = (*trial.orders(), *trial.exchanges(), *trial.channels(), *trial.poses(), *trial.speeds())
+    rivals = sorted(tried, key=lambda one: one.criterion)
+    gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
+    contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, FLOOR_S)
+    best = rivals[0]
+    others = [one for one in rivals if one.concerns != best.concerns]
+    lead = others[0].criterion - best.criterion if others else gained
+    named = contradicts and lead > MIN_LEAD and best.is_large
+    return Diagnosis(
+        trial.sounds, trial.filed.misfit_s, best if named else None, tuple(rivals), contradicts, min(gained, lead)
+    )

@@ -1,0 +1,70 @@
+"""Poses are measured from sounds at known and at unknown places."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from livessl.core.commission.places import PlaceSearch
+from livessl.core.commission.poses import Freedom, adjust, from_known_places
+from livessl.core.types import FloatArray
+from set_ups import BOUNDS_M, C_M_S, delays_of, set_up, sources
+
+few = settings(deadline=None, max_examples=3)
+
+
+def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
+    centre_m = microphones_m.mean(axis=0)
+    return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
+
+
+@few
+@given(seed=st.integers(0, 10_000))
+def test_eight_claps_at_known_places_give_the_pose_from_anywhere(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = {"north": set_up(rng)["north"]}
+    places_m = sources(rng, 8)
+    delays = delays_of(true, places_m, rng)
+    filed = moved(true["north"], rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.5, 3))
+    begin = from_known_places(filed, delays["north"], places_m)
+    assert begin is not None
+    rough = moved(filed, *begin)
+    known_m = places_m + rng.normal(0.0, 0.01, places_m.shape)
+    found = adjust({"north": rough}, delays, known_m, C_M_S, Freedom({"north": (100.0, 360.0)}), place_std_m=0.01)
+    better = found.poses["north"].applied(rough)
+    assert np.linalg.norm(better.mean(axis=0) - true["north"].mean(axis=0)) < 0.06
+    assert np.abs(better - true["north"]).max() < 0.07
+
+
+@few
+@given(seed=st.integers(0, 10_000))
+def test_a_pose_is_refined_from_sounds_at_unknown_places(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = set_up(rng, 3)
+    delays = delays_of(true, sources(rng, 20), rng)
+    filed = true | {"south": moved(true["south"], rng.normal(0.0, 0.05, 3), np.array([0.0, 0.0, 0.2]))}
+    begin_m = PlaceSearch(BOUNDS_M, C_M_S).fit(filed, delays).positions_m
+    found = adjust(filed, delays, begin_m, C_M_S, Freedom({"south": (0.1, 30.0)}))
+    pose = found.poses["south"]
+    assert abs(pose.turn_deg[2] + np.degrees(0.2)) < 2.5
+    off_m = pose.applied(filed["south"]) - true["south"]
+    assert np.sqrt((off_m**2).sum(axis=1)).max() < 0.1
+    assert 0.0 < np.sqrt(pose.covariance[5, 5]) < np.radians(2.0)
+
+
+def test_the_speed_of_sound_is_measured_with_the_places_known() -> None:
+    rng = np.random.default_rng(3)
+    true = set_up(rng)
+    places_m = sources(rng, 8)
+    delays = delays_of(true, places_m, rng)
+    found = adjust(true, delays, places_m, 335.0, Freedom({}, speed_std_m_s=20.0), place_std_m=0.01)
+    assert abs(found.c_m_s - C_M_S) < 1.0
+    assert 0.0 < found.c_std_m_s < 3.0
+
+
+def test_a_line_of_microphones_has_no_direction_to_begin_with() -> None:
+    rng = np.random.default_rng(4)
+    line_m = np.column_stack([np.linspace(0.0, 0.3, 4), np.zeros(4), np.zeros(4)])
+    assert from_known_places(line_m, np.zeros((5, 4)), sources(rng, 5)) is None
