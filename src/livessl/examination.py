@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
-from livessl.core.commission.findings import Finding, Severity, find_faults
-from livessl.core.types import Event, Observation
+from livessl.core.commission.findings import Finding, Severity
+from livessl.core.types import Event
 from livessl.recordings.assign import AssignedRecording
-from livessl.site.build.grid import search_grid
+from livessl.site.build.set_up import find_set_up_faults, with_inputs
 from livessl.site.models import Site
 
 
@@ -79,17 +79,6 @@ def examine_parts(
     return Examination(tuple(told), len(sounds))
 
 
-def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
-    """Find what the observations of some sounds say about a site's channels, poses and speed of sound."""
-    microphones = {spec.name: spec.microphones_m for spec in site.processed}
-    return find_faults(microphones, sounds, np.array(search_grid(site).bounds_m), site.c_m_s)
-
-
-def with_inputs(site: Site, findings: Sequence[Finding]) -> list[Finding]:
-    """Add the input of the device to each finding about a channel, where the site file says which one it is."""
-    return [replace(one, input=_input(site, one)) for one in findings]
-
-
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
     """Leave out what follows from another finding: whatever a silent channel shows, and the noise of a loud one."""
     faults: dict[tuple[str | None, int | None], set[str]] = {}
@@ -101,20 +90,6 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
         if "dead" not in (others := faults[one.array, one.channel] - {one.fault})
         and not (one.fault == "noisy" and others & {"level", "clipping"})
     ]
-
-
-def _input(site: Site, finding: Finding) -> int | None:
-    if finding.array is None or finding.channel is None:
-        return None
-    channel = finding.channel
-    for array in site.members(finding.array):
-        count = len(site.array(array).microphones_m)
-        if channel <= count:
-            node = site.node_of(array)
-            inputs = site.nodes[node].arrays[array] if node is not None else []
-            return inputs[channel - 1] if len(inputs) >= channel else None
-        channel -= count
-    return None
 
 
 def _of_samples(part: AssignedRecording) -> list[Finding]:

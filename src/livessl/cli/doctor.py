@@ -4,27 +4,38 @@ from __future__ import annotations
 
 import argparse
 import json
+import urllib.error
+import urllib.request
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.core.commission.findings import Finding
+from livessl.core.commission.findings import Finding, Severity
 from livessl.core.commission.trial import LEAST_SOUNDS
-from livessl.errors import UseError
-from livessl.examination import examine_parts
+from livessl.errors import RunError, UseError
+from livessl.examination import Examination, examine_parts
 from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions, span_ns
 from livessl.recordings.session import read_session
 from livessl.site.load import load_site
 from livessl.site.models import Site
 
+ANSWER_S: Final = 10.0
+"""Longest wait for a server's answer, seconds."""
+
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
+    parser.add_argument("--site", type=Path, help="site file (default: the session's own); not needed with --url")
+    parser.add_argument(
+        "--url", help="running server to ask, such as http://127.0.0.1:8000; it examines its last sounds"
+    )
+    parser.add_argument(
+        "--token-file", type=Path, metavar="FILE", help="file that holds a token for the server, where it wants one"
+    )
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
@@ -35,10 +46,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    site, parts = _given(arguments)
-    print_warnings(site)
-    with progress.timed("examining", *span_ns(parts)) as bar:
-        examination = examine_parts(site, parts, bar)
+    examination = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
         print(json.dumps({"kind": "finding"} | asdict(finding)) if arguments.json else _line(finding), flush=True)
     if examination.sounds < LEAST_SOUNDS:
@@ -52,9 +60,43 @@ def run(arguments: argparse.Namespace) -> int:
     return OK if examination.is_sound else FAILED
 
 
+def _examine(arguments: argparse.Namespace) -> Examination:
+    site, parts = _given(arguments)
+    print_warnings(site)
+    with progress.timed("examining", *span_ns(parts)) as bar:
+        return examine_parts(site, parts, bar)
+
+
+def _ask(url: str, token_file: Path | None) -> Examination:
+    """Return what a running server has found."""
+    address = f"{url.rstrip('/')}/api/v1/findings"
+    if not address.startswith(("http://", "https://")):
+        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
+    headers = {}
+    if token_file is not None:
+        try:
+            headers["Authorization"] = f"Bearer {token_file.read_text(encoding='utf-8').strip()}"
+        except OSError as error:
+            raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+    request = urllib.request.Request(address, headers=headers)  # noqa: S310 - the address begins with http
+    try:
+        with urllib.request.urlopen(request, timeout=ANSWER_S) as response:  # noqa: S310
+            answer = json.load(response)
+    except urllib.error.HTTPError as error:
+        cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
+        raise RunError(f"{address}: the server answered {error.code} {error.reason}{cure}") from error
+    except (OSError, ValueError) as error:
+        why = getattr(error, "reason", error)
+        raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
+    for finding in answer["findings"]:
+        del finding["kind"]
+        finding["severity"] = Severity(finding["severity"])
+    return Examination(tuple(Finding(**finding) for finding in answer["findings"]), answer["sounds"])
+
+
 def _given(arguments: argparse.Namespace) -> tuple[Site, list[AssignedRecording]]:
     if bool(arguments.session) == bool(arguments.wav):
-        raise UseError("doctor: expected --session DIR, or --wav ARRAY=FILE for each array; give one of them")
+        raise UseError("doctor: expected --session DIR, --wav ARRAY=FILE for each array, or --url; give one of them")
     if arguments.session:
         sessions = [read_session(directory) for directory in arguments.session]
         joint = joints(arguments)

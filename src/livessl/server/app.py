@@ -29,6 +29,7 @@ from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
 from livessl.server.retention import delete_old_events
+from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -89,9 +90,12 @@ def assemble(
         site_time = SiteTime(clock)
         latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
         overload = Overload(clock)
-        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, publish)
+        set_up_watch = SetUpWatch(site, overload)
+        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
         event_log = EventLog(site.site, clock, store, latency, publish_event)
-        publisher = Publisher(publish, receiver.request, site_time, event_log, tracks, maps, latency, overload)
+        publisher = Publisher(
+            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch
+        )
         engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload)
         undo.pop_all()
     return Parts(
@@ -107,6 +111,7 @@ def assemble(
         maps=maps,
         latency=latency,
         overload=overload,
+        set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
         fanout=fanout,
@@ -193,6 +198,7 @@ class Server:
             sys.setswitchinterval(before_s)
             self.parts.engine.stop()
             self.parts.maps.stop()
+            self.parts.set_up_watch.stop()
             self.parts.receiver.stop()
             self.parts.store.close()
             self.parts.sinks.close()
@@ -212,6 +218,7 @@ class Server:
         self.loop = asyncio.get_running_loop()
         self.parts.receiver.start()
         self.parts.maps.start()
+        self.parts.set_up_watch.start()
         if not self._stepped:
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)

@@ -17,6 +17,7 @@ from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
 from livessl.server.overload import Overload
+from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.site.build.pipeline import activity_parameters
@@ -47,6 +48,8 @@ class ArrayStates:
         Counts what the nodes sent.
     overload : Overload
         Knows what is shed.
+    set_up_watch : SetUpWatch
+        Knows what past sounds say of an array.
     publish : callable
         Gets the message `arrays` for subscribers.
     """
@@ -59,6 +62,7 @@ class ArrayStates:
         site_time: SiteTime,
         ingest: Ingest,
         overload: Overload,
+        set_up_watch: SetUpWatch,
         publish: Callable[[JsonObject], None],
     ) -> None:
         self._site = site
@@ -68,6 +72,7 @@ class ArrayStates:
         self._site_time = site_time
         self._ingest = ingest
         self._overload = overload
+        self._set_up_watch = set_up_watch
         self._publish = publish
         self._fusion: TwoPassFusion | None = None
         self._disabled = store.disabled(site.site)  # replaced as a whole, never changed, so that readers need no lock
@@ -76,8 +81,9 @@ class ArrayStates:
         self._reported_ns = self._watched_ns = 0
 
     def follow(self, fusion: TwoPassFusion) -> None:
-        """Describe the arrays as this fusion sees them, from now on."""
+        """Describe the arrays as this fusion sees them, from now on; past sounds say nothing about them any more."""
         self._fusion = fusion
+        self._set_up_watch.forget()
 
     @property
     def disabled(self) -> frozenset[str]:
@@ -149,6 +155,7 @@ class ArrayStates:
             problem=self._ingest.problem_of(array),
             is_live=self._ingest.is_live(array, self._clock.monotonic_ns()),
             is_disabled=array in self._disabled,
+            finding=self._set_up_watch.finding_of(array),
         )
 
     def _counters(self, status: ArrayStatus, fusion: TwoPassFusion) -> dict[str, int]:

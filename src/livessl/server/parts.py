@@ -14,6 +14,7 @@ from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.receiver import Inbox
 from livessl.server.refusals import Refusals
+from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -37,6 +38,7 @@ class Parts:
     maps: Maps
     latency: Latency
     overload: Overload
+    set_up_watch: SetUpWatch
     store: Store
     sinks: Sinks
     fanout: Fanout
@@ -44,4 +46,4 @@ class Parts:
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        return self.engine.failure or self.receiver.failure or self.maps.failure
+        return self.engine.failure or self.receiver.failure or self.maps.failure or self.set_up_watch.failure

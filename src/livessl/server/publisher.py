@@ -13,6 +13,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.run import Run
+from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.tracks import Tracks
 
@@ -33,6 +34,8 @@ class Publisher:
     latency : Latency
     overload : Overload
         Knows whether maps are drawn.
+    set_up_watch : SetUpWatch
+        Examines the set-up with the final events.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class Publisher:
         maps: Maps,
         latency: Latency,
         overload: Overload,
+        set_up_watch: SetUpWatch,
     ) -> None:
         self._publish = publish
         self._request = request
@@ -54,6 +58,7 @@ class Publisher:
         self._maps = maps
         self._latency = latency
         self._overload = overload
+        self._set_up_watch = set_up_watch
 
     def publish(self, outputs: Iterable[Output | FinalResults], run: Run) -> None:
         """Publish what one step of a run has found; a run that has not received anything finds nothing."""
@@ -64,6 +69,8 @@ class Publisher:
             match output:
                 case FinalResults():
                     self._event_log.add_final(output, messages, run.clock_offsets.state())
+                    for event in output.events:
+                        self._set_up_watch.take(event)
                 case Event():
                     self._event_log.add_early(output, messages)
                 case Update():

@@ -35,6 +35,7 @@ ROUTES = {
     "/api/v1/events/{event_id}",
     "/api/v1/tracks",
     "/api/v1/map",
+    "/api/v1/findings",
     "/api/v1/health",
     "/api/v1/access",
     "/metrics",

@@ -213,16 +213,18 @@ def _of_site(diagnosis: Diagnosis) -> Iterator[Finding]:
     misfit_us = 1e6 * diagnosis.misfit_s
     if diagnosis.best is not None:
         what, cure = _words(diagnosis.best)
-        better = f"{misfit_us:.0f} -> {1e6 * diagnosis.best.misfit_s:.0f} us over {diagnosis.sounds} sounds"
-        yield Finding(
-            diagnosis.best.fault,
-            diagnosis.best.array,
-            diagnosis.best.channel,
-            Severity.ERROR,
-            min(0.99, diagnosis.confidence),
-            f"{what}: misfit {better}",
-            cure,
-        )
+        best = diagnosis.best
+        better = f"{misfit_us:.0f} -> {1e6 * best.misfit_s:.0f} us over {diagnosis.sounds} sounds"
+        for array in (best.array,) if best.other is None else (best.array, best.other):
+            yield Finding(
+                best.fault,
+                array,
+                best.channel,
+                Severity.ERROR,
+                min(0.99, diagnosis.confidence),
+                f"{what}: misfit {better}",
+                cure,
+            )
     elif diagnosis.contradicts and diagnosis.rivals[0].is_large:
         likely = " or ".join(dict.fromkeys(_words(one)[0] for one in diagnosis.rivals[:2]))
         yield Finding(

@@ -74,7 +74,9 @@ def cell_intervals(
         place = lag_places(points_m, microphones_m, pairs, scale, offset)
         place = place.reshape(len(pairs), *inside.shape)
         for extreme, out, without in ((np.min, low, NO_LAG), (np.max, high, 0)):
-            split = np.where(inside, place, without).reshape(*place.shape[:2], *(n for _ in range(3) for n in (along, edge)))
+            split = np.where(inside, place, without).reshape(
+                *place.shape[:2], *(n for _ in range(3) for n in (along, edge))
+            )
             out[:, some] = extreme(split, axis=(3, 5, 7)).reshape(*place.shape[:2], -1)
 
 

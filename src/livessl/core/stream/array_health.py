@@ -48,7 +48,7 @@ class ArrayState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """What else is known of an array: by its node's messages that are not sound, and by the operator.
+    """What else is known of an array: by its node's messages that are not sound, by past sounds, and by the operator.
 
     Parameters
     ----------
@@ -58,11 +58,14 @@ class NodeReport:
         Whether the node has sent anything lately, with or without sound.
     is_disabled : bool
         Whether an operator has disabled the array.
+    finding : str or None
+        What past sounds say is wrong with its channels or its pose.
     """
 
     problem: str | None = None
     is_live: bool = False
     is_disabled: bool = False
+    finding: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +178,8 @@ class ArrayHealth:
         state, reason = self._state_by_messages(now_ns, age_ns, votes, has_left=has_left)
         if state is ArrayState.HEALTHY and clock_offset is not None and abs(clock_offset.offset_s) > FRAME_S:
             state, reason = ArrayState.DEGRADED, clock_is_off(clock_offset)
+        if node.finding is not None and state in (ArrayState.HEALTHY, ArrayState.DEGRADED):
+            state, reason = ArrayState.DEGRADED, node.finding
         if node.problem is not None:
             state, reason = ArrayState.DEGRADED if state is ArrayState.HEALTHY else state, node.problem
         if state is ArrayState.LOST and node.is_live:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from livessl.core.commission.findings import Severity
 from livessl.server.api.schema import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
 
 IntervalM = Annotated[
@@ -130,6 +131,36 @@ class Arrays(_Versioned):
 
     now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
     arrays: list[Array]
+
+
+class Finding(BaseModel):
+    """One thing that is wrong with the set-up."""
+
+    kind: Literal["finding"]
+    fault: str = Field(
+        description="Code of the fault: `dead`, `deaf`, `level`, `inverted`, `duplicate`, `swapped`, `mirrored`, "
+        "`exchanged`, `late_channel`, `geometry`, `turned`, `moved` or `temperature`; others may be added.",
+        examples=["swapped"],
+    )
+    array: str | None = Field(description="The array; null for the whole site.", examples=["south"])
+    channel: int | None = Field(ge=1, description="Channel of the array, from 1; null for all.", examples=[3])
+    severity: Severity
+    confidence: float = Field(ge=0, le=1, description="How sure it is.", examples=[0.99])
+    message: str = Field(
+        description="What is wrong.",
+        examples=["channels 2 and 3 of 'south' are swapped: misfit 240 -> 24 us over 5 sounds"],
+    )
+    cure: str = Field(description="What to do.", examples=["exchange the plugs"])
+    input: int | None = Field(
+        ge=1, description="Input of the device that carries the channel, where the site file says so.", examples=[7]
+    )
+
+
+class Findings(_Versioned):
+    """What the last sounds say is wrong with the set-up, errors first."""
+
+    sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
+    findings: list[Finding]
 
 
 class Tracks(_Versioned):

@@ -9,6 +9,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from livessl.core.commission.findings import Severity
 from livessl.server.api.encode import JsonObject
 from livessl.server.parts import Parts
 
@@ -50,6 +51,12 @@ class _Metrics(Collector):
 def server_metrics(parts: Parts) -> Iterator[Metric]:
     """Gauges and counters of connections, maps and refusals."""
     yield GaugeMetricFamily("livessl_uptime_seconds", "Seconds since the server started.", parts.site_time.uptime_s())
+    findings = GaugeMetricFamily(
+        "livessl_findings", "Faults of the set-up that the last sounds show.", labels=["severity"]
+    )
+    for severity in Severity:
+        findings.add_metric([severity], sum(one.severity is severity for one in parts.set_up_watch.findings))
+    yield findings
     yield GaugeMetricFamily("livessl_websocket_clients", "Connected live subscribers.", parts.fanout.clients)
     yield GaugeMetricFamily("livessl_map_watchers", "Connected subscribers to power maps.", parts.maps.watchers)
     yield CounterMetricFamily("livessl_maps_drawn", "Power maps drawn on demand.", parts.maps.drawings)

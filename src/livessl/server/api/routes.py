@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -106,6 +107,13 @@ def state_routes(parts: Parts) -> APIRouter:
         """State, age of the last message, levels, drift and counters of every array."""
         now_utc = utc_text(parts.site_time.now_ns())
         return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": parts.array_states.describe()})
+
+    @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
+    def get_findings() -> Response:
+        """What the last sounds say is wrong with the set-up, errors first."""
+        watch = parts.set_up_watch
+        findings = [{"kind": "finding", **asdict(finding)} for finding in watch.findings]
+        return as_json({"v": API_VERSION, "sounds": watch.sounds, "findings": findings})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:

@@ -1,0 +1,127 @@
+"""Examines the set-up with the sounds that are located, in a thread of its own: `livessl doctor`, all the time.
+
+It keeps the observations of the last sounds only, so that findings end once the set-up is mended.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.trial import LEAST_SOUNDS
+from livessl.core.types import Event, Observation
+from livessl.server.overload import Overload
+from livessl.site.build.set_up import find_set_up_faults
+from livessl.site.models import Site
+
+KEPT_SOUNDS: Final = 12
+"""Number of sounds that are examined together: ten show most faults."""
+
+WAIT_S: Final = 1.0
+"""Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
+
+_log = logging.getLogger(__name__)
+
+
+class SetUpWatch:
+    """Examines the set-up.
+
+    The fusion thread calls `take` and `forget`; every thread may read `findings` and `finding_of`.
+
+    Parameters
+    ----------
+    site : Site
+    overload : Overload
+        Nothing is examined while sound arrives faster than it is located.
+    """
+
+    def __init__(self, site: Site, overload: Overload) -> None:
+        self._site = site
+        self._overload = overload
+        self._lock = threading.Lock()
+        self._sounds: deque[Sequence[Observation]] = deque(maxlen=KEPT_SOUNDS)
+        self._is_new = False
+        self._findings: tuple[Finding, ...] = ()
+        self._by_array: Mapping[str, str] = {}
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.failure: BaseException | None = None
+        """The error that has ended the thread, if one has."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong, errors first."""
+        return self._findings
+
+    @property
+    def sounds(self) -> int:
+        """Number of sounds that the findings rest on, or will."""
+        return len(self._sounds)
+
+    def finding_of(self, array: str) -> str | None:
+        """Return the error that concerns an array, in words; None if there is none."""
+        return self._by_array.get(array)
+
+    def take(self, event: Event) -> None:
+        """Take in a final event."""
+        if event.source == 1 and len(event.observations) > 0:
+            with self._lock:
+                self._sounds.append(event.observations)
+                self._is_new = True
+
+    def forget(self) -> None:
+        """Forget all sounds: those of another run are about another set-up."""
+        with self._lock:
+            self._sounds.clear()
+            self._is_new = False
+            self._note(())
+
+    def start(self) -> None:
+        """Begin to examine."""
+        self._thread = threading.Thread(target=self._work, name="set-up", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop, and wait for the thread."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def examine(self) -> None:
+        """Examine the sounds if there are new ones; the thread calls it, and a test may."""
+        with self._lock:
+            sounds, is_new = list(self._sounds), self._is_new
+            self._is_new = False
+        if not is_new or len(sounds) < LEAST_SOUNDS:
+            return
+        findings = tuple(find_set_up_faults(self._site, sounds))
+        with self._lock:
+            if self._sounds:  # otherwise another run has begun
+                self._note(findings)
+
+    def _note(self, findings: tuple[Finding, ...]) -> None:
+        known = {finding.message.partition(":")[0] for finding in self._findings}
+        for finding in findings:
+            if finding.message.partition(":")[0] not in known:
+                _log.warning("%s; %s", finding.message, finding.cure)
+        self._findings = findings
+        self._by_array = {
+            array: f"{finding.message}; {finding.cure}"
+            for finding in reversed(findings)
+            if finding.severity is Severity.ERROR
+            for array in ([finding.array] if finding.array is not None else [one.name for one in self._site.processed])
+        }
+
+    def _work(self) -> None:
+        try:
+            while not self._stop.wait(WAIT_S):
+                if self._overload.message is None:
+                    self.examine()
+        except BaseException as error:
+            self.failure = error
+            _log.exception("the examination of the set-up has failed; the server ends")
+            raise

@@ -1,0 +1,39 @@
+"""What sounds say about a site's set-up: the findings of the core, with the inputs of the site's devices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from livessl.core.commission.findings import Finding, find_faults
+from livessl.core.types import Observation
+from livessl.site.build.grid import search_grid
+from livessl.site.models import Site
+
+
+def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
+    """Find what the observations of some sounds say about a site's channels, poses and speed of sound."""
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    findings = find_faults(microphones, sounds, np.array(search_grid(site).bounds_m), site.c_m_s)
+    return with_inputs(site, findings)
+
+
+def with_inputs(site: Site, findings: Sequence[Finding]) -> list[Finding]:
+    """Add the input of the device to each finding about a channel, where the site file says which one it is."""
+    return [replace(one, input=_input(site, one)) for one in findings]
+
+
+def _input(site: Site, finding: Finding) -> int | None:
+    if finding.array is None or finding.channel is None:
+        return None
+    channel = finding.channel
+    for array in site.members(finding.array):
+        count = len(site.array(array).microphones_m)
+        if channel <= count:
+            node = site.node_of(array)
+            inputs = site.nodes[node].arrays[array] if node is not None else []
+            return inputs[channel - 1] if len(inputs) >= channel else None
+        channel -= count
+    return None
