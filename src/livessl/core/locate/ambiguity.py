@@ -25,6 +25,9 @@ microphones have a margin of 0. Poses, geometry and sampling of the lag axis shi
 MOST_CANDIDATES: Final = 8
 """Most places that are reported of an ambiguous answer; on a circle around a line there are arbitrarily many."""
 
+_NAMED: Final = 3
+"""Most other places that a reason names; `candidates` has all."""
+
 _LEAST_POWER: Final = 0.8
 """Power, as a share of that at the position, below which a proposed place is not refined."""
 
@@ -69,17 +72,16 @@ def rivals(
     weights /= weights.sum()
     candidates = [Candidate(place_m, float(share)) for (place_m, _), share in zip(places, weights, strict=True)]
     others = sorted(candidates[1:], key=lambda candidate: -candidate.probability)
-    return Rivals(candidates[0].probability, (candidates[0], *others), spread_m2)
+    why = _reason(others, specs, functional.c_m_s)
+    return Rivals(candidates[0].probability, (candidates[0], *others), spread_m2, why)
 
 
-def reason(candidates: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: float) -> str:
+def _reason(others: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: float) -> str:
     """Return why an answer is ambiguous, and the cure, in words."""
-    others = ", ".join(f"({', '.join(f'{x:.2f}' for x in each.position_m)})" for each in candidates[1:4])
-    more = f" and {len(candidates) - 4} more" if len(candidates) > 4 else ""
-    return (
-        f"{described(specs, c_m_s)}, so {others}{more} explain{'s' if len(candidates) == 2 else ''} the sound as well; "
-        f"{CURE}"
-    )
+    places = ", ".join(f"({', '.join(f'{x:.2f}' for x in each.position_m)})" for each in others[:_NAMED])
+    more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    explain = "explains" if len(others) == 1 else "explain"
+    return f"{described(specs, c_m_s)}, so {places}{more} {explain} the sound as well; {CURE}"
 
 
 def _apart(places_m: FloatArray, values: FloatArray) -> list[int]:

@@ -134,11 +134,19 @@ class Rivals:
     spread_m2 : (3, 3) float64
         Second moment of the rivals nearer than `NEAR_M` about the position, square metres: they are the same answer but
         belong into its covariance.
+    reason : str or None
+        Why there are other places, in words; None if there are none.
     """
 
     share: float
     candidates: tuple[Candidate, ...]
     spread_m2: FloatArray
+    reason: str | None = None
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the position is too improbable to be reported without the other places."""
+        return self.share < LEAST_CONFIDENCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +162,15 @@ class Judgement:
         Why neither the position nor its `candidates` should be relied on, in words; None if they may be.
     candidates : tuple of Candidate
         The position and the places that explain the evidence about as well; empty if the position is clearly the best.
+    ambiguity : str or None
+        Why there are candidates, in words; None without them.
     """
 
     covariance_m2: FloatArray
     features: ConfidenceFeatures
     refused: str | None
     candidates: tuple[Candidate, ...] = ()
+    ambiguity: str | None = None
 
 
 def judge(
@@ -209,12 +220,14 @@ def judge(
         covariance_m2[axis, axis] += _LEAST_DEVIATION_M**2
     if rivals is not None:
         covariance_m2 += rivals.spread_m2
-    ambiguous = features.share < LEAST_CONFIDENCE
+    ambiguous = rivals is not None and rivals.is_ambiguous
     confidence = features.confidence_of_candidates if ambiguous else features.confidence
     refused = None
     if confidence < LEAST_CONFIDENCE:
         refused = f"confidence {confidence:.2f} is below the threshold of {LEAST_CONFIDENCE:.2f}"
-    return Judgement(covariance_m2, features, refused, rivals.candidates if ambiguous and rivals is not None else ())
+    if rivals is None or not ambiguous:
+        return Judgement(covariance_m2, features, refused)
+    return Judgement(covariance_m2, features, refused, rivals.candidates, rivals.reason)
 
 
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:

@@ -135,7 +135,6 @@ class Onset(MapEstimator):
 
     def _localization(self, answer: _Answer) -> Localization:
         place, judgement = answer.consensus.place, answer.judgement
-        specs = [part.spec for part in place.evidence]
         return Localization(
             position_m=place.position_m,
             covariance_m2=judgement.covariance_m2,
@@ -145,7 +144,7 @@ class Onset(MapEstimator):
             refused=answer.refused,
             outliers=answer.consensus.outliers,
             candidates=judgement.candidates,
-            ambiguity=ambiguity.reason(judgement.candidates, specs, self.c_m_s) if judgement.candidates else None,
+            ambiguity=judgement.ambiguity,
         )
 
     def _beyond(self, answer: _Answer, outside: Outside) -> Localization:
@@ -171,10 +170,9 @@ class Onset(MapEstimator):
         functional, specs = SRPFunctional(second.evidence, self.c_m_s), [part.spec for part in second.evidence]
         power = float(functional.value(second.position_m[None])[0])
         rivals = ambiguity.rivals(functional, specs, second.position_m, power, self.grid)
-        if rivals.share >= LEAST_CONFIDENCE:
+        if not rivals.is_ambiguous:
             return second
-        why = ambiguity.reason(rivals.candidates, specs, self.c_m_s)
-        return replace(second, candidates=rivals.candidates, ambiguity=why)
+        return replace(second, candidates=rivals.candidates, ambiguity=rivals.reason)
 
     def _place(self, evidence: Sequence[Evidence]) -> Place:
         return highest_place(evidence, self._search, self.grid, self.c_m_s)

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, angle_deg
 from livessl.core.locate import refine
 from livessl.core.locate.ambiguity import SAME_POWER
 from livessl.core.locate.confidence import NEAR_M
@@ -28,6 +28,16 @@ middle half has 0.1 to 0.3; noise and reverberation of sounds inside reach 0.04,
 SURFACE_GAIN: Final = 0.005
 """The same where the best place inside lies on the volume's surface: the power rises only a little along the line of
 sight of arrays that are in line with the sound. Reflections by a wall move places less than `NEAR_M`."""
+
+POSE_DEG: Final = 1.5
+"""Standard deviation, in degrees, of an array's pose: that of a mount aligned by eye and measuring tape."""
+
+MOST_DEVIATIONS: Final = 2.5
+"""Deviations of the poses, over all arrays, up to which they explain why a place inside looks as if outside."""
+
+NEAR_BY_POSE_M: Final = 1.25
+"""Distance, in metres, between the places inside and outside up to which the one inside is kept if poses explain it.
+Beyond, the arrays do not measure the distance well enough to exclude the one outside."""
 
 SUFFICIENT: Final = 0.95
 """Power, as a share of the highest that the evidence can have anywhere, with which one place explains the evidence so
@@ -95,7 +105,7 @@ class Outside:
         where = (
             "at the surface of the search volume or outside the search volume"
             if self.surface
-            else ("outside the search volume")
+            else "outside the search volume"
         )
         return (
             f"{where}, near ({near}); if it was inside, check the arrays' poses in the site file, room.size_m and "
@@ -121,8 +131,8 @@ def find_outside(
     refused : bool
         Whether the place inside is not relied on anyway; then its being on the surface says nothing.
     """
-    if len(grid.free_axes) < 3:
-        return None  # a search in a plane: other heights are outside without being wrong
+    if len(grid.free_axes) < 3 or len(evidence) < 2:
+        return None  # sounds off a plane that is searched look far away in it; one array measures no distance
     evidence = tuple(sorted(evidence, key=lambda part: part.spec.name))
     functional = SRPFunctional(evidence, c_m_s)
     power = float(functional.value(inside.position_m[None])[0])
@@ -137,8 +147,8 @@ def find_outside(
     wide = _widened(grid)
     best = np.argsort(-values, kind="stable")[:_STARTS]
     position_m, beyond = refine.refine(functional, starts_m[best], wide)
-    off_m = position_m - np.clip(position_m, grid.lower_m, grid.upper_m)
-    if beyond < least or not off_m.any() or np.linalg.norm(position_m - inside.position_m) <= NEAR_M:
+    is_outside = bool(((position_m < grid.lower_m) | (position_m > grid.upper_m)).any())
+    if beyond < least or not is_outside or _is_near(position_m, inside.position_m, evidence):
         return None
     place = Place(evidence, functional, position_m, beyond, power)
     return Outside(place, wide, surface=surface and beyond < (1.0 + GAIN) * power)
@@ -150,6 +160,13 @@ def highest_power(evidence: Sequence[Evidence]) -> float:
         pair_weight(len(part.spec.microphones_m)) * float(part.gcc.values.max(axis=1).sum(dtype=np.float64))
         for part in evidence
     )
+
+
+def _is_near(place_m: FloatArray, inside_m: FloatArray, evidence: Sequence[Evidence]) -> bool:
+    """Whether a place outside is the same answer as one inside, given how well the poses of arrays are known."""
+    turns_deg = [angle_deg(place_m - part.spec.centre_m, inside_m - part.spec.centre_m) for part in evidence]
+    by_pose = float(np.linalg.norm(turns_deg)) <= MOST_DEVIATIONS * POSE_DEG
+    return float(np.linalg.norm(place_m - inside_m)) <= (NEAR_BY_POSE_M if by_pose else NEAR_M)
 
 
 def _on_surface(position_m: FloatArray, grid: Grid) -> bool:

@@ -11,7 +11,7 @@ from livessl.core.correlate.band import uses_envelope
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.correlate.spectra import FrontEnd, averaged, cepstral
 from livessl.core.geometry import Grid, microphone_pairs
-from livessl.core.locate import refine
+from livessl.core.locate import ambiguity, refine
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.locate.map_estimator import MapEstimator, third_octaves_below_hz
 from livessl.core.locate.peak_search import PeakSearch
@@ -58,12 +58,15 @@ class SrpPhat(MapEstimator):
         find = refine.in_map(self.power_maps(evidence, ()).fused, grid) if in_map else self._search.among(evidence)
         found = find(refine.CANDIDATES)
         functional = SRPFunctional(evidence, self.c_m_s)
-        position, _ = refine.refine_peaks(functional, found, grid)
+        position, power = refine.refine_peaks(functional, found, grid)
+        rivals = ambiguity.rivals(functional, [part.spec for part in evidence], position, power, grid)
         return Localization(
             position,
             refine.laplace_covariance_m2(functional, evidence, position, grid),
             refine.confidence(find, found[0], grid, position),
             evidence,
+            candidates=rivals.candidates if rivals.is_ambiguous else (),
+            ambiguity=rivals.reason if rivals.is_ambiguous else None,
         )
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:

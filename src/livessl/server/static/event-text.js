@@ -62,6 +62,7 @@ export function details(event) {
   const sigmas = event.covariance_m2?.map((row, axis) => `${"xyz"[axis]} ${sigma(row, axis)}`).join("  ");
   const list = el("dl", {},
     entry("position", event.position_m && position(event.position_m), "wide"),
+    entry("candidates", event.candidates?.map(candidate).join("; "), "wide"),
     entry("error (1 σ)", sigmas && `${sigmas} m`, "wide"),
     entry("detected by", event.heard_by?.join(", ")),
     entry("used", event.arrays?.map((name) => withRequest(name, event)).join(", ")),
@@ -73,6 +74,11 @@ export function details(event) {
     entry("method", event.method),
     entry("id", event.id, "wide"));
   return event.contributions?.length ? [list, contributionTable(event)] : [list];
+}
+
+/** One of several places that explain a sound about as well. */
+function candidate({ position_m: place, probability }) {
+  return `${position(place)} (${percent(probability)})`;
 }
 
 function entry(name, value, className) {
