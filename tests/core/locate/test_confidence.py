@@ -93,7 +93,7 @@ def test_pairs_that_disagree_widen_the_covariance() -> None:
     agreed, disagreed = (judged(*each).covariance_m2 for each in (evidence, torn))
     deviations_m = np.sqrt(np.linalg.eigvalsh(agreed))
     assert deviations_m[0] > 0.005  # what remains with the clearest evidence,
-    assert deviations_m[-1] < 0.015  # and 1 mm in an array of 0.3 m seen from 1.7 m, along two crossing lines
+    assert deviations_m[-1] < 0.015  # and half a millimetre in an array of 0.3 m
     assert np.trace(disagreed) > 1.2 * np.trace(agreed)  # although the placement is most of both
 
 

@@ -40,7 +40,7 @@ _DISTANCE_FIT: Final = (-0.04, 62.2)
 """Log-odds that no position further along the line of sight is as good: intercept, weight of the margin. It matters for
 one array, or arrays side by side, whose maps have a ridge along that line."""
 
-_CLEAR_PEAK_TO_RMS: Final = 2.0
+CLEAR_PEAK_TO_RMS: Final = 2.0
 """Peak-to-RMS ratio at and above which one array's peak cannot be noise; noise gives about 1."""
 
 _FITTED_DELAYS: Final = 3.0
@@ -54,7 +54,7 @@ _CALIBRATED_MISFIT: Final = 0.4
 """Residual misfit below which most of what stands elsewhere on the lag axis is no noise but side lobes of the sound
 itself, so that the variance shrinks with its square. It is about 0.05 in free field, and 0.7 or more in a room."""
 
-_PLACED_M: Final = 0.001
+_PLACED_M: Final = 0.0005
 """Standard deviation, in metres, with which the acoustic centres of an array's microphones are known relative to each
 other at best. Coordinates that hang on the curvature of the wavefront are no more certain than that allows."""
 
@@ -113,7 +113,7 @@ class ConfidenceFeatures:
     @property
     def is_sure(self) -> bool:
         """Whether another look at the sound is not worth its time."""
-        return self.confidence_of_candidates >= SURE and self.second_array >= _CLEAR_PEAK_TO_RMS
+        return self.confidence_of_candidates >= SURE and self.second_array >= CLEAR_PEAK_TO_RMS
 
     @property
     def has_direction(self) -> bool:

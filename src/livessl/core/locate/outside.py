@@ -16,7 +16,7 @@ import numpy as np
 from livessl.core.geometry import Grid, angle_deg
 from livessl.core.locate import refine
 from livessl.core.locate.ambiguity import SAME_POWER
-from livessl.core.locate.confidence import NEAR_M
+from livessl.core.locate.confidence import CLEAR_PEAK_TO_RMS, NEAR_M, peak_to_rms
 from livessl.core.locate.place import Place
 from livessl.core.locate.srp import SRPFunctional, pair_weight
 from livessl.core.types import Candidate, Evidence, FloatArray
@@ -62,8 +62,11 @@ _DISTANCES: Final = 100
 """Distances examined along each direction, in equal ratios of some 5 %: from two arrays metres apart, neighbours differ
 by less than a lobe."""
 
-_STARTS: Final = 3
-"""Places along the directions that are refined."""
+MOST_DIRECTIONS: Final = 4
+"""Most arrays along whose directions places are examined, those that receive the sound most clearly."""
+
+_PROMISING: Final = 0.9
+"""Power along these directions, as a share of that needed, below which refining cannot reach it."""
 
 _REFINED_M: Final = 0.5
 """Edge, in metres, of the cells in which places outside are refined; four times the longest step of the climb."""
@@ -140,17 +143,19 @@ def find_outside(
     least = (1.0 + (SURFACE_GAIN if surface else GAIN)) * power
     if power <= 0.0 or highest_power(evidence) < least:
         return None
-    starts_m = np.concatenate([_along_m(part, grid, c_m_s) for part in evidence])
-    if not len(starts_m):
-        return None
+    clearest = sorted(evidence, key=lambda part: -peak_to_rms(part, highest_power([part])))[:MOST_DIRECTIONS]
+    starts_m = np.concatenate([_along_m(part, grid, c_m_s) for part in clearest])
     values = functional.value(starts_m)
+    if not len(values) or values.max() < _PROMISING * least:
+        return None
     wide = _widened(grid)
-    best = np.argsort(-values, kind="stable")[:_STARTS]
-    position_m, beyond = refine.refine(functional, starts_m[best], wide)
+    position_m, beyond = refine.refine(functional, starts_m[values.argmax()], wide)
     is_outside = bool(((position_m < grid.lower_m) | (position_m > grid.upper_m)).any())
     if beyond < least or not is_outside or _is_near(position_m, inside.position_m, evidence):
         return None
     place = Place(evidence, functional, position_m, beyond, power)
+    if sorted(place.peak_to_rms)[-2] < CLEAR_PEAK_TO_RMS:
+        return None  # one array's noise has a peak somewhere along the other's line of sight
     return Outside(place, wide, surface=surface and beyond < (1.0 + GAIN) * power)
 
 

@@ -42,11 +42,15 @@ class Place:
     rival_power: float
 
     @property
+    def peak_to_rms(self) -> list[float]:
+        """Peak-to-RMS ratio of each array there."""
+        terms = self.functional.pair_terms(self.position_m)
+        return [peak_to_rms(part, array_power(part, term)) for part, term in zip(self.evidence, terms, strict=True)]
+
+    @property
     def stands_out_everywhere(self) -> bool:
         """Whether every array's peak-to-RMS ratio there is at least 1, that of noise."""
-        terms = self.functional.pair_terms(self.position_m)
-        ratios = (peak_to_rms(part, array_power(part, term)) for part, term in zip(self.evidence, terms, strict=True))
-        return min(ratios) >= 1.0
+        return min(self.peak_to_rms) >= 1.0
 
     def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:
         """Judge the place; `whole` if the evidence includes whole segments."""
