@@ -31,6 +31,7 @@ from livessl.core.types import (
     FRAME_NS,
     GCC,
     ArraySpec,
+    Candidate,
     ClockState,
     Event,
     Evidence,
@@ -507,6 +508,31 @@ def test_updates_come_only_while_there_is_sound() -> None:
     tracks = [(when, output) for when, output in said if isinstance(output, Track)]
     assert [track.state for _, track in tracks] == [TrackState.NEW] + [TrackState.UPDATE] * 4 + [TrackState.END]
     assert tracks[-1][0] == 20 - 2 + 60 + 1  # three seconds after the last estimate
+
+
+class Undecided(Scripted):
+    """An estimator that cannot tell two places apart."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        found = super().locate(sounds)
+        mirror_m = found.position_m + np.array([0.0, 0.0, 1.0])
+        candidates = (Candidate(found.position_m, 0.5), Candidate(mirror_m, 0.5))
+        return replace(found, candidates=candidates, ambiguity="all microphones lie in one plane")
+
+
+def test_estimates_with_candidates_are_directions_and_start_no_track() -> None:
+    arrivals = node("north", range(10, 20), range(120)) + node("south", range(10, 20), range(120))
+    said = play(fusion_of(Undecided(), updates=True), arrivals, 120)
+    event = only_event(said)
+    assert event.status is Status.DIRECTION_ONLY
+    assert event.reason == "all microphones lie in one plane"
+    updates = [output for _, output in said if isinstance(output, Update)]
+    assert updates
+    for answer in (event, *updates):
+        assert answer.status is Status.DIRECTION_ONLY
+        assert answer.estimate is not None
+        assert [each.probability for each in answer.estimate.candidates] == [0.5, 0.5]
+    assert not [output for _, output in said if isinstance(output, Track)]
 
 
 def test_live_fusion_that_is_behind_locates_only_the_newest_window() -> None:

@@ -12,7 +12,7 @@ import pytest
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayState, ArrayStatus
 from livessl.core.stream.clock_offsets import ClockOffset
-from livessl.core.types import ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
+from livessl.core.types import Candidate, ClockState, Contribution, Estimate, Event, Status, Track, TrackState, Update
 from livessl.server.api.encode import JsonObject, Messages, Stages, array_status, dbfs
 from small_site import site_of
 
@@ -105,6 +105,19 @@ def test_event_holds_time_and_place() -> None:
             "asked": False,
         }
     ]
+
+
+def test_candidates_are_listed_with_their_probabilities() -> None:
+    candidates = (Candidate(np.array([0.51234567, 0.7, 1.1]), 0.50001), Candidate(np.array([0.5, 0.7, 1.9]), 0.49999))
+    ambiguous = replace(ESTIMATE, candidates=candidates)
+    listed = [
+        {"position_m": [0.5123, 0.7, 1.1], "probability": 0.5},
+        {"position_m": [0.5, 0.7, 1.9], "probability": 0.5},
+    ]
+    assert messages().event(replace(EVENT, estimate=ambiguous))["candidates"] == listed
+    assert messages().update(replace(UPDATE, estimate=ambiguous))["candidates"] == listed
+    assert messages().event(EVENT)["candidates"] == messages().update(UPDATE)["candidates"] == []
+    assert messages().event(replace(EVENT, estimate=None))["candidates"] == []
 
 
 def test_time_is_null_where_it_is_not_utc() -> None:
