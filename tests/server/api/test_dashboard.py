@@ -14,6 +14,7 @@ from browser import faultless_page, running_browser
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.server.app import Server
+from livessl.server.overload import Overload
 from small_site import HANG_S, running_server, scene_recordings, site_of
 
 pytestmark = [pytest.mark.browser]
@@ -103,6 +104,19 @@ def test_page_shows_the_server_s_states_after_a_replay_has_ended(browser: Browse
             expect(card).to_contain_text("0.")  # seconds since its last data
         expect(page.locator("#vital-arrays")).to_have_text("2 of 2 healthy")
         expect(page.locator("#vital-clock-label")).to_have_text("recording time")
+
+
+def test_page_tells_an_overload_and_its_end(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    with running_server(site_of()) as server, faultless_page(browser) as page:
+        page.goto(server.url)
+        expect(page.get_by_test_id("array-north")).to_have_attribute("data-state", "starting", timeout=1000 * HANG_S)
+        expect(page.get_by_test_id("overload")).to_be_hidden()
+        with monkeypatch.context() as patch:
+            patch.setattr(Overload, "message", property(lambda _: "overloaded: it sheds some updates"))
+            expect(page.get_by_test_id("overload")).to_have_text(
+                "Server overloaded: it sheds some updates", timeout=1000 * HANG_S
+            )
+        expect(page.get_by_test_id("overload")).to_be_hidden(timeout=1000 * HANG_S)
 
 
 def test_page_claims_no_state_while_the_server_is_unreachable(browser: Browser) -> None:

@@ -118,7 +118,8 @@ class Verdicts:
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
-        first = replace(first, status=status, reason=reason, observations=_observations(found, used))
+        observations = () if self._state.relief.shed else _observations(found, used)
+        first = replace(first, status=status, reason=reason, observations=observations)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
