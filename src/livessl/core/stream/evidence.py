@@ -72,16 +72,30 @@ class Sounds(Mapping[str, Sound]):
         self.ended = ended
         self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
         self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
+        self._requested: set[str] = set()
 
-    def add(self, array: str, segments: Sequence[Sequence[Frame]], onsets: tuple[OnsetGCC, ...]) -> None:
-        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames."""
+    def add(
+        self,
+        array: str,
+        segments: Sequence[Sequence[Frame]],
+        onsets: tuple[OnsetGCC, ...],
+        *,
+        requested: bool = False,
+    ) -> None:
+        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames.
+
+        `requested` if the array did not detect the sound, and its frames were requested.
+        """
         self._segments[array], self._onsets[array] = segments, onsets
+        if requested:
+            self._requested.add(array)
 
     def copy(self) -> Sounds:
         """Return a copy that sounds can be added to."""
         copy = Sounds(self.sources, self.suspects, ended=self.ended)
         copy._segments |= self._segments
         copy._onsets |= self._onsets
+        copy._requested |= self._requested
         return copy
 
     @property
@@ -98,6 +112,7 @@ class Sounds(Mapping[str, Sound]):
             array in self.suspects,
             self.sources,
             self.ended,
+            array not in self._requested,
         )
 
     def __iter__(self) -> Iterator[str]:
@@ -160,7 +175,8 @@ class Excerpt:
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
         for name, sound in backfilled.items():
             powers = np.array([frame.power for frame in sound.frames])
-            joined.add(name, [sound.frames], sound.onsets, powers)
+            joined.sounds.add(name, [sound.frames], sound.onsets, requested=True)
+            joined.powers[name] = powers
         return joined
 
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.geometry import direction_deg
+from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
@@ -37,13 +38,15 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     ----------
     found : Localization
     specs : sequence of ArraySpec
-        The arrays that it was found by.
+        The arrays that it was found by; none if no array carries evidence.
 
     Returns
     -------
     Status, str or None
         The status, and the reason for it; None if there is nothing to add.
     """
+    if not specs:
+        return Status.REFUSED, found.refused or NO_EVIDENCE
     spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
     nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
@@ -52,7 +55,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
             return Status.REFUSED, found.refused
         return (Status.DIRECTION_ONLY, found.ambiguity) if found.candidates else (Status.LOCATED, _dissent(found))
     if found.features is not None and not found.features.has_direction:
-        return Status.REFUSED, "no direction stands out in the sound"
+        return Status.REFUSED, NO_EVIDENCE
     who = "one array" if len(specs) == 1 else "these arrays"
     unresolved = f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
     return Status.DIRECTION_ONLY, unresolved if found.ambiguity is None else f"{found.ambiguity}; {unresolved}"
@@ -166,7 +169,12 @@ class Verdicts:
         return tuple(estimate for estimate, other in estimates if self._judged(estimate, other)[0] is Status.LOCATED)
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
-        return judged(found, self._state.specs(estimate.arrays))
+        status, reason = judged(found, self._state.specs(estimate.arrays))
+        least = self._state.parameters.min_arrays
+        if status is Status.REFUSED or len(estimate.arrays) >= least:
+            return status, reason
+        names = " and ".join(map(repr, estimate.arrays))
+        return Status.REFUSED, f"only {names} carried evidence of it; fusion.min_arrays is {least}"
 
     def _contributions(
         self,
@@ -179,6 +187,7 @@ class Verdicts:
         return tuple(
             _contribution(arrays[name], power, estimate, found, backfilled=name in backfilled)
             for name, power in powers.items()
+            if name not in backfilled or name not in found.unneeded
         )
 
     def _id(self, frame_index: int) -> str:
