@@ -98,6 +98,14 @@ class Sounds(Mapping[str, Sound]):
         copy._requested |= self._requested
         return copy
 
+    def without(self, arrays: Collection[str]) -> Sounds:
+        """Return a copy without the sounds of some arrays."""
+        copy = self.copy()
+        for array in arrays:
+            copy._segments.pop(array, None)
+            copy._onsets.pop(array, None)
+        return copy
+
     @property
     def has_onsets(self) -> bool:
         """True if the estimator correlates every frame, and thus weights each array by what it received."""
@@ -170,6 +178,11 @@ class Excerpt:
         """Greatest power of a frame, full scale squared."""
         return max(float(power.max()) for power in self.powers.values())
 
+    def without(self, arrays: Collection[str]) -> Excerpt:
+        """Return this excerpt without the sounds of some arrays; the times stay."""
+        powers = {name: power for name, power in self.powers.items() if name not in arrays}
+        return Excerpt(self.sounds.without(arrays), self.start_ns, self.end_ns, powers)
+
     def with_backfill(self, backfilled: Mapping[str, BackfilledSound]) -> Excerpt:
         """Return this excerpt with the sounds of requested frames added; the times stay."""
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
@@ -196,6 +209,7 @@ class EvidenceCollector:
         self._state = state
         self._cache = state.cache
         self._votes = state.votes
+        self._channel_faults = state.channel_faults
         self._parameters = state.parameters
         self._alignment = alignment
         self._correlates_ahead = correlates_ahead
@@ -352,13 +366,16 @@ class EvidenceCollector:
     # --- excerpts
 
     def window(self, last: int) -> Excerpt:
-        """Return the active frames of the window that ends with a frame index, without those of suspect arrays."""
+        """Return the active frames of the window that ends with a frame index.
+
+        Those of suspect arrays, and of arrays with faulty channels, are left out.
+        """
         window = range(last - self._parameters.window_frames + 1, last + 1)
         sounds = Sounds(self._parameters.live_sources, ended=False)
         excerpt = Excerpt(sounds, window.start * FRAME_NS, window.stop * FRAME_NS)
         for name, stream in self._alignment.streams.items():
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
-            if segments and not self._votes.is_suspect(name):
+            if segments and not self._votes.is_suspect(name) and self._channel_faults.of(name) is None:
                 excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
                 onsets = stream.correlations.at(window)
                 if self._is_located(stream) and (onsets or Segments(segments)):

@@ -100,16 +100,19 @@ class Verdicts:
             Sounds of other arrays that are used as well.
         """
         backfilled = backfilled or {}
-        used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
-        count = "1 array" if len(used.sounds) == 1 else f"{len(used.sounds)} arrays"
-        why = f"detected by {count}; fusion.min_arrays is {least}" if used.sounds else NO_SOUND
-        first = self._refused(event, excerpt, now_ns, why)
+        received, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
+        faults = self._channel_faults(event, received)
+        used = received.without(faults)
+        count = "1 array" if len(received.sounds) == 1 else f"{len(received.sounds)} arrays"
+        why = f"detected by {count}; fusion.min_arrays is {least}" if received.sounds else NO_SOUND
+        few = why if len(received.sounds) < least else None
+        first = self._refused(event, excerpt, now_ns, _joined(few, faults))
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
-        first = replace(first, status=status, reason=reason)
+        first = replace(first, status=status, reason=_joined(reason, faults) or None)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
@@ -119,13 +122,19 @@ class Verdicts:
                 id=f"{first.id}-{source}",
                 source=source,
                 status=Status.LOCATED,
-                reason=None,
+                reason=_joined(None, faults) or None,
                 estimate=other,  # the power stays that of both sources: it cannot be divided
                 contributions=self._contributions(used.powers, other, found, backfilled),
             )
             for source, other in enumerate(self._others(found, used), 2)
         )
         return Verdict([first, *others], found)
+
+    def _channel_faults(self, event: PendingEvent, excerpt: Excerpt) -> dict[str, str]:
+        """Return the faults, in words, of those arrays of an excerpt whose channels are faulty."""
+        examine, sounds = self._state.channel_faults.examine, excerpt.sounds
+        faults = {name: examine(name, event.start, sound.onsets) for name, sound in sounds.items()}
+        return {name: fault for name, fault in faults.items() if fault is not None}
 
     def _refused(self, event: PendingEvent, excerpt: Excerpt, now_ns: int, reason: str) -> Event:
         return Event(
@@ -229,6 +238,12 @@ def _contribution(
         off_deg=(found.outliers or {}).get(spec.name),
         asked=backfilled,
     )
+
+
+def _joined(reason: str | None, faults: Mapping[str, str]) -> str:
+    """Return a reason followed by the faults of the arrays that were not used."""
+    unused = [f"{name!r} is not used: {fault}" for name, fault in sorted(faults.items())]
+    return "; ".join([*([] if reason is None else [reason]), *unused])
 
 
 def _dissent(found: Localization) -> str | None:
