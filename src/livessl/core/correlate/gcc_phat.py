@@ -130,6 +130,15 @@ class GCCPhat:
         values = self._sampling.fine(self._sampling.sample(cross, envelope=self._envelope))
         return [GCC(self.pairs, self.lags_s, values[first : first + count]) for first in range(0, len(pairs), count)]
 
+    def noise_rms(self, segments: Sequence[Float32Array]) -> float:
+        """Root mean square of the GCC of segments (K, n), or of its real part, if the phases were random.
+
+        It is the mean over as many independent phases as band width times duration.
+        """
+        low, high = self._band_hz
+        duration_s = sum(segment.shape[1] for segment in segments) / self._rate_hz
+        return float(1.0 / np.sqrt(max(1.0, 2.0 * (high - low) * duration_s))) if duration_s else 0.0
+
     def is_like(self, other: GCCPhat) -> bool:
         """Return whether both use the same matrices."""
         if self._front_end is not other._front_end or len(self.pairs) != len(other.pairs):

@@ -76,19 +76,27 @@ class OnsetGCC:
         Weighted sums at the C near-Nyquist lags of `LagSampling`.
     levels : (K,) float64
         Correlation of each microphone with itself at lag 0: the sum of the weights times its share of the power.
+    noise_power : float
+        Mean square that the real part of `lags` would have if the phases between the microphones were random.
     """
 
     lags: ComplexArray | Float32Array
     levels: FloatArray
+    noise_power: float = 0.0
 
     def __add__(self, other: OnsetGCC) -> OnsetGCC:
         """Sum of both."""
-        return OnsetGCC(self.lags + other.lags, self.levels + other.levels)
+        return OnsetGCC(self.lags + other.lags, self.levels + other.levels, self.noise_power + other.noise_power)
 
     @property
     def weight(self) -> float:
         """Sum of the weights; a single direct sound gives `lags` of about this height."""
         return float(np.add.reduce(self.levels)) / len(self.levels)  # the mean, without what `mean` checks
+
+    @property
+    def noise_rms(self) -> float:
+        """Root mean square of `lags` at random phases, relative to the height that a single direct sound gives."""
+        return float(np.sqrt(self.noise_power)) / max(1.0, self.weight)
 
     def heights(self, pairs: IntArray) -> Float32Array:
         """Height that a single direct sound gives to each of the pairs (P, 2): (P, 1)."""
@@ -102,7 +110,7 @@ def summed(parts: Sequence[OnsetGCC]) -> OnsetGCC:
     for one in parts[1:]:
         lags += one.lags
         levels += one.levels
-    return OnsetGCC(lags, levels)
+    return OnsetGCC(lags, levels, sum(one.noise_power for one in parts))
 
 
 class OnsetFrontEnd:
@@ -134,6 +142,9 @@ class OnsetFrontEnd:
         self._n_fft = fast_length(length + room)
         self._window = (0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)).astype(np.float32)
         self._band = slice(*band_bins(self._n_fft, self._rate_hz, spec.band_hz))
+        # Windows overlap, and bins lie closer than a window resolves. Each product of two phases is thus shared by
+        # n_fft/hop cells: the sum of the squared ambiguity function of any window over such a grid.
+        self._shared_cells = 0.5 * self._n_fft / self._hop
         hop_s = self._hop / self._rate_hz
         self._parameters = OnsetParameters(
             least=np.float32(_LEAST_POWER / factor * np.square(self._window).sum()),
@@ -188,7 +199,8 @@ class OnsetFrontEnd:
         weights, noises = np.empty((2, hops, len(self._state.noise)), dtype=np.float32)
         kernels.onset_weights(spectra, self._band.start, quiet, self._parameters, self._state, weights, noises)
         cross = self._cross(Spectra(spectra, self._n_fft), weights, noises)
-        return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels)
+        noise_power = self._shared_cells * float(np.vdot(weights, weights))
+        return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels, noise_power)
 
     def _cross(self, spectra: Spectra, weights: Float32Array, noises: Float32Array) -> CrossSpectra:
         noisy = None if self._wide else _NOISY * noises

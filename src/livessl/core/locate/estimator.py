@@ -41,6 +41,8 @@ class Sound:
     ended : bool
         Whether the sound is complete. While it goes on it will be located again anyway, so an estimator
         can skip its slower second look.
+    detected : bool
+        Whether the array detected the sound by itself; if not, its frames were requested.
     """
 
     segments: Sequence[Float32Array]
@@ -49,6 +51,7 @@ class Sound:
     suspect: bool = False
     sources: int = 1
     ended: bool = True
+    detected: bool = True
 
     @property
     def onset_strength(self) -> float:
@@ -100,7 +103,8 @@ class Localization:
         Arrays that disagree with the others and were left out of the position, and the angle in degrees between each
         one's own direction and the position. None if the estimator does not look for outliers.
     unneeded : collection of str
-        Arrays that were not used because enough others have stronger onsets.
+        Arrays that were not used: their sound does not stand out from their own noise
+        (`livessl.core.locate.contributing`), or enough others have stronger onsets.
     others : tuple of Localization
         Further sources that sounded at the same time.
     candidates : tuple of Candidate

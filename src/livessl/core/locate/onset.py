@@ -13,6 +13,7 @@ from livessl.core.correlate.onset_gcc import OnsetFrontEnd, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
 from livessl.core.locate.confidence import LEAST_CONFIDENCE, Judgement
+from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
 from livessl.core.locate.outliers import Consensus
@@ -38,9 +39,13 @@ MOST_ARRAYS_REEXAMINED: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """The consensus of some evidence, its judgement, and the reason for refusing it, or None."""
+    """The consensus of the arrays that contribute, its judgement, and the reason for refusing it, or None.
+
+    `evidence` is that of all arrays if none contributes.
+    """
 
     evidence: tuple[Evidence, ...]
+    contributing: frozenset[str]
     consensus: Consensus
     judgement: Judgement
     refused: str | None
@@ -49,6 +54,10 @@ class _Answer:
     def is_sure(self) -> bool:
         """Whether a second look is not worth its time."""
         return self.refused is None and self.judgement.features.is_sure
+
+    def rank(self) -> tuple[bool, bool, float]:
+        """Return what decides which of two answers is the better one: the greater is."""
+        return self.refused is None, len(self.contributing) > 1, self.judgement.features.confidence
 
 
 class Onset(MapEstimator):
@@ -104,32 +113,51 @@ class Onset(MapEstimator):
         separation = None
         if outside is None or not outside.is_sufficient:
             separation = self._second_source.separate(
-                answer.consensus, evidence, strongest, lambda part: self._frames(part, strongest[part.spec.name])
+                answer.consensus, answer.evidence, strongest, lambda part: self._frames(part, strongest[part.spec.name])
             )
         others: tuple[Localization, ...] = ()
         if separation is not None:
             second, judgement = separation.second, separation.judgement
             consensus = Consensus(separation.first, second.outliers or {})
-            answer, outside = _Answer(evidence, consensus, judgement, judgement.refused), None
+            answer = replace(answer, consensus=consensus, judgement=judgement, refused=judgement.refused)
+            outside = None
             second = self._with_candidates(second)
             others = (replace(second, unneeded=sounds.keys() - {part.spec.name for part in second.evidence}),)
         elif outside is None and not answer.is_sure and all(sound.ended for sound in strongest.values()):
             second_look = self._answer(self._with_whole_segments(evidence, strongest), suspect, whole=True)
-            answer = max(answer, second_look, key=lambda one: (one.refused is None, one.judgement.features.confidence))
+            answer = max(answer, second_look, key=_Answer.rank)
             outside = self._outside(answer)
         found = self._localization(answer) if outside is None else self._beyond(answer, outside)
-        return replace(found, unneeded=sounds.keys() - strongest.keys(), others=others)
+        return replace(found, unneeded=sounds.keys() - answer.contributing, others=others)
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
         return tuple(self._onset_evidence(name, sounds[name]) for name in sorted(sounds))
 
     def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
-        consensus = outliers.consensus(evidence, suspect, self._search, self.grid, self._place)
+        together = self._place(evidence)
+        terms = together.functional.pair_terms(together.position_m)
+        kept = contributing(together.evidence, terms, self._highest_power, self.c_m_s)
+        if not kept:
+            judgement = together.judgement(self.grid, whole=whole)
+            return _Answer(evidence, frozenset(), Consensus(together), judgement, NO_EVIDENCE)
+        known = {_names(evidence): together}
+
+        def place_of(parts: Sequence[Evidence]) -> Place:
+            return known.get(_names(parts)) or self._place(parts)
+
+        consensus = outliers.consensus(kept, suspect, self._search, self.grid, place_of)
         judgement = consensus.place.judgement(self.grid, whole=whole)
-        return _Answer(evidence, consensus, judgement, consensus.refused or judgement.refused)
+        return _Answer(kept, _names(kept), consensus, judgement, consensus.refused or judgement.refused)
+
+    def _highest_power(self, evidence: Evidence) -> float:
+        """Return the highest power of one array's own map."""
+        (peak,) = self._search.among([evidence])(1)
+        return peak.power
 
     def _outside(self, answer: _Answer) -> Outside | None:
+        if not answer.contributing:
+            return None
         place, refused = answer.consensus.place, answer.refused is not None
         return find_outside(place, answer.evidence, self.grid, self.c_m_s, refused=refused)
 
@@ -180,16 +208,18 @@ class Onset(MapEstimator):
     def _with_whole_segments(self, evidence: tuple[Evidence, ...], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Add the GCCs of whole segments, in which a steady sound counts as much as its onset."""
         reexamined = strongest_onsets(sounds, MOST_ARRAYS_REEXAMINED)
-        whole = {
-            name: sound.without_dead_channels(self._correlator(name, sound.sample_rate_hz)(sound.segments)).values
-            for name, sound in reexamined.items()
-        }
-        return tuple(
-            replace(part, gcc=replace(part.gcc, values=part.gcc.values + whole[part.spec.name]))
-            if part.spec.name in whole
-            else part
-            for part in evidence
-        )
+        correlators = {name: self._correlator(name, sound.sample_rate_hz) for name, sound in reexamined.items()}
+
+        def added(part: Evidence) -> Evidence:
+            name = part.spec.name
+            if name not in reexamined:
+                return part
+            sound, correlate = reexamined[name], correlators[name]
+            values = part.gcc.values + sound.without_dead_channels(correlate(sound.segments)).values
+            noise_rms = part.noise_rms + correlate.noise_rms(sound.segments)
+            return replace(part, gcc=replace(part.gcc, values=values), noise_rms=noise_rms)
+
+        return tuple(added(part) for part in evidence)
 
     def _frames(self, evidence: Evidence, sound: Sound) -> FrameGCCs:
         sampling = self._sampling(evidence.spec.name, sound.sample_rate_hz)
@@ -204,7 +234,9 @@ class Onset(MapEstimator):
         spec = self.arrays[array]
         pairs = microphone_pairs(len(spec.microphones_m))
         gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
-        return Evidence(spec, sound.without_dead_channels(gcc))
+        faint = onsets.noise_power <= FAINT * onsets.weight
+        presumed = sound.detected and faint
+        return Evidence(spec, sound.without_dead_channels(gcc), noise_rms=onsets.noise_rms, is_presumed=presumed)
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
         known = self._samplings.get(array)
@@ -216,3 +248,7 @@ class Onset(MapEstimator):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
+
+
+def _names(evidence: Sequence[Evidence]) -> frozenset[str]:
+    return frozenset(part.spec.name for part in evidence)

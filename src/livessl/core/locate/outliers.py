@@ -192,5 +192,5 @@ def _refusal(evidence: Sequence[Evidence]) -> str:
     names = " and ".join(repr(part.spec.name) for part in evidence) if len(evidence) == 2 else "the arrays"
     return (
         f"{names} point to different places, and it is unknown which is wrong; check their poses in the site file "
-        "(arrays.NAME.position_m and orientation_deg)"
+        "(arrays.NAME.position_m and orientation_deg), and the order and polarity of their channels"
     )

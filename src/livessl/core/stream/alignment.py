@@ -125,6 +125,7 @@ class Alignment:
         stream.health.count_frame()
         if self._watches_health and stream.is_newest(frame.frame_index):
             stream.health.take_frame(frame, self.now_ns)
+            self._state.channel_faults.take(frame)
         return is_late
 
     def _reach(self, stream: ArrayStream, frame_index: int) -> None:
@@ -246,6 +247,7 @@ class Alignment:
                 votes.of(name),
                 None if clocks is None else clocks.of(name),
                 nodes.get(name, NodeReport()),
+                self._state.channel_faults.of(name),
                 levels=levels,
             )
             for name, stream in self.streams.items()

@@ -160,6 +160,7 @@ class ArrayHealth:
         votes: Votes,
         clock_offset: ClockOffset | None,
         node: NodeReport,
+        channel_fault: str | None = None,
     ) -> tuple[ArrayState, str | None]:
         """Decide the array's state; return it and the reason for it.
 
@@ -174,8 +175,12 @@ class ArrayHealth:
         clock_offset : ClockOffset or None
             Offset of its node's clock, if it is known.
         node : NodeReport
+        channel_fault : str or None
+            Fault of its channels with which its sound is not used, in words.
         """
         state, reason = self._state_by_messages(now_ns, age_ns, votes, has_left=has_left)
+        if channel_fault is not None and state in (ArrayState.HEALTHY, ArrayState.DEGRADED):
+            state, reason = ArrayState.DEGRADED, f"not used: {channel_fault}"
         if state is ArrayState.HEALTHY and clock_offset is not None and abs(clock_offset.offset_s) > FRAME_S:
             state, reason = ArrayState.DEGRADED, clock_is_off(clock_offset)
         if node.finding is not None and state in (ArrayState.HEALTHY, ArrayState.DEGRADED):

@@ -126,14 +126,27 @@ class ArrayStream:
             del onsets[first]
 
     def status(
-        self, now_ns: int, votes: Votes, offset: ClockOffset | None, node: NodeReport, *, levels: bool
+        self,
+        now_ns: int,
+        votes: Votes,
+        offset: ClockOffset | None,
+        node: NodeReport,
+        channel_fault: str | None = None,
+        *,
+        levels: bool,
     ) -> ArrayStatus:
         """Return the array's status; without `levels` it has no channel powers. Any thread may call it."""
         health, mark = self.health, self.health.mark
         age_ns = None if self.last_message_ns is None else max(0, now_ns - self.last_message_ns)
         is_lost = age_ns is not None and (self.has_left or age_ns >= LOST_NS)
         state, reason = health.state(
-            now_ns, age_ns=age_ns, has_left=self.has_left, votes=votes, clock_offset=offset, node=node
+            now_ns,
+            age_ns=age_ns,
+            has_left=self.has_left,
+            votes=votes,
+            clock_offset=offset,
+            node=node,
+            channel_fault=channel_fault,
         )
         return ArrayStatus(
             name=self.spec.name,

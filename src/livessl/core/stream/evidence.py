@@ -72,16 +72,38 @@ class Sounds(Mapping[str, Sound]):
         self.ended = ended
         self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
         self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
+        self._requested: set[str] = set()
 
-    def add(self, array: str, segments: Sequence[Sequence[Frame]], onsets: tuple[OnsetGCC, ...]) -> None:
-        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames."""
+    def add(
+        self,
+        array: str,
+        segments: Sequence[Sequence[Frame]],
+        onsets: tuple[OnsetGCC, ...],
+        *,
+        requested: bool = False,
+    ) -> None:
+        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames.
+
+        `requested` if the array did not detect the sound, and its frames were requested.
+        """
         self._segments[array], self._onsets[array] = segments, onsets
+        if requested:
+            self._requested.add(array)
 
     def copy(self) -> Sounds:
         """Return a copy that sounds can be added to."""
         copy = Sounds(self.sources, self.suspects, ended=self.ended)
         copy._segments |= self._segments
         copy._onsets |= self._onsets
+        copy._requested |= self._requested
+        return copy
+
+    def without(self, arrays: Collection[str]) -> Sounds:
+        """Return a copy without the sounds of some arrays."""
+        copy = self.copy()
+        for array in arrays:
+            copy._segments.pop(array, None)
+            copy._onsets.pop(array, None)
         return copy
 
     @property
@@ -98,6 +120,7 @@ class Sounds(Mapping[str, Sound]):
             array in self.suspects,
             self.sources,
             self.ended,
+            array not in self._requested,
         )
 
     def __iter__(self) -> Iterator[str]:
@@ -155,12 +178,18 @@ class Excerpt:
         """Greatest power of a frame, full scale squared."""
         return max(float(power.max()) for power in self.powers.values())
 
+    def without(self, arrays: Collection[str]) -> Excerpt:
+        """Return this excerpt without the sounds of some arrays; the times stay."""
+        powers = {name: power for name, power in self.powers.items() if name not in arrays}
+        return Excerpt(self.sounds.without(arrays), self.start_ns, self.end_ns, powers)
+
     def with_backfill(self, backfilled: Mapping[str, BackfilledSound]) -> Excerpt:
         """Return this excerpt with the sounds of requested frames added; the times stay."""
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
         for name, sound in backfilled.items():
             powers = np.array([frame.power for frame in sound.frames])
-            joined.add(name, [sound.frames], sound.onsets, powers)
+            joined.sounds.add(name, [sound.frames], sound.onsets, requested=True)
+            joined.powers[name] = powers
         return joined
 
 
@@ -180,6 +209,7 @@ class EvidenceCollector:
         self._state = state
         self._cache = state.cache
         self._votes = state.votes
+        self._channel_faults = state.channel_faults
         self._parameters = state.parameters
         self._alignment = alignment
         self._correlates_ahead = correlates_ahead
@@ -336,13 +366,16 @@ class EvidenceCollector:
     # --- excerpts
 
     def window(self, last: int) -> Excerpt:
-        """Return the active frames of the window that ends with a frame index, without those of suspect arrays."""
+        """Return the active frames of the window that ends with a frame index.
+
+        Those of suspect arrays, and of arrays with faulty channels, are left out.
+        """
         window = range(last - self._parameters.window_frames + 1, last + 1)
         sounds = Sounds(self._parameters.live_sources, ended=False)
         excerpt = Excerpt(sounds, window.start * FRAME_NS, window.stop * FRAME_NS)
         for name, stream in self._alignment.streams.items():
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
-            if segments and not self._votes.is_suspect(name):
+            if segments and not self._votes.is_suspect(name) and self._channel_faults.of(name) is None:
                 excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
                 onsets = stream.correlations.at(window)
                 if self._is_located(stream) and (onsets or Segments(segments)):

@@ -214,6 +214,7 @@ class Fusion:
         self._reporter.start_over()
         self._state.cache.clear()
         self._state.votes.clear()
+        self._state.channel_faults.clear()
         return outputs
 
     def _close_ready(self) -> list[Output]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from livessl.core.locate.estimator import Estimator
+from livessl.core.stream.channel_faults import ChannelFaults
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.stream.correlation_cache import CorrelationCache, ForEach
 from livessl.core.stream.load_policy import NOTHING_SHED, Relief
@@ -52,6 +53,7 @@ class SiteState:
         self.clock_offsets = clock_offsets
         self.cache = CorrelationCache(estimator, for_each)
         self.votes = OutlierVotes(self.arrays)
+        self.channel_faults = ChannelFaults(self.arrays)
         self._answering: set[str] = set()
         self._excluded: Collection[str] = ()
         self.relief = NOTHING_SHED
@@ -98,8 +100,8 @@ class SiteState:
         return array in self._answering
 
     def may_request(self, array: str) -> bool:
-        """Return whether frames may be requested from an array: its node answers, and it is not excluded."""
-        return self.answers(array) and not self.is_excluded(array)
+        """Return whether frames may be requested from an array: its node answers, and its sound would be used."""
+        return self.answers(array) and not self.is_excluded(array) and self.channel_faults.of(array) is None
 
     def specs(self, arrays: Sequence[str]) -> list[ArraySpec]:
         """Return the specifications of the arrays named."""

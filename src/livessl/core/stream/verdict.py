@@ -13,6 +13,7 @@ import numpy as np
 
 from livessl.core.commission.observe import observe
 from livessl.core.geometry import direction_deg
+from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
@@ -49,13 +50,15 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
     ----------
     found : Localization
     specs : sequence of ArraySpec
-        The arrays that it was found by.
+        The arrays that it was found by; none if no array carries evidence.
 
     Returns
     -------
     Status, str or None
         The status, and the reason for it; None if there is nothing to add.
     """
+    if not specs:
+        return Status.REFUSED, found.refused or NO_EVIDENCE
     spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(found.covariance_m2)[-1])))
     nearest_m = min(_distance_m(spec, found.position_m) for spec in specs)
     alone = len(specs) == 1 and nearest_m > RANGE_APERTURES * specs[0].aperture_m
@@ -64,7 +67,7 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
             return Status.REFUSED, found.refused
         return (Status.DIRECTION_ONLY, found.ambiguity) if found.candidates else (Status.LOCATED, _dissent(found))
     if found.features is not None and not found.features.has_direction:
-        return Status.REFUSED, "no direction stands out in the sound"
+        return Status.REFUSED, NO_EVIDENCE
     who = "one array" if len(specs) == 1 else "these arrays"
     unresolved = f"{who} cannot resolve the distance: ±{spread_m:.2f} m at {nearest_m:.2f} m"
     return Status.DIRECTION_ONLY, unresolved if found.ambiguity is None else f"{found.ambiguity}; {unresolved}"
@@ -109,17 +112,20 @@ class Verdicts:
             Sounds of other arrays that are used as well.
         """
         backfilled = backfilled or {}
-        used, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
-        count = "1 array" if len(used.sounds) == 1 else f"{len(used.sounds)} arrays"
-        why = f"detected by {count}; fusion.min_arrays is {least}" if used.sounds else NO_SOUND
-        first = self._refused(event, excerpt, now_ns, why)
+        received, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
+        faults = self._channel_faults(event, received)
+        used = received.without(faults)
+        count = "1 array" if len(received.sounds) == 1 else f"{len(received.sounds)} arrays"
+        why = f"detected by {count}; fusion.min_arrays is {least}" if received.sounds else NO_SOUND
+        few = why if len(received.sounds) < least else None
+        first = self._refused(event, excerpt, now_ns, _joined(few, faults))
         if len(used.sounds) < least:
             return Verdict([first], None)
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
         observations = () if self._state.relief.shed else _observations(found, used)
-        first = replace(first, status=status, reason=reason, observations=observations)
+        first = replace(first, status=status, reason=_joined(reason, faults) or None, observations=observations)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
@@ -129,7 +135,7 @@ class Verdicts:
                 id=f"{first.id}-{source}",
                 source=source,
                 status=Status.LOCATED,
-                reason=None,
+                reason=_joined(None, faults) or None,
                 observations=(),
                 estimate=other,  # the power stays that of both sources: it cannot be divided
                 contributions=self._contributions(used.powers, other, found, backfilled),
@@ -137,6 +143,12 @@ class Verdicts:
             for source, other in enumerate(self._others(found, used), 2)
         )
         return Verdict([first, *others], found)
+
+    def _channel_faults(self, event: PendingEvent, excerpt: Excerpt) -> dict[str, str]:
+        """Return the faults, in words, of those arrays of an excerpt whose channels are faulty."""
+        examine, sounds = self._state.channel_faults.examine, excerpt.sounds
+        faults = {name: examine(name, event.start, sound.onsets) for name, sound in sounds.items()}
+        return {name: fault for name, fault in faults.items() if fault is not None}
 
     def _refused(self, event: PendingEvent, excerpt: Excerpt, now_ns: int, reason: str) -> Event:
         return Event(
@@ -180,7 +192,12 @@ class Verdicts:
         return tuple(estimate for estimate, other in estimates if self._judged(estimate, other)[0] is Status.LOCATED)
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
-        return judged(found, self._state.specs(estimate.arrays))
+        status, reason = judged(found, self._state.specs(estimate.arrays))
+        least = self._state.parameters.min_arrays
+        if status is Status.REFUSED or len(estimate.arrays) >= least:
+            return status, reason
+        names = " and ".join(map(repr, estimate.arrays))
+        return Status.REFUSED, f"only {names} carried evidence of it; fusion.min_arrays is {least}"
 
     def _contributions(
         self,
@@ -193,6 +210,7 @@ class Verdicts:
         return tuple(
             _contribution(arrays[name], power, estimate, found, backfilled=name in backfilled)
             for name, power in powers.items()
+            if name not in backfilled or name not in found.unneeded
         )
 
     def _id(self, frame_index: int) -> str:
@@ -240,6 +258,12 @@ def _contribution(
         off_deg=(found.outliers or {}).get(spec.name),
         asked=backfilled,
     )
+
+
+def _joined(reason: str | None, faults: Mapping[str, str]) -> str:
+    """Return a reason followed by the faults of the arrays that were not used."""
+    unused = [f"{name!r} is not used: {fault}" for name, fault in sorted(faults.items())]
+    return "; ".join([*([] if reason is None else [reason]), *unused])
 
 
 def _dissent(found: Localization) -> str | None:

@@ -266,11 +266,18 @@ class Evidence:
         Correlations of the whole band.
     below : tuple of GCC
         Correlations of the part of the band below each cut-off, if the array's map is limited against spatial aliasing.
+    noise_rms : float
+        Root mean square that a pair's GCC, or the real part of its analytic signal, would have if the phases between
+        the microphones were random; 0 if it is not known.
+    is_presumed : bool
+        Whether the array is taken to contribute even if its sound does not stand out from its noise.
     """
 
     spec: ArraySpec
     gcc: GCC
     below: tuple[GCC, ...] = ()
+    noise_rms: float = 0.0
+    is_presumed: bool = True
 
 
 @dataclass(frozen=True, slots=True)

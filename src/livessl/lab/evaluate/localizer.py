@@ -247,7 +247,7 @@ def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[Ar
         "error_m": float(np.linalg.norm(error)),
         "bearing_deg": angle_deg(found.position_m - nearest_m, source_m - nearest_m),
         "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
-        "status": str(judged(found, [spec for spec in specs if spec.name not in outliers])[0]),
+        "status": str(judged(found, [spec for spec in specs if spec.name not in {*outliers, *found.unneeded}])[0]),
         "outvoted": "".join(sorted(outliers)),
     }
     row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
