@@ -1,4 +1,4 @@
-"""Places that arrays cannot tell apart, known from the geometry of the microphones alone: mirror images.
+"""Places that look alike to arrays, known from the geometry of the microphones alone: mirror images.
 
 Microphones in one plane receive the same from a place and from its mirror image behind the plane; microphones on one
 line receive the same from every place on a circle around it.
@@ -26,7 +26,7 @@ REACH_M: Final = 0.5
 may be off by that much, and its mirror image with it, so that the volume does not exclude the place."""
 
 CURE: Final = "let grid.bounds_m end at the plane, tilt an array, or raise a microphone"
-"""What makes a position and its mirror image distinguishable."""
+"""Advice that makes a position and its mirror image distinguishable."""
 
 MOST_SHARE: Final = 0.05
 """Share of the search volume above which its look-alikes are worth a warning before anything is mounted."""
@@ -96,7 +96,7 @@ def flatness(specs: Sequence[ArraySpec], c_m_s: float) -> Flatness | None:
 
 
 def look_alikes(position_m: FloatArray, specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> FloatArray:
-    """Places (N, 3) inside the search volume that some of the arrays, or all together, cannot tell from a position."""
+    """Places (N, 3) inside the search volume that look like a position to one of the arrays, or to all together."""
     groups = [[spec] for spec in specs] if len(specs) > 1 else []
     flats = (flatness(group, c_m_s) for group in [list(specs), *groups])
     images = [flat.images_m(position_m, grid) for flat in flats if flat is not None]
@@ -104,7 +104,7 @@ def look_alikes(position_m: FloatArray, specs: Sequence[ArraySpec], grid: Grid, 
 
 
 def confused(position_m: FloatArray, places_m: FloatArray, specs: Sequence[ArraySpec], c_m_s: float) -> bool:
-    """Whether at one of some places (N, 3) all pairs have the delays of a position, to within `SAME_PERIODS`."""
+    """Return whether one of some places (N, 3) has the delays of a position, to within `SAME_PERIODS`, at all pairs."""
     for spec in specs:
         points_m = np.concatenate([position_m[None], places_m])
         pairs = microphone_pairs(len(spec.microphones_m))
@@ -117,7 +117,7 @@ def confused(position_m: FloatArray, places_m: FloatArray, specs: Sequence[Array
 
 
 def ambiguous_share(specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> float:
-    """Share of the search volume in which some arrays cannot tell a place from another one that is far away.
+    """Share of the search volume in which a place looks like another one far away to all of some arrays.
 
     What all arrays confuse is an image of each of them, so that the images of one suffice.
     """
@@ -136,7 +136,7 @@ def ambiguous_share(specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> flo
 
 
 def warning(specs: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> str | None:
-    """Return a warning with its cure if arrays cannot tell apart many places of the search volume; None otherwise."""
+    """Return a warning with its cure if many places of the search volume look alike to arrays; None otherwise."""
     share = ambiguous_share(specs, grid, c_m_s)
     if share <= MOST_SHARE:
         return None

@@ -249,7 +249,7 @@ def _unlikely_values(site: Site) -> Iterator[str]:
 
 
 def _look_alikes(site: Site) -> Iterator[str]:
-    """Yield a warning if the arrays together cannot tell positions from their mirror images."""
+    """Yield a warning if positions and their mirror images look alike to all arrays together."""
     found = mirror.warning(site.processed, search_grid(site), site.c_m_s)
     if found is not None:
         yield found

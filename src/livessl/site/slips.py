@@ -22,7 +22,7 @@ _KINDS: Final = {
     "tag:yaml.org,2002:null": "nothing",
     "tag:yaml.org,2002:timestamp": "a date",
 }
-"""What YAML makes of texts without quotes, by the tag of the node."""
+"""The value that YAML reads in place of a text without quotes, in words, by the tag of the node."""
 
 _WITH_COMMA: Final = re.compile(r"[+-]?\d+,\d+")
 
@@ -81,5 +81,5 @@ def slip(error: Mapping[str, Any]) -> str | None:
 
 
 def _has_commas(numbers: list[Any]) -> bool:
-    """Whether a list looks like numbers that decimal commas have divided: at least two of them are whole."""
+    """Return whether a list looks like numbers that decimal commas have divided: at least two of them are whole."""
     return all(type(x) in (int, float) for x in numbers) and sum(type(x) is int for x in numbers) >= 2

@@ -1,7 +1,7 @@
 """Weighs a position against its mirror images by the power there. It sees correlations and no sound.
 
 The geometry of the microphones proposes places that look alike (`livessl.core.mirror`). Where another array, or a
-microphone off the plane, tells them apart, they have less power than the position.
+microphone off the plane, distinguishes them, they have less power than the position.
 """
 
 from __future__ import annotations

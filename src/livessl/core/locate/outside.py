@@ -92,7 +92,7 @@ class Outside:
 
     @property
     def is_sufficient(self) -> bool:
-        """Whether the place explains the evidence so well that no second source is needed."""
+        """True if the place explains the evidence so well that no second source is needed."""
         return self.place.power >= SUFFICIENT * highest_power(self.place.evidence)
 
     def candidates(self, inside_m: FloatArray) -> tuple[Candidate, Candidate]:
@@ -168,7 +168,7 @@ def highest_power(evidence: Sequence[Evidence]) -> float:
 
 
 def _is_near(place_m: FloatArray, inside_m: FloatArray, evidence: Sequence[Evidence]) -> bool:
-    """Whether a place outside is the same answer as one inside, given how well the poses of arrays are known."""
+    """Return whether a place outside is the same answer as one inside, given how well the poses of arrays are known."""
     turns_deg = [angle_deg(place_m - part.spec.centre_m, inside_m - part.spec.centre_m) for part in evidence]
     by_pose = float(np.linalg.norm(turns_deg)) <= MOST_DEVIATIONS * POSE_DEG
     return float(np.linalg.norm(place_m - inside_m)) <= (NEAR_BY_POSE_M if by_pose else NEAR_M)
