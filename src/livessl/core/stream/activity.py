@@ -102,6 +102,13 @@ class CausalActivity:
         """Start from a known background, full scale squared."""
         self._smoothed.append(floor_power)
 
+    def restart(self, floor_power: float) -> None:
+        """Start over from a known background, full scale squared, because part of the power is no longer counted."""
+        self._maximum = 0.0
+        self._latest.clear()
+        self._smoothed.clear()
+        self.prime(floor_power)
+
     def push(self, power: float) -> bool:
         """Return whether the next frame, of mean power `power`, is active."""
         parameters = self._parameters

@@ -124,7 +124,7 @@ class Alignment:
         stream.add(frame)
         stream.health.count_frame()
         if self._watches_health and stream.is_newest(frame.frame_index):
-            stream.health.take_frame(frame, self.now_ns)
+            stream.health.take_frame(frame, stream.spec.band_hz, self.now_ns)
             self._state.channel_faults.take(frame)
         return is_late
 

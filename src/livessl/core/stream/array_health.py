@@ -11,8 +11,9 @@ from enum import StrEnum
 from typing import Final
 
 import numpy as np
+import scipy.fft
 
-from livessl.core.correlate.band import dead_channels
+from livessl.core.correlate.band import band_bins, dead_channels
 from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off
 from livessl.core.stream.outlier_votes import Votes, is_suspect
 from livessl.core.types import FRAME_S, ClockState, Float32Array, Frame, Mark
@@ -29,6 +30,13 @@ DEAD_CHANNEL_NS: Final = 1_000_000_000
 
 WEAK_FRAMES: Final = 10
 """Channels are checked for missing sound in one active frame out of this many; a fault is reported after a second."""
+
+HUM: Final = 10.0
+"""Ratio of a quiet frame's power to the background from which on hum or rumble is reported. Without it quiet frames
+stay below four times the background."""
+
+HUM_MARKS: Final = 20
+"""Number of quiet frames in a row, one second, after which it is reported."""
 
 _ZERO_STRIDE: Final = 64
 """One sample in this many shows that a live channel is not all zeros; channels that look silent are then examined
@@ -108,6 +116,9 @@ class ArrayHealth:
     dead_since_ns: int = 0
     weak: tuple[int, ...] = ()  # channels from 1, with next to nothing of a sound that the others receive
     weak_since_ns: int = 0
+    hum_marks: int = 0  # quiet frames in a row with hum or rumble
+    hum_power: float = 0.0
+    hum_hz: float | None = None  # strongest frequency, once a quiet frame has come
 
     def note(self, now_ns: int, fault: str) -> None:
         """Note a fault, in words."""
@@ -127,14 +138,16 @@ class ArrayHealth:
         """Count a frame that is used."""
         self.counters["frames"] += 1
 
-    def take_frame(self, frame: Frame, now_ns: int) -> None:
-        """Take in the newest frame."""
+    def take_frame(self, frame: Frame, band_hz: tuple[float, float], now_ns: int) -> None:
+        """Take in the newest frame of an array with this band."""
         self.power, self.active = frame.power, frame.active
         if not frame.samples.size:
             return
         self._find_dead(now_ns, _alive(frame.samples))
         if frame.active and frame.frame_index % WEAK_FRAMES == 0:
             self._find_weak(now_ns, frame.samples)
+        if self.hum_marks >= HUM_MARKS and self.hum_hz is None and not frame.active:
+            self.hum_hz = strongest_hz(frame.samples, frame.sample_rate_hz, band_hz)
 
     def take_mark(self, mark: Mark, now_ns: int, *, is_newest: bool) -> None:
         """Take in a mark; `is_newest` unless a message of a later frame index came before it."""
@@ -150,6 +163,7 @@ class ArrayHealth:
         if is_newest:
             self.mark, self.power, self.active = mark, mark.power, False
             self._find_dead(now_ns, (power > 0.0 for power in mark.channel_power))
+            self._find_hum(mark)
 
     def state(
         self,
@@ -207,7 +221,15 @@ class ArrayHealth:
             silence = f"no message for {age_ns / 1e9:.1f} s"
             return ArrayState.LOST, f"{silence}; before that, {self.fault}" if troubled else silence
         reason = self._channel_fault(now_ns) or (self.fault if troubled else _disagreement(votes))
-        return (ArrayState.HEALTHY, None) if reason is None else (ArrayState.DEGRADED, reason)
+        return (ArrayState.HEALTHY, self._hum()) if reason is None else (ArrayState.DEGRADED, reason)
+
+    def _hum(self) -> str | None:
+        """Return a note on hum or rumble, with which an array works; None without it."""
+        if self.hum_marks < HUM_MARKS:
+            return None
+        where = "" if self.hum_hz is None else f", strongest near {self.hum_hz:.0f} Hz"
+        level = f"steady hum or rumble at {10.0 * np.log10(self.hum_power):.0f} dBFS{where}"
+        return f"{level}, is not counted as sound; look for a ground loop, a fan or a lamp"
 
     def _channel_fault(self, now_ns: int) -> str | None:
         if self.dead and now_ns - self.dead_since_ns >= DEAD_CHANNEL_NS:
@@ -224,6 +246,12 @@ class ArrayHealth:
             self.dead_since_ns = now_ns
         self.dead = dead
 
+    def _find_hum(self, mark: Mark) -> None:
+        self.hum_power = mark.power
+        self.hum_marks = self.hum_marks + 1 if 0.0 < HUM * mark.noise_power <= mark.power else 0
+        if not self.hum_marks:
+            self.hum_hz = None
+
     def _find_weak(self, now_ns: int, samples: Float32Array) -> None:
         weak = tuple(k for k, dead in enumerate(dead_channels([samples]).tolist(), start=1) if dead)
         if weak and not self.weak:
@@ -234,6 +262,18 @@ class ArrayHealth:
 def is_connected(last_message_ns: int | None, now_ns: int) -> bool:
     """Return whether the last message came less than `LOST_NS` ago."""
     return last_message_ns is not None and now_ns - last_message_ns < LOST_NS
+
+
+def strongest_hz(samples: Float32Array, sample_rate_hz: float, band_hz: tuple[float, float]) -> float:
+    """Return the frequency, in hertz, at which the channels (K, n) together are strongest within a band."""
+    count = samples.shape[1]
+    spectra = scipy.fft.rfft(samples * np.hanning(count).astype(np.float32), axis=1)
+    low, high = band_bins(count, sample_rate_hz, band_hz)
+    power = (spectra.real**2 + spectra.imag**2).sum(axis=0)[low:high]
+    peak = int(power.argmax())
+    around = power[max(0, peak - 1) : peak + 2]  # the centre of the window's main lobe
+    first = low + max(0, peak - 1)
+    return float((np.arange(first, first + len(around)) @ around) / around.sum() * sample_rate_hz / count)
 
 
 def _disagreement(votes: Votes) -> str | None:

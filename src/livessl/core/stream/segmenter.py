@@ -9,6 +9,7 @@ import numpy as np
 
 from livessl.core.correlate.band import band_power
 from livessl.core.stream.activity import ActivityParameters, CausalActivity
+from livessl.core.stream.steady_background import SteadyBackground
 from livessl.core.stream.timeline import Cut, Framer
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, Frame, IntArray, Mark, Message
 
@@ -18,6 +19,11 @@ event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
 """Number of frames held back at the start; the quietest of them is the first estimate of the background."""
+
+
+NEW_HUM: Final = 0.25
+"""Ratio of a frame's level, with the background known then, to its level with the background known before it, below
+which a hum has just been recognized: what the activity rule knows of levels is then no longer true."""
 
 
 class Segmenter:
@@ -49,8 +55,9 @@ class Segmenter:
         self._channels = channels
         self._rate_hz = sample_rate_hz
         self._activity = CausalActivity(parameters)
+        self._background = SteadyBackground(sample_rate_hz, spec.band_hz, parameters.floor_window_s)
         self._hang_over = parameters.hang_over_frames
-        self._warm_up: list[tuple[Cut, FloatArray]] | None = []
+        self._warm_up: list[tuple[Cut, FloatArray, FloatArray]] | None = []
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=parameters.pre_roll_frames)
         self._recent: deque[tuple[Cut, float]] = deque(maxlen=round(RECENT_S / FRAME_S))
         self._quiet_frames = self._hang_over + 1
@@ -69,18 +76,27 @@ class Segmenter:
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
         self._frame_index = cut.frame_index
-        power = band_power(self._selected(cut), self._rate_hz, self._spec.band_hz)
+        samples = self._selected(cut)
+        power = band_power(samples, self._rate_hz, self._spec.band_hz)
+        spectrum, mean = self._background.spectrum(samples), float(power.mean())
+        before = self._background.changing_power(spectrum, mean)
+        self._background.learn(spectrum)
         if self._warm_up is None:
-            return self._decide(cut, power, framer)
-        self._warm_up.append((cut, power))
+            level = self._background.changing_power(spectrum, mean)
+            if level < NEW_HUM * before:
+                self._activity.restart(level)
+            return self._decide(cut, power, level, framer)
+        self._warm_up.append((cut, power, spectrum))
         return self.flush(framer) if len(self._warm_up) >= WARM_UP_FRAMES else []
 
     def flush(self, framer: Framer) -> list[Message]:
         """End the warm-up, as the end of a short stream must."""
         held, self._warm_up = self._warm_up or [], None
+        levels = [self._background.changing_power(spectrum, float(power.mean())) for _, power, spectrum in held]
         if held:
-            self._activity.prime(min(float(power.mean()) for _, power in held))
-        return [message for cut, power in held for message in self._decide(cut, power, framer)]
+            self._activity.prime(min(levels))
+        known = zip(held, levels, strict=True)
+        return [message for (cut, power, _), level in known for message in self._decide(cut, power, level, framer)]
 
     def backfill(self, first: int, last: int) -> list[Message]:
         """Return the remembered frames from `first` to `last`, both included, whether or not they were sent."""
@@ -89,8 +105,7 @@ class Segmenter:
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
 
-    def _decide(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> list[Message]:
-        power = float(channel_power.mean())
+    def _decide(self, cut: Cut, channel_power: FloatArray, power: float, framer: Framer) -> list[Message]:
         self._recent.append((cut, power))
         active = self._activity.push(power)
         self._quiet_frames = 0 if active else self._quiet_frames + 1

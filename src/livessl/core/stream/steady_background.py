@@ -1,0 +1,111 @@
+"""The level of what changes: the power of a frame in the band, without hum and rumble. It reads no clock.
+
+A mains hum, a fan's tone or rumble can be far above everything else in the band, so that a sound which is 30 dB above
+all the rest hardly raises the level. The background is therefore tracked in every bin of the frames' spectra, as the
+least power of a few seconds. Bins whose background stands far above the others' are *loud*; in them only what exceeds
+their usual power by far counts. Bins outside the band may be loud, too, and leak into it, which the window prevents.
+Without loud bins the level is the plain power in the band.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+import scipy.fft
+
+from livessl.core.correlate.band import band_bins
+from livessl.core.types import FRAME_S, BoolArray, Float32Array, FloatArray
+
+LOUD: Final = 30.0
+"""Ratio of a bin's background to the median over the band, 15 dB, above which it is loud. A tone that fills three of
+300 bins must be about so far above the others to double the level."""
+
+EXCESS: Final = 16.0
+"""Ratio of a frame's power to its usual power, 12 dB, above which sound counts in a loud bin. A bin of rumble exceeds
+its mean by so much in one of ten million frames."""
+
+BEYOND: Final = 1.25
+"""Ratio to the band's upper edge of the highest frequency at which a tone may leak into the band."""
+
+_SMOOTHING: Final = 5
+"""Number of frames averaged before the minimum is taken: as in `livessl.core.stream.activity`."""
+
+_BLOCK: Final = 10
+"""Number of frames of which a minimum is kept, so that not every frame has to be."""
+
+_LEAST_BINS: Final = 16
+"""Least number of bins in the band for their median to be a background."""
+
+
+class SteadyBackground:
+    """Tracks the background of one array's frames, and returns their power without what is loud and steady in it.
+
+    Parameters
+    ----------
+    sample_rate_hz : float
+    band_hz : (float, float)
+    window_s : float
+        Length of the window whose least power is the background.
+    """
+
+    def __init__(self, sample_rate_hz: float, band_hz: tuple[float, float], window_s: float) -> None:
+        self._count = round(FRAME_S * sample_rate_hz)
+        window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(self._count) / self._count)
+        self._window = window.astype(np.float32)
+        self._scale = 2.0 / (self._count**2 * float(np.square(window).mean()))
+        self._band = slice(*band_bins(self._count, sample_rate_hz, band_hz))
+        bins = min(self._count // 2 + 1, round(BEYOND * self._band.stop))
+        self._bins = slice(0, bins)
+        self._latest: deque[FloatArray] = deque(maxlen=_SMOOTHING)
+        self._blocks: deque[FloatArray] = deque(maxlen=max(1, round(window_s / FRAME_S / _BLOCK) - 1))
+        self._least: FloatArray | None = None  # of the block that goes on
+        self._sum: FloatArray | None = None
+        self._means: deque[FloatArray] = deque(maxlen=self._blocks.maxlen)
+        self._frames = 0
+        self._loud: BoolArray = np.zeros(bins, dtype=np.bool_)
+        self._usual: FloatArray = np.zeros(bins)
+
+    def spectrum(self, samples: Float32Array) -> FloatArray:
+        """Return the power of a frame (K, n) in each bin, mean over the channels, full scale squared: (F,)."""
+        frame = samples[:, : self._count]
+        spectra = scipy.fft.rfft(frame * self._window[: frame.shape[1]], self._count, axis=1)[:, self._bins]
+        return np.asarray((spectra.real**2 + spectra.imag**2).mean(axis=0, dtype=np.float64) * self._scale)
+
+    def learn(self, spectrum: FloatArray) -> None:
+        """Take in the spectrum of the next frame."""
+        self._latest.append(spectrum)
+        if len(self._latest) < _SMOOTHING:
+            return
+        smoothed = np.add.reduce(list(self._latest)) / _SMOOTHING
+        self._least = smoothed if self._least is None else np.minimum(self._least, smoothed)
+        self._sum = smoothed if self._sum is None else self._sum + smoothed
+        self._frames += 1
+        background = np.minimum.reduce([*self._blocks, self._least])
+        inside = background[self._band]
+        if len(inside) >= _LEAST_BINS:
+            self._loud = background > LOUD * np.median(inside)
+            self._loud[0] = False
+        if self._frames % _BLOCK == 0:
+            self._blocks.append(self._least)
+            self._means.append(self._sum / _BLOCK)
+            self._least = self._sum = None
+            self._usual = np.asarray(np.median(self._means, axis=0))
+        elif not self._means:
+            self._usual = self._sum / self._frames
+
+    def changing_power(self, spectrum: FloatArray, power: float) -> float:
+        """Return the power of a frame in the band without what is loud and steady.
+
+        Parameters
+        ----------
+        spectrum : (F,) float64
+        power : float
+            The plain power in the band, which is returned if nothing is loud.
+        """
+        if not self._loud.any():
+            return power
+        inside, loud = spectrum[self._band], self._loud[self._band]
+        excess = np.maximum(inside - EXCESS * self._usual[self._band], 0.0)
+        return float(np.where(loud, excess, inside).sum())

@@ -1,0 +1,153 @@
+"""Hum and rumble do not hide sounds, and are no sounds themselves."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import butter, sosfilt
+
+from livessl.core.correlate.band import band_power
+from livessl.core.geometry import tetrahedron
+from livessl.core.stream.activity import ActivityParameters, runs
+from livessl.core.stream.array_health import HUM_MARKS, ArrayHealth, ArrayState, NodeReport
+from livessl.core.stream.segmenter import Segmenter
+from livessl.core.stream.steady_background import SteadyBackground
+from livessl.core.stream.timeline import Cut, Framer
+from livessl.core.types import FRAME_NS, ArraySpec, Float32Array, FloatArray, Frame, Mark, Message
+
+BAND_HZ: Final = (100.0, 6000.0)
+SPEC: Final = ArraySpec("north", tetrahedron(0.5), BAND_HZ)
+BURSTS_S: Final = (1.5, 3.5, 5.5)
+LENGTH_S: Final = 7.5
+BURST_RMS: Final = 3e-3
+NOISE_RMS: Final = 1e-4
+"""30 dB below the bursts."""
+
+
+def recording(rng: np.random.Generator, rate_hz: float, steady: FloatArray) -> Float32Array:
+    """Three bursts of 0.2 s, each microphone's noise, and something steady that all microphones receive."""
+    count = round(LENGTH_S * rate_hz)
+    t = np.arange(count) / rate_hz
+    sound = np.zeros(count)
+    for start_s in BURSTS_S:
+        sound += np.where((t >= start_s) & (t < start_s + 0.2), rng.standard_normal(count), 0.0)
+    return np.asarray(
+        BURST_RMS * sound + NOISE_RMS * rng.standard_normal((4, count)) + steady[:count], dtype=np.float32
+    )
+
+
+def messages_of(samples: Float32Array, rate_hz: float) -> list[Message]:
+    """Frames are now and then a sample longer, as they are with a drifting clock."""
+    segmenter, framer = Segmenter(SPEC, np.arange(4), rate_hz, ActivityParameters()), Framer(rate_hz)
+    messages: list[Message] = []
+    at = index = 0
+    while (stop := round((index + 1) * 0.05 * rate_hz * 1.0001)) <= samples.shape[1]:
+        messages += segmenter.push(Cut(index, index * FRAME_NS, samples[:, at:stop]), framer)
+        at, index = stop, index + 1
+    return messages + segmenter.flush(framer)
+
+
+def active_runs(messages: list[Message]) -> list[tuple[int, int]]:
+    active = np.zeros(1 + max(message.frame_index for message in messages), dtype=np.bool_)
+    for message in messages:
+        if isinstance(message, Frame):
+            active[message.frame_index] = message.active
+    return runs(active)
+
+
+def is_burst(run: tuple[int, int]) -> bool:
+    return any(start_s - 0.06 <= 0.05 * run[0] and 0.05 * run[1] <= start_s + 0.36 for start_s in BURSTS_S)
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 1 << 30),
+    hum_hz=st.sampled_from([50.0, 60.0, 100.0, 120.0, 150.0, 1000.0, 2345.6, 5000.0]),
+    above_db=st.floats(-20.0, 40.0),
+    harmonic=st.sampled_from([0.0, 0.3]),
+    phase=st.floats(0.0, 6.28),
+    rate_hz=st.sampled_from([16000.0, 44100.0, 48000.0]),
+)
+def test_sounds_are_found_in_a_hum_of_any_frequency_and_level(
+    seed: int, hum_hz: float, above_db: float, harmonic: float, phase: float, rate_hz: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(LENGTH_S * rate_hz)) / rate_hz
+    wave = np.sin(2 * np.pi * hum_hz * t + phase) + harmonic * np.sin(6 * np.pi * min(hum_hz, 1900.0) * t)
+    hum = BURST_RMS * 10.0 ** (above_db / 20.0) * np.sqrt(2.0) * wave
+    found = active_runs(messages_of(recording(rng, rate_hz, hum), rate_hz))
+    assert len(found) == len(BURSTS_S)
+    assert all(map(is_burst, found))
+
+
+@pytest.mark.parametrize("above_db", [0.0, 15.0, 30.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_sounds_are_found_in_rumble(seed: int, above_db: float) -> None:
+    rng = np.random.default_rng(seed)
+    rate_hz = 16000.0
+    low = sosfilt(butter(4, 110.0, fs=rate_hz, output="sos"), rng.standard_normal(round((LENGTH_S + 1) * rate_hz)))
+    rumble = BURST_RMS * 10.0 ** (above_db / 20.0) * low / low.std()
+    found = active_runs(messages_of(recording(rng, rate_hz, rumble[round(rate_hz) :]), rate_hz))
+    for start_s in BURSTS_S:
+        assert any(0.05 * start <= start_s + 0.06 and start_s < 0.05 * stop for start, stop in found)
+    assert sum(not is_burst(run) for run in found) <= 1
+
+
+def test_a_hum_that_begins_is_one_sound_and_then_background() -> None:
+    rng, rate_hz = np.random.default_rng(5), 16000.0
+    t = np.arange(round(14.0 * rate_hz)) / rate_hz
+    samples = NOISE_RMS * rng.standard_normal((4, len(t))) + 0.03 * np.sin(2 * np.pi * 150.0 * t) * (t >= 2.0)
+    samples += BURST_RMS * rng.standard_normal(len(t)) * ((t >= 10.0) & (t < 10.2))
+    first, *others = active_runs(messages_of(samples.astype(np.float32), rate_hz))
+    assert first[0] * 0.05 == pytest.approx(2.0, abs=0.06)
+    assert first[1] * 0.05 <= 2.0 + 4.0
+    assert [round(0.05 * start, 1) for start, _ in others] == [10.0]
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-4, 1e-2])
+@given(seed=st.integers(0, 1 << 30))
+@settings(max_examples=10)
+def test_without_hum_the_level_is_the_plain_power_in_the_band(level: float, seed: int) -> None:
+    rng, rate_hz = np.random.default_rng(seed), 16000.0
+    background = SteadyBackground(rate_hz, BAND_HZ, 3.0)
+    for _ in range(70):
+        samples = (level * rng.standard_normal((4, 800))).astype(np.float32)
+        spectrum, power = background.spectrum(samples), float(band_power(samples, rate_hz, BAND_HZ).mean())
+        background.learn(spectrum)
+        assert background.changing_power(spectrum, power) == power
+
+
+def test_the_state_of_the_array_names_the_hum() -> None:
+    rng, rate_hz = np.random.default_rng(6), 16000.0
+    t = np.arange(round(LENGTH_S * rate_hz)) / rate_hz
+    messages = messages_of(recording(rng, rate_hz, 0.1 * np.sin(2 * np.pi * 150.0 * t)), rate_hz)
+    health = ArrayHealth(4)
+    for message in messages:
+        if isinstance(message, Mark):
+            health.take_mark(message, 0, is_newest=True)
+        else:
+            health.take_frame(message, BAND_HZ, 0)
+    assert health.hum_marks < HUM_MARKS or health.hum_hz is not None
+    state, reason = health.state(0, age_ns=0, has_left=False, votes=(), clock_offset=None, node=NodeReport())
+    assert state is ArrayState.HEALTHY
+    assert reason is not None
+    assert reason.startswith("steady hum or rumble at -23 dBFS")
+    named = re.search(r"strongest near (\d+) Hz", reason)
+    assert named is not None
+    assert int(named[1]) == pytest.approx(150, abs=5)
+
+
+def test_nothing_is_said_without_hum() -> None:
+    rate_hz = 16000.0
+    health = ArrayHealth(4)
+    for message in messages_of(recording(np.random.default_rng(7), rate_hz, np.zeros(1 << 20)), rate_hz):
+        if isinstance(message, Mark):
+            health.take_mark(message, 0, is_newest=True)
+            assert health.hum_marks < HUM_MARKS
+    state = health.state(0, age_ns=0, has_left=False, votes=(), clock_offset=None, node=NodeReport())
+    assert state == (ArrayState.HEALTHY, None)
