@@ -11,13 +11,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray, RealArray, UInt16Array
+from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
 
-BLOCKS: Final = 512
+BLOCKS: Final = 256
 """Most blocks into which a lag axis is divided for the bounds of the search."""
 
-RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(7) for q in (4, 5, 6, 7)), BLOCKS])
+RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(6) for q in (4, 5, 6, 7)), BLOCKS])
 """Lengths, in blocks, of the runs whose maxima are kept: none is more than a quarter longer than the one before."""
+
+REACHES: Final = np.array([*range(1, 8), *(q << k for k in range(1, 7) for q in (4, 5, 6, 7))])
+"""Lags on either side of a place over which `reaching_maxima` are kept: none is more than a quarter more than the one
+before, and the last is more than the halves of any cell need."""
 
 NO_LAG: Final = 65535
 """Place above every place on a lag axis: the lowest place in a cell without points."""
@@ -115,9 +119,10 @@ class SearchCells(NamedTuple):
     per_cube: int
     """Cells along the edge of a cube."""
     cell_places: UInt16Array
-    """Places for the cells of each of T cubes: (T, site's pairs, per_cube^3)."""
-    leaf_places: UInt16Array
-    """Places for the halves, along each axis, of each cell: (T per_cube^3, site's pairs, 8), or 0 without halves."""
+    """Places for the cells of each cube: (T, site's pairs, per_cube^3)."""
+    reaches: UInt8Array
+    """Index in `REACHES` of the most lags between the middle of a cell and any of its points, and of those between the
+    middle of any half, along each axis, and a point in that half: (2, T, per_cube^3, site's pairs)."""
 
 
 class SearchBounds(NamedTuple):
@@ -129,3 +134,8 @@ class SearchBounds(NamedTuple):
     """Bounds of what the arrays from each on add in the cells of each cube: (T, per_cube^3, A + 1)."""
     known: BoolArray
     """Cubes whose cells' bounds are known: (T,)."""
+    reaching: Float32Array
+    """Maxima of each row over the lags within each of some of the first `REACHES`, one after another, where they are
+    known: (R, any number times L)."""
+    reaching_known: BoolArray
+    """Whether `reaching` is known: (1,)."""

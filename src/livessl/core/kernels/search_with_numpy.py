@@ -80,6 +80,28 @@ def cell_intervals(
             out[:, some] = extreme(split, axis=(3, 5, 7)).reshape(*place.shape[:2], -1)
 
 
+def reaches_of_parts(
+    axes: Axes,
+    corners: IntArray,
+    strides: IntArray,
+    edge: int,
+    part: int,
+    along: int,
+    microphones_m: Float32Array,
+    pairs: IntArray,
+    scale: np.float32,
+    offset: np.float32,
+    reach: UInt16Array,
+) -> None:
+    """Find the most lags between the middle of any part of a cell, `part` points long, and a point in that part.
+
+    The other arguments are those of `cell_intervals`, and `reach` (P, T, along^3) uint16 is the output. On NumPy it is
+    0: there the search examines all points of a cell at once.
+    """
+    del axes, corners, strides, edge, part, along, microphones_m, pairs, scale, offset
+    reach[:] = 0
+
+
 def running_maxima(values: Float32Array, block: IntArray, maxima: Float32Array) -> None:
     """Find the maxima of each row over runs of blocks of lags.
 
@@ -125,28 +147,35 @@ def upper_bounds(maxima: Float32Array, places: UInt16Array, rows: SearchRows, bo
 
 
 def bounds_of_rest(
-    maxima: Float32Array, places: UInt16Array, rows: SearchRows, rounding: np.float32, bound: Float32Array
+    maxima: Float32Array,
+    places: UInt16Array,
+    rows: SearchRows,
+    rounding: np.float32,
+    cubes: IntArray,
+    bound: Float32Array,
 ) -> None:
-    """Bound what the arrays from each on add to the power of the points of some cells.
+    """Bound what the arrays from each on add to the power of the points of the cells of some cubes.
 
     Parameters
     ----------
     maxima : (R, levels * `BLOCKS`) float32
         `running_maxima` of the rows.
-    places : (site's pairs, C) uint16
-        As in `upper_bounds`.
+    places : (T, site's pairs, C) uint16
+        As `SearchCells.cell_places`.
     rows : SearchRows
     rounding : float32
         Largest difference between sums of the same powers of arrays in different orders; every bound includes it.
-    bound : (C, A + 1) float32
-        Output: bounds of the arrays from the first on, from the second on, …, and of none.
+    cubes : (N,) int64
+        Which of the T cubes.
+    bound : (T, C, A + 1) float32
+        Output for these cubes: bounds of the arrays from the first on, from the second on, …, and of none.
     """
-    bound[:, -1] = rounding
+    bound[cubes, :, -1] = rounding
     for a in range(len(rows.weight) - 1, -1, -1):
-        total = np.zeros(len(bound), dtype=np.float32)
+        total = np.zeros((len(cubes), places.shape[2]), dtype=np.float32)
         for r in range(rows.first_row[a], rows.first_row[a + 1]):
-            total += maxima[r, places[rows.site_pair[r]]]
-        bound[:, a] = bound[:, a + 1] + rows.weight[a] * total
+            total += maxima[r, places[cubes, rows.site_pair[r]]]
+        bound[cubes, :, a] = bound[cubes, :, a + 1] + rows.weight[a] * total
 
 
 def highest(
@@ -210,24 +239,21 @@ class _Search:
         self._boxes = boxes
         self._rounding = rounding
         self._shape = tuple(len(axis_m) for axis_m in cells.axes)
-        self._halves = cells.leaf_places.shape[2] > 0
-        self._leaf_edge = cells.edge // 2 if self._halves else cells.edge
         self.best = np.float32(-np.inf)
         self.best_point = int(np.prod(self._shape))
 
     def run(self) -> None:
         """Examine cubes."""
         per_cube, edge = self._cells.per_cube, self._cells.edge
-        of_cubes, of_cells, known = self._bounds
+        of_cubes, of_cells, known, *_ = self._bounds
         inner = _corners(per_cube) * edge
         every = np.arange(len(of_cubes))
         cubes = self._promising(every, self._cells.corners, self._cells.strides, per_cube * edge, of_cubes)
         while (chosen := cubes.take(self.best, self.best_point)) is not None:
             which, first, stride = chosen
-            for cube in which[~known[which]]:
-                places = self._cells.cell_places[cube]
-                bounds_of_rest(self._maxima, places, self._rows, self._rounding, of_cells[cube])
-                known[cube] = True
+            new = which[~known[which]]
+            bounds_of_rest(self._maxima, self._cells.cell_places, self._rows, self._rounding, new, of_cells)
+            known[new] = True
             children = (which[:, None] * per_cube**3 + np.arange(per_cube**3)).ravel()
             firsts = (first[:, None] + inner * stride[:, None, None]).reshape(-1, 3)
             strides = np.repeat(stride, per_cube**3)
@@ -235,17 +261,9 @@ class _Search:
 
     def _examine(self, cells: _InOrder) -> None:
         """Examine all cells that may hold a better point."""
-        halves = _corners(2) * self._leaf_edge
-        inmost = _corners(self._leaf_edge)
-        bound = np.empty((_CELLS_AT_ONCE, 8), dtype=np.float32)
+        inmost = _corners(self._cells.edge)
         while (chosen := cells.take(self.best, self.best_point)) is not None:
-            which, first, stride = chosen
-            if self._halves:
-                for number, cell in enumerate(which):
-                    upper_bounds(self._maxima, self._cells.leaf_places[cell], self._rows, bound[number])
-                left = bound[: len(which)] >= self.best
-                first = (first[:, None] + halves * stride[:, None, None])[left]
-                stride = np.repeat(stride, left.sum(axis=1))
+            _, first, stride = chosen
             at, inside = _points_of(first[:, None], stride[:, None], inmost, self._shape)
             self._compare(at[inside])
 

@@ -13,6 +13,7 @@ from livessl.core.kernels.arguments import SILENT_POWER, OnsetParameters, OnsetS
 from livessl.core.kernels.search_with_numpy import bounds_of_rest as bounds_of_rest
 from livessl.core.kernels.search_with_numpy import cell_intervals as cell_intervals
 from livessl.core.kernels.search_with_numpy import highest as highest
+from livessl.core.kernels.search_with_numpy import reaches_of_parts as reaches_of_parts
 from livessl.core.kernels.search_with_numpy import running_maxima as running_maxima
 from livessl.core.kernels.search_with_numpy import upper_bounds as upper_bounds
 from livessl.core.types import ComplexArray, Float32Array, FloatArray, IntArray, RealArray, UInt16Array

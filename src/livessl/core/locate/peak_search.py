@@ -19,7 +19,7 @@ from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels
-from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, SearchBounds, SearchCells, SearchRows
+from livessl.core.kernels.arguments import BLOCKS, NO_LAG, REACHES, RUNS, SearchBounds, SearchCells, SearchRows
 from livessl.core.locate.refine import FindPeaks, Peak, box_around, laplace_covariance_m2
 from livessl.core.locate.search_cubes import CELLS_PER_CUBE, search_cubes
 from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
@@ -33,12 +33,9 @@ from livessl.core.types import (
     UInt16Array,
 )
 
-MOST_HALVES_BYTES: Final = 64_000_000
-"""Largest tables, in bytes, with which cells are halved along each axis before their points are examined."""
-
-_ROUNDING: Final = 4e-6
-"""Largest difference, relative to the sum of all pairs' greatest values, between sums over at most 16 arrays in
-different orders: four times 16 roundings of 6e-8."""
+_ROUNDING: Final = 8e-6
+"""Largest difference, relative to the sum of all pairs' greatest values, between sums over at most 64 arrays in
+different orders: two times 64 roundings of 6e-8. Where a sum is great, what is negative in it is less."""
 
 _CUBES_AT_ONCE: Final = 512
 """Cubes whose tables are computed at once, to bound the memory of doing so."""
@@ -61,25 +58,25 @@ class PeakSearch:
         self._c_m_s = c_m_s
         x_m, y_m, z_m = (grid.axis_m(axis).astype(np.float32) for axis in range(3))
         self._cubes = cubes = search_cubes(arrays, grid, c_m_s)
+        self._is_thinned = bool(cubes.strides.max() > 1)
         self._specs = {spec.name: spec for spec in arrays}
         self._pairs = {spec.name: microphone_pairs(len(spec.microphones_m)) for spec in arrays}
         counts = [len(pairs) for pairs in self._pairs.values()]
         self._first_row = dict(zip(self._pairs, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
         total, count = sum(counts), len(cubes.corners)
         children = CELLS_PER_CUBE**3
-        self._halves = 2 * 8 * children * count * total <= MOST_HALVES_BYTES
         self._cells = SearchCells(
             axes=(x_m, y_m, z_m),
             corners=cubes.corners,
             strides=cubes.strides,
-            edge=2 * cubes.half,
+            edge=cubes.edge,
             per_cube=CELLS_PER_CUBE,
             cell_places=np.zeros((count, total, children), np.uint16),
-            leaf_places=np.zeros((count * children, total, 8 if self._halves else 0), np.uint16),
+            reaches=np.zeros((2, count, children, total), np.uint8),
         )
         self._cube_places = np.zeros((total, count), np.uint16)
         self._of_cubes, self._known = np.zeros(count, np.float32), np.zeros(count, np.bool_)
-        self._values, self._maxima, self._of_cells = _Buffer(), _Buffer(), _Buffer()
+        self._values, self._maxima, self._reaching, self._of_cells = _Buffer(), _Buffer(), _Buffer(), _Buffer()
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Among] = {}
 
@@ -100,28 +97,25 @@ class PeakSearch:
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
         block, rows = block_lags(len(lags_s)), slice(first, first + len(pairs))
         cells, microphones_m = self._cells, spec.microphones_m.astype(np.float32)
-        along = CELLS_PER_CUBE * (2 if self._halves else 1)
         for begin in range(0, len(cells.corners), _CUBES_AT_ONCE):
             some = slice(begin, begin + _CUBES_AT_ONCE)
             corners = cells.corners[some]
-            low, high = (np.empty((len(pairs), len(corners), along**3), np.uint16) for _ in range(2))
-            kernels.cell_intervals(
-                cells.axes, corners, cells.strides[some], CELLS_PER_CUBE * cells.edge // along, along,
-                microphones_m, pairs.astype(np.int32), places.scale, places.offset, low, high,
-            )  # fmt: skip
-            if self._halves:
-                by_cell = _parts(run_places(np.minimum(low, high), high, block))
-                own = slice(begin * CELLS_PER_CUBE**3, (begin + len(corners)) * CELLS_PER_CUBE**3)
-                cells.leaf_places[own, rows] = by_cell.reshape(len(pairs), -1, 8).swapaxes(0, 1)
-                low, high = _parts(low).min(axis=3), _parts(high).max(axis=3)
-            cells.cell_places[some, rows] = run_places(np.minimum(low, high), high, block).swapaxes(0, 1)
+            low, high, reach = (np.empty((len(pairs), len(corners), CELLS_PER_CUBE**3), np.uint16) for _ in range(3))
+            of_cubes = cells.axes, corners, cells.strides[some], cells.edge
+            of_array = CELLS_PER_CUBE, microphones_m, pairs.astype(np.int32), places.scale, places.offset
+            kernels.cell_intervals(*of_cubes, *of_array, low, high)
+            for number, part in enumerate((cells.edge, (cells.edge + 1) // 2)):
+                kernels.reaches_of_parts(*of_cubes, part, *of_array, reach)
+                cells.reaches[number, some, :, rows] = np.searchsorted(REACHES, reach).transpose(1, 2, 0)
             self._cube_places[rows, some] = run_places(low.min(axis=2), high.max(axis=2), block)
+            low = np.minimum(low, high)  # `NO_LAG` and 0 in a cell without points
+            cells.cell_places[some, rows] = run_places(low, high, block).swapaxes(0, 1)
         self._sets.clear()
 
     @property
     def table_bytes(self) -> int:
         """Memory of the tables of all arrays, in bytes."""
-        return self._cells.cell_places.nbytes + self._cells.leaf_places.nbytes + self._cube_places.nbytes
+        return self._cells.cell_places.nbytes + self._cells.reaches.nbytes + self._cube_places.nbytes
 
     def among(self, evidence: Sequence[Evidence]) -> FindPeaks:
         """Return a function that finds the peaks of some arrays' evidence; it is valid until the next call.
@@ -143,8 +137,14 @@ class PeakSearch:
         kernels.upper_bounds(maxima, self._cube_places, rows, self._of_cubes)
         self._known[:] = False
         of_cells = self._of_cells.of(len(self._known) * CELLS_PER_CUBE**3, len(evidence) + 1)
-        bounds = SearchBounds(self._of_cubes, of_cells.reshape(len(self._known), -1, len(evidence) + 1), self._known)
-        greatest = np.abs(values).max(axis=1)
+        bounds = SearchBounds(
+            self._of_cubes,
+            of_cells.reshape(len(self._known), -1, len(evidence) + 1),
+            self._known,
+            self._reaching.of(len(rows.site_pair), among.reaches * among.lags),
+            np.zeros(1, np.bool_),
+        )
+        greatest = np.abs(maxima[:, :BLOCKS].max(axis=1))
         rounding = np.float32(_ROUNDING * (np.add.reduceat(greatest, rows.first_row[:-1]) @ rows.weight))
 
         def find(count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
@@ -155,12 +155,17 @@ class PeakSearch:
                 point, power = kernels.highest(values, maxima, rows, self._cells, bounds, left_out, rounding)
                 if power == -np.inf:
                     break
-                stride = self._cubes.stride_at(np.array(np.unravel_index(point, self._grid.shape)))
+                stride = self._stride_at(int(point))
                 found.append(Peak(int(point), float(power), stride))
                 boxes.append(box_around(self._grid, int(point), apart_points * stride))
             return found
 
         return find
+
+    def _stride_at(self, point: int) -> int:
+        if not self._is_thinned:
+            return 1
+        return self._cubes.stride_at(np.array(np.unravel_index(point, self._grid.shape)))
 
     def _among(self, arrays: tuple[str, ...]) -> _Among:
         if arrays not in self._sets:
@@ -187,6 +192,7 @@ class PeakSearch:
         return _Among(
             lags=max(one.count for one in places),
             runs=-(-most // BLOCKS) * BLOCKS,
+            reaches=1 + int(self._cells.reaches[:, :, :, site_pair].max()),
             block=np.repeat([block_lags(one.count) for one in places], np.diff(first_row)),
             rows=rows,
         )
@@ -202,6 +208,8 @@ class _Among:
         Lags of the longest row.
     runs : int
         Places among the running maxima of a row that cells may refer to, in whole levels.
+    reaches : int
+        How many of the `REACHES` cells may refer to.
     block : (R,) int64
         Lags in a block of each row.
     rows : SearchRows
@@ -209,6 +217,7 @@ class _Among:
 
     lags: int
     runs: int
+    reaches: int
     block: IntArray
     rows: SearchRows
 
@@ -235,12 +244,6 @@ def run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
     """Place among the running maxima of the shortest run that begins in the block of `low` and holds `high`."""
     first = low // block
     return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
-
-
-def _parts(halves: UInt16Array) -> UInt16Array:
-    """Reorder the halves of cubes' cells (P, T, n^3) cell after cell: (P, T, (n/2)^3, 8)."""
-    split = halves.reshape(*halves.shape[:2], *(n for _ in range(3) for n in (CELLS_PER_CUBE, 2)))
-    return split.transpose(0, 1, 2, 4, 6, 3, 5, 7).reshape(*halves.shape[:2], CELLS_PER_CUBE**3, 8)
 
 
 _PLACE_OF_LENGTH: Final = np.array([BLOCKS * np.searchsorted(RUNS, blocks) for blocks in range(BLOCKS + 1)], np.uint16)

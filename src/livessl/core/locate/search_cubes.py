@@ -48,18 +48,18 @@ class SearchCubes:
         First grid point of each cube along x, y and z.
     strides : (T,) int64
         Distance between neighbouring points of each cube, in grid points.
-    half : int
-        Points along half the edge of a cell.
+    edge : int
+        Points along the edge of a cell.
     """
 
     corners: IntArray
     strides: IntArray
-    half: int
+    edge: int
 
     @property
     def points(self) -> int:
         """Points along the edge of a cube."""
-        return 2 * self.half * CELLS_PER_CUBE
+        return self.edge * CELLS_PER_CUBE
 
     def stride_at(self, point: IntArray) -> int:
         """Return the stride of the cube that holds a point (3,)."""
@@ -72,30 +72,30 @@ def search_cubes(arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> Searc
     """Divide a grid into cubes: with all its points if there are at most `MOST_POINTS`, or else with fewer far away."""
     if grid.size <= MOST_POINTS:
         volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
-        half = max(1, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / 2 / grid.spacing_m))
-        return _divided(arrays, grid, [np.inf] * len(arrays), half)
+        edge = max(2, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / grid.spacing_m))
+        return _divided(arrays, grid, [np.inf] * len(arrays), edge)
     # distance at which the delay changes by a period from one grid point to the next
     period_m = np.array([grid.cell_m.max() * spec.aperture_m * spec.band_hz[1] / c_m_s for spec in arrays])
     periods = FAR_PERIODS
-    cubes = _divided(arrays, grid, period_m / periods, 1)
+    cubes = _divided(arrays, grid, period_m / periods, 2)
     while len(cubes.corners) * cubes.points**3 > MOST_POINTS:
         periods *= _COARSER
-        cubes = _divided(arrays, grid, period_m / periods, 1)
+        cubes = _divided(arrays, grid, period_m / periods, 2)
     while len(cubes.corners) * CELLS_PER_CUBE**3 > MOST_CELLS:
-        cubes = _divided(arrays, grid, period_m / periods, cubes.half + 1)
+        cubes = _divided(arrays, grid, period_m / periods, cubes.edge + 1)
     return cubes
 
 
-def _divided(arrays: Sequence[ArraySpec], grid: Grid, far_m: Sequence[float] | FloatArray, half: int) -> SearchCubes:
+def _divided(arrays: Sequence[ArraySpec], grid: Grid, far_m: Sequence[float] | FloatArray, edge: int) -> SearchCubes:
     """Halve cubes until each has stride 1 or is as many times `far_m` away from every array as its stride."""
     shape, cell_m = np.array(grid.shape), grid.cell_m
-    points = 2 * half * CELLS_PER_CUBE
+    points = edge * CELLS_PER_CUBE
     stride = 1
     if np.isfinite(far_m).all():
         while points * stride < shape.max():
             stride *= 2
-    edge = points * stride
-    corners = np.stack([axis.ravel() for axis in np.indices(-(-shape // edge))], axis=1) * edge
+    extent = points * stride
+    corners = np.stack([axis.ravel() for axis in np.indices(-(-shape // extent))], axis=1) * extent
     kept: list[tuple[IntArray, int]] = []
     while stride > 1 and len(corners):
         low_m = grid.lower_m + corners * cell_m
@@ -114,5 +114,5 @@ def _divided(arrays: Sequence[ArraySpec], grid: Grid, far_m: Sequence[float] | F
     return SearchCubes(
         np.concatenate([some for some, _ in kept]),
         np.repeat([each for _, each in kept], [len(some) for some, _ in kept]),
-        half,
+        edge,
     )
