@@ -9,6 +9,7 @@ import numpy as np
 
 from livessl.core.kernels import kernels
 from livessl.core.types import Float32Array
+from livessl.core.types.arrays import read_only
 
 LEAST_RATE: Final = 2.4
 """Least ratio of the lower sampling rate to the band's upper edge. Between the edge and the frequencies that would be
@@ -67,6 +68,6 @@ def low_pass(factor: int, edge: float) -> Float32Array:
     count = int(np.ceil((STOP_DB - 7.95) / (2.285 * 2.0 * np.pi * (stop - edge)))) | 1
     at = np.arange(count) - count // 2
     taps = np.sinc(at / factor) * np.kaiser(count, 0.1102 * (STOP_DB - 8.7))
-    taps = (taps / taps.sum()).astype(np.float32)
-    taps.flags.writeable = False
-    return taps
+    unity: Float32Array = (taps / taps.sum()).astype(np.float32)
+    read_only(unity)
+    return unity
