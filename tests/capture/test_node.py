@@ -28,6 +28,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
+from livessl.server.inlet import QUEUE_MESSAGES
 from livessl.server.receiver import Item, Joined, Left, Receiver
 from livessl.site.models import Site
 from small_site import HANG_S, RATE_HZ, hiss, mark, site_of, wait_until
@@ -155,7 +156,7 @@ def test_session_is_not_played_faster_than_the_server_takes_messages() -> None:
         played = Thread(target=replay, args=(there, recordings(samples=knocking())))
         played.start()
         wait_until(lambda: there.receiver.ingest.live_nodes(CLOCK.monotonic_ns()), "the node")
-        wait_until(there.receiver._queue.full, "a full queue")  # no message is taken
+        wait_until(lambda: there.receiver.queued >= QUEUE_MESSAGES, "a full queue")  # no message is taken
         assert played.is_alive()
         wait_until(lambda: there.of(Left), "the end")
         played.join()

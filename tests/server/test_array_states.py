@@ -17,6 +17,7 @@ from livessl.server.array_states import REPORT_NS, WATCH_NS, ArrayStates
 from livessl.server.ingest import Ingest
 from livessl.server.overload import Overload
 from livessl.server.run import live_run
+from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Finalized, Store, StoreError
 from small_site import mark, site_of
@@ -46,8 +47,10 @@ class Desk:
         self.published: list[JsonObject] = []
         self.store = Store() if store is None else store
         site_time = SiteTime(self.clock)
+        overload = Overload(self.clock)
+        watch = SetUpWatch(SITE, overload)
         self.states = ArrayStates(
-            SITE, self.clock, self.store, site_time, self.ingest, Overload(self.clock), self.published.append
+            SITE, self.clock, self.store, site_time, self.ingest, overload, watch, self.published.append
         )
         self.fusion = live_run(SITE, Finalized(None, None), for_each).fusion
         self.states.follow(self.fusion)

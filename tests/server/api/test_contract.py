@@ -53,7 +53,7 @@ def test_a_wrong_value_in_a_message_is_found(contract: Contract, monkeypatch: py
 def test_a_wrong_message_is_found_without_subscribers(
     contract: Contract, change: dict[str, object], fault: str
 ) -> None:
-    right = {
+    right: dict[str, object] = {
         "kind": "arrays",
         "now_utc": "2026-01-31T12:00:00Z",
         "mode": "live",

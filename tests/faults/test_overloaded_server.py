@@ -209,7 +209,7 @@ def test_an_overloaded_server_says_so_keeps_up_and_stores_every_event(tmp_path: 
 
             def keeps_up() -> bool:
                 load = health_of(url)["load"]
-                return load["state"] == "overloaded" and load["delay_s"] < 0.5
+                return bool(load["state"] == "overloaded" and load["delay_s"] < 0.5)
 
             wait_until(keeps_up, "five seconds of sound within half a second of its arrival, while work is shed")
             nodes.fall_silent()
