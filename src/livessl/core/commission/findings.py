@@ -115,7 +115,7 @@ def find_faults(
     microphones = {array: at_m for array, at_m in microphones.items() if array in known}
     delays = {array: measured for array, measured in delays.items() if array in known}
     if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
-        findings += _of_site(diagnose(microphones, delays, bounds_m, c_m_s))
+        findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s))
     return sorted(findings, key=lambda one: (list(Severity).index(one.severity), one.array or "", one.channel or 0))
 
 
@@ -208,7 +208,7 @@ def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tupl
     return found
 
 
-def _of_site(diagnosis: Diagnosis) -> Iterator[Finding]:
+def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Yield what the delays say about the order of channels, the poses and the speed of sound."""
     misfit_us = 1e6 * diagnosis.misfit_s
     if diagnosis.best is not None:
@@ -260,6 +260,12 @@ def _words(alternative: Alternative) -> tuple[str, str]:
         return (
             f"the inputs of {array!r} and {alternative.other!r} are exchanged",
             "exchange the plugs of the two arrays, or their channels in the site file (nodes.NAME.arrays)",
+        )
+    if alternative.fault == "height":
+        rise_m = alternative.shift_m[2]
+        return (
+            f"all arrays are {abs(rise_m):.2f} m {'higher' if rise_m > 0.0 else 'lower'} than the site file has them",
+            "measure z of arrays.NAME.position_m again, from the floor of room.size_m",
         )
     if alternative.fault == "late_channel":
         return (
