@@ -74,6 +74,11 @@ COMMANDS: Final = (
         "find what is wrong with a set-up, from recordings of some sounds",
         "livessl doctor --session session/",
     ),
+    Command(
+        "calibrate",
+        "verify a set-up, and measure poses, by claps at places that you know",
+        "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
+    ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
