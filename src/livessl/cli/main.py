@@ -121,7 +121,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="livessl", description="Locate sounds in a room, live.", epilog="example: livessl demo"
     )
-    parser.add_argument("--version", action="version", version=f"livessl {__version__}")
+    parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     chosen = next((word for word in given if not word.startswith("-")), None)
