@@ -12,8 +12,8 @@ from typing import Any
 from small_site import RATE_HZ
 
 COMMANDS = (
-    "demo", "serve", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan", "doctor", "keys",
-    "check", "devices",
+    "demo", "serve", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan", "doctor",
+    "calibrate", "keys",    "check", "devices",
 )  # fmt: skip
 
 

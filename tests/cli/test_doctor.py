@@ -114,7 +114,7 @@ def test_silence_is_examined_too(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ([], "expected --session DIR, --wav ARRAY=FILE for each array, or --url"),
+        ([], "expected --session DIR, or --wav ARRAY=FILE for each array, or --url"),
         (["--wav", "north=n.wav"], "expected --site FILE with --wav"),
         (["--session", "nowhere"], "nowhere"),
     ],

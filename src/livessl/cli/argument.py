@@ -6,6 +6,7 @@ They are passed to argparse as `type`, and raise `ArgumentTypeError` with what w
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,9 @@ from livessl.site import keys as keyring
 from livessl.site.addresses import check_endpoint
 
 T = TypeVar("T")
+
+AXES: Final = 3
+"""Number of coordinates of a place."""
 
 MAX_RT60_S: Final = 5.0
 """Longest reverberation time that is simulated, in seconds.
@@ -84,6 +88,15 @@ def positive(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number >= 1, got {text!r}")
     return int(text)
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """Return a place in the form `x,y,z`, in metres."""
+    parts = text.split(",")
+    if len(parts) != AXES:
+        raise argparse.ArgumentTypeError(f"expected x,y,z in metres, such as 2.5,3,1.2, got {text!r}")
+    x, y, z = (_number(part, math.isfinite, "metres") for part in parts)
+    return x, y, z
 
 
 def count(text: str) -> int:

@@ -48,7 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     examination = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
-        print(json.dumps({"kind": "finding"} | asdict(finding)) if arguments.json else _line(finding), flush=True)
+        print(
+            json.dumps({"kind": "finding"} | asdict(finding)) if arguments.json else finding_line(finding), flush=True
+        )
     if examination.sounds < LEAST_SOUNDS:
         complain(
             f"{_count(examination.sounds)} found: too few to examine poses and the order of channels; record ten, such "
@@ -61,9 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _examine(arguments: argparse.Namespace) -> Examination:
-    site, parts = _given(arguments)
+    site, parts, span = recordings_given(arguments, "doctor", ", or --url")
     print_warnings(site)
-    with progress.timed("examining", *span_ns(parts)) as bar:
+    with progress.timed("examining", *span) as bar:
         return examine_parts(site, parts, bar)
 
 
@@ -94,21 +96,29 @@ def _ask(url: str, token_file: Path | None) -> Examination:
     return Examination(tuple(Finding(**finding) for finding in answer["findings"]), answer["sounds"])
 
 
-def _given(arguments: argparse.Namespace) -> tuple[Site, list[AssignedRecording]]:
+def recordings_given(
+    arguments: argparse.Namespace, command: str, otherwise: str = ""
+) -> tuple[Site, list[AssignedRecording], tuple[int, int | None]]:
+    """Return the site and the recordings that --session, or --site and --wav, name, and their span in nanoseconds."""
     if bool(arguments.session) == bool(arguments.wav):
-        raise UseError("doctor: expected --session DIR, --wav ARRAY=FILE for each array, or --url; give one of them")
+        raise UseError(
+            f"{command}: expected --session DIR, or --wav ARRAY=FILE for each array{otherwise}; give one of them"
+        )
     if arguments.session:
         sessions = [read_session(directory) for directory in arguments.session]
         joint = joints(arguments)
         site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
-        return site, list(assign_sessions(site, sessions))
-    if arguments.site is None:
-        raise UseError("doctor: expected --site FILE with --wav; give the site file that the recordings belong to")
-    site = read_site(arguments)
-    return site, list(assign_files(site, *wavs(arguments)))
+        parts = list(assign_sessions(site, sessions))
+    elif arguments.site is None:
+        raise UseError(f"{command}: expected --site FILE with --wav; give the site file that the recordings belong to")
+    else:
+        site = read_site(arguments)
+        parts = list(assign_files(site, *wavs(arguments)))
+    return site, parts, span_ns(parts)
 
 
-def _line(finding: Finding) -> str:
+def finding_line(finding: Finding) -> str:
+    """Return a finding as a line of text."""
     where = f" (input {finding.input})" if finding.input is not None else ""
     return (
         f"{finding.severity:<8} {finding.fault:<12} {finding.message}{where}; {finding.cure}  "

@@ -74,6 +74,11 @@ COMMANDS: Final = (
         "find what is wrong with a set-up, from recordings of some sounds",
         "livessl doctor --session session/",
     ),
+    Command(
+        "calibrate",
+        "verify a set-up, and measure poses, by claps at places that you know",
+        "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
+    ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
@@ -116,7 +121,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="livessl", description="Locate sounds in a room, live.", epilog="example: livessl demo"
     )
-    parser.add_argument("--version", action="version", version=f"livessl {__version__}")
+    parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     chosen = next((word for word in given if not word.startswith("-")), None)

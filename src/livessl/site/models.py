@@ -111,6 +111,23 @@ class GeometryFile(Model):
     description: str = ""
 
 
+class CalibratedArray(Model):
+    """Measured microphones of one array, and how well they are known."""
+
+    microphones_m: MicrophonesM
+    position_std_m: Annotated[float, Field(ge=0)] = 0.0
+    orientation_std_deg: Annotated[float, Field(ge=0)] = 0.0
+    misfit_us: list[Annotated[float, Field(ge=0)]] = Field(default_factory=list)
+
+
+class CalibrationFile(Model):
+    """A file that `livessl calibrate` writes: it takes the place of the site file's positions of these arrays."""
+
+    measured_utc: str = ""
+    sounds: Annotated[int, Field(ge=0)] = 0
+    arrays: Annotated[dict[str, CalibratedArray], Field(min_length=1)]
+
+
 class Orientation(Model):
     """Angles in degrees: roll about x, then pitch about y, then yaw about z."""
 
@@ -206,6 +223,7 @@ class SiteFile(Model):
     band_hz: BandHz = (100.0, 6000.0)
     grid: GridConfig = GridConfig()
     arrays: Annotated[dict[str, ArrayConfig], Field(min_length=1)]
+    calibration: FileName | None = None
     joint: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(default_factory=dict)
     nodes: dict[str, NodeConfig] = Field(default_factory=dict)
     server: ServerConfig = ServerConfig()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
-from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
 seeds = st.integers(0, 10_000)
 few = settings(deadline=None, max_examples=3)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from set_ups import BOUNDS_M, C_M_S, delays_of, set_up, sources
 
 from livessl.core.commission.places import PlaceSearch
-from livessl.core.commission.poses import Freedom, adjust, from_known_places
+from livessl.core.commission.poses import Freedom, adjust
+from livessl.core.commission.resection import from_known_places, measure_pose
 from livessl.core.types import FloatArray
-from set_ups import BOUNDS_M, C_M_S, delays_of, set_up, sources
 
 few = settings(deadline=None, max_examples=3)
 
@@ -24,18 +26,31 @@ def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> F
 @given(seed=st.integers(0, 10_000))
 def test_eight_claps_at_known_places_give_the_pose_from_anywhere(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    true = {"north": set_up(rng)["north"]}
+    true = set_up(rng)["north"]
     places_m = sources(rng, 8)
-    delays = delays_of(true, places_m, rng)
-    filed = moved(true["north"], rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.5, 3))
-    begin = from_known_places(filed, delays["north"], places_m)
-    assert begin is not None
-    rough = moved(filed, *begin)
+    delays = delays_of({"north": true}, places_m, rng)["north"]
+    filed = moved(true, rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.5, 3))
     known_m = places_m + rng.normal(0.0, 0.01, places_m.shape)
-    found = adjust({"north": rough}, delays, known_m, C_M_S, Freedom({"north": (100.0, 360.0)}), place_std_m=0.01)
-    better = found.poses["north"].applied(rough)
-    assert np.linalg.norm(better.mean(axis=0) - true["north"].mean(axis=0)) < 0.06
-    assert np.abs(better - true["north"]).max() < 0.07
+    found = measure_pose(filed, delays, known_m, C_M_S, 0.01)
+    assert np.abs(found.microphones_m - true).max() < 0.08
+    assert found.is_determined
+    assert found.misfit_s < 15e-6 < found.misfit_before_s
+
+
+def test_claps_in_one_direction_do_not_determine_a_pose() -> None:
+    rng = np.random.default_rng(2)
+    true = set_up(rng)["north"]
+    places_m = true.mean(axis=0) + np.array([3.0, 2.0, 0.0]) * np.linspace(0.8, 1.2, 5)[:, None]
+    delays = delays_of({"north": true}, places_m, rng)["north"]
+    assert not measure_pose(true, delays, places_m, C_M_S, 0.01).is_determined
+
+
+def test_three_claps_are_too_few() -> None:
+    rng = np.random.default_rng(2)
+    true = set_up(rng)["north"]
+    places_m = sources(rng, 3)
+    with pytest.raises(ValueError, match="expected 4 sounds or more at known places, got 3"):
+        measure_pose(true, delays_of({"north": true}, places_m, rng)["north"], places_m, C_M_S, 0.01)
 
 
 @few

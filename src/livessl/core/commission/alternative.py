@@ -30,7 +30,8 @@ class Alternative:
     Parameters
     ----------
     fault : str
-        Code of the fault: swapped, mirrored, exchanged, turned, moved, late_channel, geometry, temperature.
+        Code of the fault: swapped, mirrored, exchanged, turned, moved, height, late_channel, geometry,
+        temperature.
     array : str or None
         The array that is other than filed; None for the whole site.
     other : str or None
@@ -76,8 +77,8 @@ class Alternative:
         """Whether it differs from what is filed by more than a careful set-up may."""
         if self.fault == "turned":
             return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
-        if self.fault in ("moved", "geometry"):
-            least_m = LEAST_SHIFT_M if self.fault == "moved" else LEAST_DISPLACEMENT_M
+        if self.fault in ("moved", "height", "geometry"):
+            least_m = LEAST_DISPLACEMENT_M if self.fault == "geometry" else LEAST_SHIFT_M
             return float(np.linalg.norm(self.shift_m)) >= least_m
         if self.fault == "late_channel":
             return abs(self.late_s) >= LEAST_LATE_S

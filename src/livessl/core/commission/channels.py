@@ -23,6 +23,9 @@ MAINS_HZ: Final = (50.0, 60.0)
 HARMONICS: Final = 6
 """Harmonics of the mains that are looked at."""
 
+MOST_WINDOWS: Final = 120
+"""Windows, the last ones, in which hum is looked for."""
+
 LEAST_LINES: Final = 2
 """Fewest of these that are hum without the first: a single one may be any tone."""
 
@@ -59,7 +62,8 @@ class ChannelMeter:
         self._window = round(_WINDOW_S * sample_rate_hz)
         self._frame = round(_FRAME_S * sample_rate_hz)
         self._hann = np.hanning(self._window)
-        self._spectrum = np.zeros((count, self._window // 2 + 1))
+        self._low_bins = min(self._window // 2 + 1, round((HARMONICS * max(MAINS_HZ) + _BESIDE_HZ[1]) * _WINDOW_S) + 1)
+        self._low: list[FloatArray] = []  # spectrum of each window, up to the highest harmonic
         self._windows = self._samples = 0
         self._sum, self._clipped = np.zeros(count), np.zeros(count, dtype=np.int64)
         self._quiet: list[FloatArray] = []
@@ -80,7 +84,8 @@ class ChannelMeter:
         over = np.abs(window) >= CLIPPED
         self._clipped += (over[:, 1:] & over[:, :-1]).sum(axis=1)
         centred = window - window.mean(axis=1, keepdims=True)
-        self._spectrum += np.abs(np.fft.rfft(centred * self._hann, axis=1)) ** 2
+        spectrum = np.fft.rfft(centred * self._hann, axis=1)[:, : self._low_bins]
+        self._low = [*self._low[1 - MOST_WINDOWS :], np.abs(spectrum) ** 2]
         frames = window[:, : self._window // self._frame * self._frame].reshape(len(window), -1, self._frame)
         powers = (np.diff(frames, axis=2).astype(np.float64) ** 2).mean(axis=2)
         self._quiet.append(np.percentile(powers, _QUIET, axis=1))
@@ -111,7 +116,8 @@ class ChannelMeter:
 
     def _hum_dbfs(self) -> list[tuple[float, float] | None]:
         """Frequency and level of each channel's hum; None where there is none."""
-        spectrum = 2.0 * self._spectrum / (self._windows * self._hann.sum() ** 2)  # power of a sine at each bin
+        # power of a sine at each bin; the median over the windows leaves out voices, which have lines as well
+        spectrum = 4.0 * np.median(self._low, axis=0) / self._hann.sum() ** 2 / 2.0
         found: list[tuple[float, float] | None] = []
         for channel in spectrum:
             best: tuple[float, float] | None = None

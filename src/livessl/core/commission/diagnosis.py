@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from livessl.core.commission.alternative import Alternative
-from livessl.core.commission.places import Delays, Microphones, PlaceSearch
-from livessl.core.commission.trial import FLOOR_S, LEAST_SOUNDS, Trial
+from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
+from livessl.core.commission.trial import LEAST_SOUNDS, Trial
 from livessl.core.types import FloatArray
 
 MIN_GAIN: Final = 12.0
@@ -63,7 +63,7 @@ class Diagnosis:
 
 
 def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float) -> Diagnosis:
-    """Compare the set-up as filed with its alternatives.
+    """Compare the set-up as filed with its alternatives, by sounds at unknown places.
 
     Parameters
     ----------
@@ -77,12 +77,40 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
         Speed of sound as filed, m/s.
     """
     trial = Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
-    if trial.sounds < LEAST_SOUNDS or len(microphones) < 2 or trial.filed.misfit_s <= MIN_RATIO * FLOOR_S:
+    if trial.sounds < LEAST_SOUNDS or len(microphones) < 2:
         return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    tried = (*trial.orders(), *trial.exchanges(), *trial.channels(), *trial.poses(), *trial.speeds())
+    return _compared(trial)
+
+
+def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
+    """Compare the set-up as filed with its alternatives, by sounds at places that somebody measured.
+
+    One array is enough, and one sound shows whether something is wrong; three or four tell what.
+
+    Parameters
+    ----------
+    microphones, delays, c_m_s
+        As in `diagnose`.
+    places_m : (S, 3) float64
+        Where the sounds were made, metres.
+    """
+    return _compared(Trial(microphones, delays, KnownPlaces(places_m, c_m_s)))
+
+
+def _compared(trial: Trial) -> Diagnosis:
+    if trial.filed.misfit_s <= MIN_RATIO * trial.floor_s:
+        return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
+    tried = (
+        *trial.orders(),
+        *trial.exchanges(),
+        *trial.channels(),
+        *trial.poses(),
+        *trial.heights(),
+        *trial.speeds(),
+    )
     rivals = sorted(tried, key=lambda one: one.criterion)
     gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
-    contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, FLOOR_S)
+    contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, trial.floor_s)
     best = rivals[0]
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained

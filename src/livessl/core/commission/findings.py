@@ -101,22 +101,29 @@ def find_faults(
         Speed of sound as the site file has it, m/s.
     """
     findings: list[Finding] = []
-    unusable: dict[str, BoolArray] = {}
     for array, at_m in microphones.items():
         observed = [one for sound in sounds for one in sound if one.array == array]
-        unusable[array] = np.zeros(len(at_m), dtype=bool)
-        for finding in _of_channels(array, at_m, observed):
-            findings.append(finding)
-            if finding.channel is not None and finding.fault in ("dead", "deaf", "duplicate"):
-                unusable[array][finding.channel - 1] = True
-    sharp = [_usable(sound, unusable) for sound in sounds]
-    delays = stacked([sound for sound in sharp if len(sound) > 1], microphones)
-    known = {array for array in microphones if len(delays[array]) and np.isfinite(delays[array]).any()}
-    microphones = {array: at_m for array, at_m in microphones.items() if array in known}
-    delays = {array: measured for array, measured in delays.items() if array in known}
+        findings += _of_channels(array, at_m, observed)
+    delays = sharp_delays(microphones, [sound for sound in sounds if len(sound) > 1], findings)
+    microphones = {array: microphones[array] for array in delays}
     if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
-        findings += _of_site(diagnose(microphones, delays, bounds_m, c_m_s))
+        findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s))
     return sorted(findings, key=lambda one: (list(Severity).index(one.severity), one.array or "", one.channel or 0))
+
+
+def sharp_delays(
+    microphones: Microphones, sounds: Sequence[Sequence[Observation]], findings: Sequence[Finding]
+) -> dict[str, FloatArray]:
+    """Delays (S, K) of each array that clearly received any of the sounds, seconds.
+
+    They are NaN where an array did not clearly receive a sound, and for channels that carry none of their own.
+    """
+    unusable = {array: np.zeros(len(at_m), dtype=bool) for array, at_m in microphones.items()}
+    for finding in findings:
+        if finding.array in unusable and finding.channel is not None and finding.fault in ("dead", "deaf", "duplicate"):
+            unusable[finding.array][finding.channel - 1] = True
+    delays = stacked([_usable(sound, unusable) for sound in sounds], microphones)
+    return {array: measured for array, measured in delays.items() if np.isfinite(measured).any()}
 
 
 def _usable(sound: Sequence[Observation], unusable: Mapping[str, BoolArray]) -> dict[str, FloatArray]:
@@ -208,7 +215,7 @@ def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tupl
     return found
 
 
-def _of_site(diagnosis: Diagnosis) -> Iterator[Finding]:
+def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Yield what the delays say about the order of channels, the poses and the speed of sound."""
     misfit_us = 1e6 * diagnosis.misfit_s
     if diagnosis.best is not None:
@@ -260,6 +267,12 @@ def _words(alternative: Alternative) -> tuple[str, str]:
         return (
             f"the inputs of {array!r} and {alternative.other!r} are exchanged",
             "exchange the plugs of the two arrays, or their channels in the site file (nodes.NAME.arrays)",
+        )
+    if alternative.fault == "height":
+        rise_m = alternative.shift_m[2]
+        return (
+            f"all arrays are {abs(rise_m):.2f} m {'higher' if rise_m > 0.0 else 'lower'} than the site file has them",
+            "measure z of arrays.NAME.position_m again, from the floor of room.size_m",
         )
     if alternative.fault == "late_channel":
         return (

@@ -144,6 +144,43 @@ class PlaceSearch:
         return Places(positions_m, np.sqrt(cost / degrees_of_freedom(delays)))
 
 
+class KnownPlaces(PlaceSearch):
+    """The places of sounds that were made where somebody measured: they are not searched for.
+
+    Parameters
+    ----------
+    places_m : (S, 3) float64
+        Metres.
+    c_m_s : float
+        Speed of sound, m/s.
+    """
+
+    def __init__(self, places_m: FloatArray, c_m_s: float) -> None:
+        super().__init__(np.column_stack([places_m.min(axis=0), places_m.max(axis=0)]), c_m_s)
+        self._points_m = np.asarray(places_m, dtype=np.float64)
+
+    def costs(self, table_s: FloatArray, delays_s: FloatArray) -> FloatArray:
+        """Squared contradiction of delays (S, K) at one array with the place of each sound, (S, 1)."""
+        off_s = centred(np.where(np.isfinite(delays_s), table_s.T, np.nan)) - centred(delays_s)
+        return np.asarray((off_s**2).sum(axis=1, keepdims=True))
+
+    def at_lowest(self, costs: FloatArray) -> FloatArray:  # noqa: ARG002 - places are known
+        """The places (S, 3), metres."""
+        return self._points_m.copy()
+
+    def refine(
+        self,
+        microphones: Microphones,
+        delays: Delays,
+        starts_m: FloatArray,  # noqa: ARG002 - places are known
+        c_m_s: float | None = None,
+    ) -> Places:
+        """The places, and how far the delays are from them."""
+        off, _ = _residuals(microphones, delays, self._points_m, self.c_m_s if c_m_s is None else c_m_s)
+        count = np.sum([np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in delays.values()], axis=0)
+        return Places(self._points_m, np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1)))
+
+
 def _residuals(
     microphones: Microphones, delays: Delays, positions_m: FloatArray, c_m_s: float
 ) -> tuple[FloatArray, FloatArray]:

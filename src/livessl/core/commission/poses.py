@@ -86,7 +86,7 @@ class Pose:
 
     def applied(self, microphones_m: FloatArray) -> FloatArray:
         """Positions (K, 3) of the microphones after the turn and the shift, metres."""
-        return _moved(microphones_m, self.shift_m, np.radians(self.turn_deg))
+        return moved(microphones_m, self.shift_m, np.radians(self.turn_deg))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,54 +150,6 @@ def adjust(
         max_nfev=_MOST_STEPS,
     )
     return problem.result(solved.x, np.asarray(solved.jac))
-
-
-def from_known_places(
-    microphones_m: FloatArray, delays_s: FloatArray, places_m: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Find a rough pose of one array from sounds at known places: where to begin an adjustment.
-
-    Each sound's delays give its direction in the array's own frame. A position is tried at each point of a grid around
-    the places; the turn that takes the directions to those towards the places is Wahba's problem.
-
-    Parameters
-    ----------
-    microphones_m : (K, 3) float64
-        Metres.
-    delays_s : (S, K) float64
-        Seconds.
-    places_m : (S, 3) float64
-        Metres.
-
-    Returns
-    -------
-    (3,) float64 and (3,) float64, or None
-        Shift of the array's centre in metres, and turn about it as a vector in radians. None if fewer than two sounds
-        have a direction, or the array is a line or a plane, whose delays have none.
-    """
-    centre_m = microphones_m.mean(axis=0)
-    arms_m = microphones_m - centre_m
-    there = np.isfinite(delays_s).all(axis=1)
-    if there.sum() < 2 or np.linalg.matrix_rank(arms_m, tol=0.01) < 3:
-        return None
-    slowness, *_ = np.linalg.lstsq(arms_m, -centred(delays_s[there]).T, rcond=None)
-    directions = (slowness / np.maximum(np.linalg.norm(slowness, axis=0), 1e-12)).T
-    low, high = places_m.min(axis=0) - 6.0, places_m.max(axis=0) + 6.0
-    best: tuple[float, FloatArray, FloatArray] | None = None
-    for step_m in (1.0, 0.25):
-        if best is not None:
-            low, high = best[1] - 1.0, best[1] + 1.0
-        axes = [np.arange(a, b + step_m / 2.0, step_m) for a, b in zip(low, high, strict=True)]
-        for at_m in np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3):
-            towards = places_m[there] - at_m
-            away_m = np.linalg.norm(towards, axis=1, keepdims=True)
-            if away_m.min() < 0.1:
-                continue
-            turn, rssd = Rotation.align_vectors(towards / away_m, directions)
-            if best is None or rssd < best[0]:
-                best = float(rssd), at_m, turn.as_rotvec()
-    assert best is not None
-    return best[1] - centre_m, best[2]
 
 
 class _Problem:
@@ -290,7 +242,7 @@ class _Problem:
 
     def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, FloatArray]:
         return {
-            name: _moved(self._microphones[name], *poses[name]) if name in poses else self._microphones[name]
+            name: moved(self._microphones[name], *poses[name]) if name in poses else self._microphones[name]
             for name in self._measured
         }
 
@@ -305,7 +257,7 @@ class _Problem:
         return np.concatenate(parts, axis=1)
 
 
-def _moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
+def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
     """Positions after a turn (a vector, radians) about their centre and a shift, metres."""
     centre_m = microphones_m.mean(axis=0)
     return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.alternative import LEAST_SHIFT_M, LEAST_TURN_DEG, Alternative
-from livessl.core.commission.places import Delays, Microphones, Places, PlaceSearch, degrees_of_freedom
-from livessl.core.commission.poses import DELAY_STD_S, Adjusted, Freedom, adjust
+from livessl.core.commission.places import Delays, KnownPlaces, Microphones, Places, PlaceSearch, degrees_of_freedom
+from livessl.core.commission.poses import DELAY_STD_S, UNKNOWN_M, Adjusted, Freedom, adjust
 from livessl.core.types import FloatArray, IntArray
 
 ALL_ORDERS: Final = 4
@@ -31,6 +31,17 @@ FLOOR_S: Final = 12e-6
 """Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
 to 2 cm and 1.5 degrees. A smaller one is no reason to prefer an alternative."""
 
+KNOWN_FLOOR_S: Final = 20e-6
+"""The same for sounds at places that somebody measured: to some centimetres, which turn the direction by a degree or
+two."""
+
+PLACE_STD_M: Final = 0.03
+"""Standard deviation of such places along each axis, metres."""
+
+MOST_RISE_M: Final = 1.5
+RISE_STEP_M: Final = 0.02
+"""Heights of all arrays that are tried against those filed, metres."""
+
 _TURNED: Final = (0.02, 180.0)
 _MOVED: Final = (1.0, 1.5)
 _SPEED_STD_M_S: Final = 20.0
@@ -47,9 +58,12 @@ class Trial:
     delays : mapping of array to (S, K) float64
         Seconds.
     search : PlaceSearch
+        `KnownPlaces` if somebody measured the places of the sounds.
     """
 
     def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
+        self._is_known = isinstance(search, KnownPlaces)
+        self.floor_s = KNOWN_FLOOR_S if self._is_known else FLOOR_S
         self._microphones, self._delays, self._search = microphones, delays, search
         self.sounds = len(next(iter(delays.values())))
         self._tables = {name: search.table_s(at_m) for name, at_m in microphones.items()}
@@ -59,7 +73,7 @@ class Trial:
 
     def criterion(self, places: Places, unknowns: float) -> float:
         """Bayesian information criterion of a set-up with so many unknowns more than that which is filed."""
-        misfit_s = np.hypot(places.misfit_s, FLOOR_S / 3.0)
+        misfit_s = np.hypot(places.misfit_s, self.floor_s / 3.0)
         return float(self._free * np.log(misfit_s**2) + unknowns * np.log(self._free))
 
     def orders(self) -> Iterator[Alternative]:
@@ -174,6 +188,20 @@ class Trial:
             shift_m=tuple(float(part) for part in pose.shift_m),
         )
 
+    def heights(self) -> Iterator[Alternative]:
+        """Yield all arrays higher or lower, which only sounds at known places can show."""
+        if not self._is_known:
+            return
+        best: tuple[Places, float] | None = None
+        for rise_m in np.arange(-MOST_RISE_M, MOST_RISE_M + RISE_STEP_M / 2.0, RISE_STEP_M):
+            microphones = {name: at_m + np.array([0.0, 0.0, rise_m]) for name, at_m in self._microphones.items()}
+            places = self._search.refine(microphones, self._delays, self.filed.positions_m)
+            if best is None or places.misfit_s < best[0].misfit_s:
+                best = places, float(rise_m)
+        assert best is not None
+        places, rise_m = best
+        yield Alternative("height", None, places.misfit_s, self.criterion(places, 1.0), shift_m=(0.0, 0.0, rise_m))
+
     def speeds(self) -> Iterator[Alternative]:
         """Yield the speed of sound that the sounds say best."""
         adjusted = self._adjusted(self._microphones, self.filed.positions_m, Freedom({}, speed_std_m_s=_SPEED_STD_M_S))
@@ -199,7 +227,8 @@ class Trial:
         return self._adjusted(microphones, places.positions_m, Freedom({name: _TURNED})), best[1]
 
     def _adjusted(self, microphones: Microphones, places_m: FloatArray, freedom: Freedom) -> Adjusted:
-        return adjust(microphones, self._delays, places_m, self._search.c_m_s, freedom)
+        std_m = PLACE_STD_M if self._is_known else UNKNOWN_M
+        return adjust(microphones, self._delays, places_m, self._search.c_m_s, freedom, std_m)
 
     def _placed(self, name: str, adjusted: Adjusted, turn: Rotation) -> Places:
         centre_m = self._microphones[name].mean(axis=0)

@@ -15,6 +15,7 @@ from livessl.core.commission.observe import observe
 from livessl.core.geometry import direction_deg
 from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
+from livessl.core.locate.map_estimator import MapEstimator
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
 from livessl.core.stream.site_state import SiteState
@@ -120,11 +121,11 @@ class Verdicts:
         few = why if len(received.sounds) < least else None
         first = self._refused(event, excerpt, now_ns, _joined(few, faults))
         if len(used.sounds) < least:
-            return Verdict([first], None)
+            return Verdict([replace(first, observations=self._observations(None, received, faults))], None)
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
-        observations = () if self._state.relief.shed else _observations(found, used)
+        observations = self._observations(found, received, faults)
         first = replace(first, status=status, reason=_joined(reason, faults) or None, observations=observations)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
@@ -143,6 +144,21 @@ class Verdicts:
             for source, other in enumerate(self._others(found, used), 2)
         )
         return Verdict([first, *others], found)
+
+    def _observations(
+        self, found: Localization | None, received: Excerpt, faulty: Iterable[str]
+    ) -> tuple[Observation, ...]:
+        """Return what the channels of each array received, also of those that were not used; none under overload."""
+        estimator = self._state.estimator
+        if self._state.relief.shed:
+            return ()
+        evidence = [] if found is None else list(found.evidence)
+        if isinstance(estimator, MapEstimator):
+            known = {part.spec.name for part in evidence}
+            missing = faulty if found is not None else received.sounds
+            evidence += estimator.evidence({name: received.sounds[name] for name in missing if name not in known})
+        observed = (observe(part, received.sounds[part.spec.name].segments) for part in evidence)
+        return tuple(one for one in observed if one is not None)
 
     def _channel_faults(self, event: PendingEvent, excerpt: Excerpt) -> dict[str, str]:
         """Return the faults, in words, of those arrays of an excerpt whose channels are faulty."""
@@ -226,12 +242,6 @@ def _estimate(found: Localization, excerpt: Excerpt) -> Estimate:
 
 def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in arrays if name not in (found.outliers or ()) and name not in found.unneeded)
-
-
-def _observations(found: Localization, excerpt: Excerpt) -> tuple[Observation, ...]:
-    """Return what the channels of each array received; arrays without an exact delay are left out."""
-    observed = (observe(part, excerpt.sounds[part.spec.name].segments) for part in found.evidence)
-    return tuple(one for one in observed if one is not None)
 
 
 def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from livessl.core.geometry import as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
 from livessl.core.joint_array import joined
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.errors import ConfigError, Fault
 from livessl.site.findings import dotted, read_yaml, reason, unknown_array, validation_findings
-from livessl.site.models import ArrayConfig, GeometryFile, Orientation, Shape, Site, SiteFile
+from livessl.site.models import ArrayConfig, CalibrationFile, GeometryFile, Orientation, Shape, Site, SiteFile
 from livessl.site.place import Finding, Place
+
+Read = TypeVar("Read", bound=BaseModel)
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 """Speed of sound in m/s where the site file gives neither speed nor temperature: that of air at 20 degrees Celsius."""
@@ -48,10 +50,12 @@ def _speed_of_sound_m_s(file: SiteFile) -> float:
 
 def _array_specs(file: SiteFile, directory: Path) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
     specs: list[ArraySpec] = []
-    faults: list[Finding] = []
+    measured, faults = _measured_m(file, directory)
     for name, array in file.arrays.items():
         try:
             positions = _microphones_m(array, directory)
+            if name in measured:
+                positions = _replaced(name, positions, measured[name])
         except ConfigError as error:
             faults.append((("arrays", name, "geometry"), "; ".join(str(fault) for fault in error.faults)))
             continue
@@ -119,6 +123,28 @@ def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
     return posed(shape_m, array.position_m, turn.yaw, turn.pitch, turn.roll)
 
 
+def _measured_m(file: SiteFile, directory: Path) -> tuple[dict[str, FloatArray], list[Finding]]:
+    """Return the positions (K, 3) of the microphones that the calibration file holds, metres."""
+    if file.calibration is None:
+        return {}, []
+    try:
+        calibrated = _read_model(CalibrationFile, directory / file.calibration, "calibration file")
+    except ConfigError as error:
+        return {}, [(("calibration",), str(fault)) for fault in error.faults]
+    strangers = [
+        (("calibration",), unknown_array(name, file.arrays)) for name in calibrated.arrays.keys() - file.arrays
+    ]
+    return {name: as_positions_m(array.microphones_m) for name, array in calibrated.arrays.items()}, strangers
+
+
+def _replaced(name: str, filed_m: FloatArray, measured_m: FloatArray) -> FloatArray:
+    """Return the measured positions after checking that there are as many."""
+    if len(filed_m) != len(measured_m):
+        what = f"expected {len(filed_m)} microphones in the calibration file, got {len(measured_m)}; calibrate again"
+        raise ConfigError([Fault(f"arrays.{name}", what)])
+    return measured_m
+
+
 def _shape_m(shape: Shape) -> FloatArray:
     """Return positions (K, 3) around the shape's own origin, metres."""
     if shape.tetrahedron is not None:
@@ -130,10 +156,14 @@ def _shape_m(shape: Shape) -> FloatArray:
 
 
 def _geometry_file(path: Path) -> GeometryFile:
+    return _read_model(GeometryFile, path, "geometry file")
+
+
+def _read_model(model: type[Read], path: Path, what: str) -> Read:
     try:
-        return GeometryFile.model_validate(read_yaml(path.read_text(encoding="utf-8")))
+        return model.model_validate(read_yaml(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError([Fault(str(path), f"geometry file cannot be read: {reason(error)}")]) from error
+        raise ConfigError([Fault(str(path), f"{what} cannot be read: {reason(error)}")]) from error
     except ValidationError as error:
-        findings = validation_findings(GeometryFile, error.errors())
-        raise ConfigError([Fault(f"{path}: {dotted(place)}", what) for place, what in findings]) from error
+        findings = validation_findings(model, error.errors())
+        raise ConfigError([Fault(f"{path}: {dotted(place)}", said) for place, said in findings]) from error

@@ -1,0 +1,162 @@
+"""`livessl calibrate`: claps at known places verify a set-up, and measure the poses of its arrays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import yaml
+
+from cli.command_runs import Recorded, Run
+from livessl.cli.main import main
+from livessl.site.load import load_site
+from small_site import RATE_HZ, write_site, write_wav
+
+TURN_DEG = 25.0
+
+
+@pytest.fixture(scope="module")
+def claps(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Eight sounds in the small room; no test changes them."""
+    directory = tmp_path_factory.mktemp("claps")
+    site = write_site(tmp_path_factory.mktemp("site"))
+    options = f"--rt60 0.2 --count 8 --sample-rate {RATE_HZ} --seed 4".split()
+    assert main(["simulate", "--site", str(site), "--out", str(directory), *options]) == 0
+    return Recorded(directory, site)
+
+
+def places(recorded: Recorded, count: int = 8) -> list[str]:
+    """Options that say where the sounds were made."""
+    truth = [json.loads(line) for line in (recorded.directory / "truth.jsonl").read_text().splitlines()]
+    return [f"--at={','.join(str(x) for x in source['position_m'])}" for source in truth[:count]]
+
+
+def test_a_right_set_up_is_verified_with_the_error_of_each_clap(run: Run, claps: Recorded) -> None:
+    done = run("calibrate", "verify", "--session", claps.directory, *places(claps), "--json")
+    assert (done.code, done.err) == (0, "")
+    assert [one["kind"] for one in done.objects] == ["clap"] * 8
+    assert all(one["error_m"] < 0.15 for one in done.objects)
+    lines = run("calibrate", "verify", "--session", claps.directory, *places(claps)).out.splitlines()
+    assert len(lines) == 8
+    assert all("m off" in line for line in lines)
+
+
+def test_four_claps_name_a_swap(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    first = [json.loads(line)["start_s"] for line in (claps.directory / "truth.jsonl").read_text().splitlines()][4]
+    wavs = []
+    for name in ("north", "south"):
+        samples, _ = soundfile.read(claps.directory / f"{name}.wav", dtype="float32", always_2d=True)
+        four = samples.T[:, : round((first - 0.2) * RATE_HZ)]
+        wavs += [
+            "--wav",
+            f"{name}={write_wav(tmp_path / f'{name}.wav', four[[1, 0, 2, 3]] if name == 'north' else four)}",
+        ]
+    done = run("calibrate", "verify", "--site", claps.site, *wavs, *places(claps, 4), "--json")
+    assert done.code == 1
+    (finding,) = [one for one in done.objects if one["kind"] == "finding"]
+    assert (finding["fault"], finding["array"]) == ("swapped", "north")
+    assert "channels 1 and 2 of 'north' are swapped" in finding["message"]
+
+
+def test_arrays_that_are_all_too_low_are_named(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    site = write_site(
+        tmp_path, {"arrays.north.position_m": [1.9, 1.3, 0.9], "arrays.south.position_m": [2.2, 3.8, 1.0]}
+    )
+    done = run("calibrate", "verify", "--site", site, "--session", claps.directory, *places(claps), "--json")
+    (finding,) = [one for one in done.objects if one["kind"] == "finding"]
+    assert (done.code, finding["fault"], finding["array"]) == (1, "height", None)
+    assert "0.50 m higher than the site file" in finding["message"]
+
+
+def turned_site(directory: Path) -> Path:
+    """The small site with an array that is filed with a wrong yaw and place."""
+    return write_site(
+        directory,
+        {"arrays.south.orientation_deg": {"yaw": TURN_DEG}, "arrays.south.position_m": [2.35, 3.7, 1.55]},
+    )
+
+
+def test_measured_poses_mend_a_wrong_site_file(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    site, written = turned_site(tmp_path), tmp_path / "calibration" / "lab.yaml"
+    session = ["--site", site, "--session", claps.directory, *places(claps)]
+    wrong = run("calibrate", "verify", *session, "--json")
+    assert wrong.code == 1
+    done = run("calibrate", "poses", *session, "--place-std", "0.01", "--write", written, "--json")
+    assert done.code == 0
+    assert "name it in the site file as calibration: FILE" in done.err
+    poses = {one["array"]: one for one in done.objects}
+    assert poses["south"]["turn_deg"] == pytest.approx([0.0, 0.0, -TURN_DEG], abs=2.0)
+    assert poses["south"]["misfit_us"][1] < 20.0 < poses["south"]["misfit_us"][0]
+    assert np.linalg.norm(poses["north"]["shift_m"]) < 0.06
+
+    calibrated = yaml.safe_load(site.read_text()) | {"calibration": "calibration/lab.yaml"}
+    site.write_text(yaml.safe_dump(calibrated), encoding="utf-8")
+    true = load_site(claps.site).array("south").microphones_m
+    assert np.abs(load_site(site).array("south").microphones_m - true).max() < 0.06
+    right = run("calibrate", "verify", *session, "--json")
+    assert right.code == 0
+    errors = [one["error_m"] for one in right.objects if one["kind"] == "clap"]
+    assert np.median(errors) < 0.1
+
+
+def test_a_calibration_file_is_put_back(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    written = tmp_path / "lab.yaml"
+    written.write_text("arrays: {}\n")
+    session = ["--session", claps.directory, *places(claps)]
+    assert run("calibrate", "poses", *session, "--write", written).code == 0
+    assert "microphones_m" in written.read_text()
+    assert run("calibrate", "poses", *session, "--write", written, "--undo").code == 0
+    assert written.read_text() == "arrays: {}\n"
+    again = run("calibrate", "poses", *session, "--write", written, "--undo")
+    assert again.code == 2
+    assert "there is none" in again.err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("arrays: {south: {microphones_m: [[0, 0, 0], [1, 1, 1]]}}", "expected 4 microphones in the calibration file"),
+        ("arrays: {east: {microphones_m: [[0, 0, 0], [1, 1, 1]]}}", "east"),
+        ("arrays: 3", "arrays"),
+        (None, "cannot be read"),
+    ],
+)
+def test_a_calibration_file_that_does_not_fit_is_told(
+    run: Run, tmp_path: Path, content: str | None, words: str
+) -> None:
+    if content is not None:
+        (tmp_path / "lab.yaml").write_text(content, encoding="utf-8")
+    done = run("check", write_site(tmp_path, {"calibration": "lab.yaml"}))
+    assert done.code == 2
+    assert words in done.err + done.out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--at", "1,2"], "expected x,y,z in metres"),
+        (["--at", "1,2,3"], "expected --session DIR, or --wav ARRAY=FILE for each array"),
+        (["--at", "1,2,x"], "expected metres"),
+    ],
+)
+def test_wrong_use_is_told(run: Run, options: list[str], words: str) -> None:
+    done = run("calibrate", "verify", *options)
+    assert done.code == 2
+    assert words in done.err
+
+
+def test_more_places_than_sounds_are_told(run: Run, claps: Recorded) -> None:
+    done = run("calibrate", "verify", "--session", claps.directory, *places(claps), "--at=1,1,1")
+    assert done.code == 1
+    assert "expected 9 sounds, one at each place in this order, got 8" in done.err
+
+
+def test_three_claps_do_not_measure_a_pose(run: Run, recorded: Recorded) -> None:
+    truth = [json.loads(line) for line in (recorded.directory / "truth.jsonl").read_text().splitlines()]
+    at = [f"--at={','.join(str(x) for x in source['position_m'])}" for source in truth]
+    done = run("calibrate", "poses", "--session", recorded.directory, *at)
+    assert done.code == 1
+    assert "expected 4 claps or more" in done.err
