@@ -221,6 +221,16 @@ def test_one_sound_examined_twice_is_counted_once() -> None:
     assert faults.of("north") is None
 
 
+def test_a_pair_of_opposite_polarity_is_named_after_two_sounds() -> None:
+    rng = np.random.default_rng(3)
+    spec = ArraySpec("north", shape(4, 0.2).microphones_m[:2].copy(), BAND_HZ)
+    faults = ChannelFaults(["north"])
+    assert faults.examine("north", 1, onsets_of(spec, [1, -1], rng)) is None
+    fault = faults.examine("north", 2, onsets_of(spec, [1, -1], rng))
+    assert fault is not None
+    assert fault.startswith("channel 2 and channel 1 have opposite polarity")
+
+
 def test_polarity_recovers_when_the_channel_is_turned_back() -> None:
     rng, spec = np.random.default_rng(2), shape(5, 0.2)
     faults = ChannelFaults(["north"])

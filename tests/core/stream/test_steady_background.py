@@ -114,7 +114,7 @@ def test_a_hum_that_begins_is_one_sound_and_then_background() -> None:
 @settings(max_examples=10)
 def test_without_hum_the_level_is_the_plain_power_in_the_band(level: float, seed: int) -> None:
     rng, rate_hz = np.random.default_rng(seed), 16000.0
-    background = SteadyBackground(rate_hz, BAND_HZ, 3.0)
+    background = SteadyBackground(rate_hz, BAND_HZ, 3.0, 0.95)
     for _ in range(70):
         samples = (level * rng.standard_normal((4, 800))).astype(np.float32)
         spectrum, power = background.spectrum(samples), float(band_power(samples, rate_hz, BAND_HZ).mean())
@@ -151,3 +151,15 @@ def test_nothing_is_said_without_hum() -> None:
             assert health.hum_marks < HUM_MARKS
     state = health.state(0, age_ns=0, has_left=False, votes=(), clock_offset=None, node=NodeReport())
     assert state == (ArrayState.HEALTHY, None)
+
+
+def test_a_tail_stays_a_tail_when_a_hum_is_recognized_meanwhile() -> None:
+    """What remains 18 dB below a loud sound, soon after it, is its reverberation, whatever is learned in between."""
+    rng, rate_hz = np.random.default_rng(8), 16000.0
+    t = np.arange(round(5.0 * rate_hz)) / rate_hz
+    hum = 0.01 * np.sin(2 * np.pi * 120.0 * t) * np.where(t < 0.5, 0.0, 1.0)
+    loud = 0.05 * rng.standard_normal(len(t)) * ((t >= 0.6) & (t < 3.0))
+    tail = 0.005 * rng.standard_normal(len(t)) * ((t >= 3.4) & (t < 3.7))
+    samples = NOISE_RMS * rng.standard_normal((4, len(t))) + hum + loud + tail
+    found = active_runs(messages_of(samples.astype(np.float32), rate_hz))
+    assert not any(start * 0.05 >= 3.2 for start, _ in found)

@@ -78,6 +78,11 @@ class ActivityParameters:
         """Number of quiet frames kept after the last active one."""
         return round(self.hang_over_s / FRAME_S)
 
+    @property
+    def keep(self) -> float:
+        """Factor by which the maximum decays from frame to frame."""
+        return float(np.exp(-FRAME_S / self.release_s))
+
     def least_power(self, floor_power: float) -> float:
         """Return the least power, full scale squared, at which a frame can be active over a background."""
         return max(self.floor_factor * floor_power, self.min_power)
@@ -88,7 +93,7 @@ class CausalActivity:
 
     def __init__(self, parameters: ActivityParameters) -> None:
         self._parameters = parameters
-        self._keep = float(np.exp(-FRAME_S / parameters.release_s))
+        self._keep = parameters.keep
         self._maximum = 0.0
         self._latest: deque[float] = deque(maxlen=_FLOOR_SMOOTHING)
         self._smoothed: deque[float] = deque(maxlen=max(1, round(parameters.floor_window_s / FRAME_S)))
@@ -102,9 +107,12 @@ class CausalActivity:
         """Start from a known background, full scale squared."""
         self._smoothed.append(floor_power)
 
-    def restart(self, floor_power: float) -> None:
-        """Start over from a known background, full scale squared, because part of the power is no longer counted."""
-        self._maximum = 0.0
+    def restart(self, floor_power: float, maximum: float) -> None:
+        """Start over, because part of the power is no longer counted, from a background and a decaying maximum.
+
+        Both are what is left of them, full scale squared.
+        """
+        self._maximum = min(self._maximum, maximum)
         self._latest.clear()
         self._smoothed.clear()
         self.prime(floor_power)

@@ -49,7 +49,11 @@ COHERENT: Final = 0.3
 
 INVERTED_SOUNDS: Final = 2
 """Number of sounds, of the last `SIGNED_SOUNDS`, with the same signs after which channels are reported as inverted. A
-single such sound is located without the array."""
+single such sound is located without an array of `LEAST_SIGNS` channels."""
+
+LEAST_SIGNS: Final = 3
+"""Least number of channels of an array that a single sound is located without: a single pair has nothing to check its
+sign by, and reflections of one real clap of 240 gave the wrong one."""
 
 SIGNED_SOUNDS: Final = 5
 """Number of last sounds of which the signs are kept."""
@@ -202,7 +206,8 @@ class ChannelFaults:
             while len(known.signs) > SIGNED_SOUNDS:
                 del known.signs[next(iter(known.signs))]
             self._word(array)
-        return self.of(array) or (None if signs is None or min(signs) > 0 else _inverted(signs))
+        is_clear = signs is not None and min(signs) < 0 and len(signs) >= LEAST_SIGNS
+        return self.of(array) or (_inverted(signs) if signs is not None and is_clear else None)
 
     # --- words
 
@@ -307,7 +312,8 @@ def _inverted(signs: Sequence[int]) -> str:
     cure = "exchange the two signal wires of a plug (pins 2 and 3 of an XLR), or invert the channel in the device"
     if 2 * len(negative) == len(signs):
         positive = [channel for channel, sign in enumerate(signs) if sign > 0]
-        return f"channels {_listed(positive)}, and {_listed(negative)}, have opposite polarity; {cure}"
+        channels = "channels" if len(negative) > 1 else "channel"
+        return f"{channels} {_listed(negative)} and {channels} {_listed(positive)} have opposite polarity; {cure}"
     channels, be = ("channel", "is") if len(negative) == 1 else ("channels", "are")
     return f"{channels} {_listed(negative)} {be} inverted against the others; {cure}"
 

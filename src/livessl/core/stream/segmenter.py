@@ -55,7 +55,7 @@ class Segmenter:
         self._channels = channels
         self._rate_hz = sample_rate_hz
         self._activity = CausalActivity(parameters)
-        self._background = SteadyBackground(sample_rate_hz, spec.band_hz, parameters.floor_window_s)
+        self._background = SteadyBackground(sample_rate_hz, spec.band_hz, parameters.floor_window_s, parameters.keep)
         self._hang_over = parameters.hang_over_frames
         self._warm_up: list[tuple[Cut, FloatArray, FloatArray]] | None = []
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=parameters.pre_roll_frames)
@@ -84,7 +84,7 @@ class Segmenter:
         if self._warm_up is None:
             level = self._background.changing_power(spectrum, mean)
             if level < NEW_HUM * before:
-                self._activity.restart(level)
+                self._activity.restart(level, self._background.changing_maximum)
             return self._decide(cut, power, level, framer)
         self._warm_up.append((cut, power, spectrum))
         return self.flush(framer) if len(self._warm_up) >= WARM_UP_FRAMES else []

@@ -22,9 +22,10 @@ LOUD: Final = 30.0
 """Ratio of a bin's background to the median over the band, 15 dB, above which it is loud. A tone that fills three of
 300 bins must be about so far above the others to double the level."""
 
-EXCESS: Final = 16.0
-"""Ratio of a frame's power to its usual power, 12 dB, above which sound counts in a loud bin. A bin of rumble exceeds
-its mean by so much in one of ten million frames."""
+EXCESS: Final = 25.0
+"""Ratio of a frame's power to the usual power, 14 dB, above which sound counts in a loud bin. The usual power is the
+least mean of half a second, for rumble 0.6 of the mean; a bin of rumble exceeds it by so much in one of three million
+frames."""
 
 BEYOND: Final = 1.25
 """Ratio to the band's upper edge of the highest frequency at which a tone may leak into the band."""
@@ -48,9 +49,12 @@ class SteadyBackground:
     band_hz : (float, float)
     window_s : float
         Length of the window whose least power is the background.
+    keep : float
+        Factor by which the maximum of the level decays from frame to frame.
     """
 
-    def __init__(self, sample_rate_hz: float, band_hz: tuple[float, float], window_s: float) -> None:
+    def __init__(self, sample_rate_hz: float, band_hz: tuple[float, float], window_s: float, keep: float) -> None:
+        self._keep = keep
         self._count = round(FRAME_S * sample_rate_hz)
         window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(self._count) / self._count)
         self._window = window.astype(np.float32)
@@ -66,6 +70,7 @@ class SteadyBackground:
         self._frames = 0
         self._loud: BoolArray = np.zeros(bins, dtype=np.bool_)
         self._usual: FloatArray = np.zeros(bins)
+        self._maximum: FloatArray = np.zeros(bins)
 
     def spectrum(self, samples: Float32Array) -> FloatArray:
         """Return the power of a frame (K, n) in each bin, mean over the channels, full scale squared: (F,)."""
@@ -75,6 +80,7 @@ class SteadyBackground:
 
     def learn(self, spectrum: FloatArray) -> None:
         """Take in the spectrum of the next frame."""
+        self._maximum = np.maximum(self._keep * self._maximum, spectrum)
         self._latest.append(spectrum)
         if len(self._latest) < _SMOOTHING:
             return
@@ -91,9 +97,17 @@ class SteadyBackground:
             self._blocks.append(self._least)
             self._means.append(self._sum / _BLOCK)
             self._least = self._sum = None
-            self._usual = np.asarray(np.median(self._means, axis=0))
+            self._usual = np.minimum.reduce(list(self._means))
         elif not self._means:
             self._usual = self._sum / self._frames
+
+    @property
+    def changing_maximum(self) -> float:
+        """Decaying maximum of the level, full scale squared, without what is loud and steady now.
+
+        It is the sum of the bins' maxima, and so an upper bound.
+        """
+        return self.changing_power(self._maximum, np.inf)
 
     def changing_power(self, spectrum: FloatArray, power: float) -> float:
         """Return the power of a frame in the band without what is loud and steady.
