@@ -157,7 +157,8 @@ class _Pairs:
             values = sign * self._values[pair]
             inner = values[1:-1]
             tops = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0.0)) + 1
-            self._tops[pair, sign] = self._first_s + self._step_s * tops[np.argsort(-values[tops])[:PEAKS]]
+            highest = tops[np.argsort(-values[tops])[:PEAKS]]
+            self._tops[pair, sign] = np.asarray(self._first_s + self._step_s * highest, dtype=np.float64)
         return self._tops[pair, sign]
 
     def _at(self, values: FloatArray, lags_s: FloatArray) -> FloatArray:
