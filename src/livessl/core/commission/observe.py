@@ -16,10 +16,10 @@ import numpy as np
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.types import Evidence, Float32Array, FloatArray, IntArray, Observation
 
-PEAKS: Final = 4
+PEAKS: Final = 3
 """Peaks of each pair, up and down, that are tried as its delay: reverberation and tones have several."""
 
-BEAM: Final = 24
+BEAM: Final = 8
 """Most partial solutions that are kept while one microphone after the other is added."""
 
 NEAR_STEPS: Final = 4
@@ -53,9 +53,11 @@ def observe(evidence: Evidence, segments: Iterable[Float32Array]) -> Observation
     pairs = _Pairs(evidence)
     if len(pairs.live) < 2:
         return None
-    upright = pairs.best(signs=(1.0,))
-    free = pairs.best(signs=(1.0, -1.0))
-    return pairs.observation(free if free.score > INVERSION * upright.score else upright, _powers(segments))
+    found = pairs.best(signs=(1.0, -1.0))
+    if min(found.signs) < 0.0:
+        upright = pairs.best(signs=(1.0,))
+        found = found if found.score > INVERSION * upright.score else upright
+    return pairs.observation(found, _powers(segments))
 
 
 def _powers(segments: Iterable[Float32Array]) -> FloatArray:
@@ -84,7 +86,9 @@ class _Pairs:
         self._count = len(evidence.spec.microphones_m)
         self._first_s, self._step_s = float(gcc.lags_s[0]), float(gcc.lags_s[1] - gcc.lags_s[0])
         self._lags = len(gcc.lags_s)
+        self._steps = np.arange(self._lags)
         self._values: dict[tuple[int, int], FloatArray] = {}
+        self._tops: dict[tuple[tuple[int, int], float], FloatArray] = {}
         heard = np.zeros(self._count, dtype=bool)
         for (i, k), values in zip(gcc.pairs, gcc.values, strict=True):
             if values.any():
@@ -131,39 +135,36 @@ class _Pairs:
 
     def _grown(self, one: _Partial, placed: int, k: int, signs: tuple[float, ...]) -> list[_Partial]:
         """Return the partial solutions with one more microphone, at each peak of its pairs with those placed."""
-        pairs = [
-            (place, values)
-            for place in range(placed)
-            if (values := self._between(int(self.live[place]), k)) is not None
-        ]
+        pairs = [(place, pair) for place in range(placed) if (pair := (int(self.live[place]), k)) in self._values]
         if not pairs:
             return [_Partial((*one.delays_s, 0.0), (*one.signs, 1.0), one.score)]
         grown = []
         for sign in signs:
-            turned = [(one.delays_s[place], sign * one.signs[place] * values) for place, values in pairs]
-            tried_s = np.unique([from_s + lag_s for from_s, values in turned for lag_s in self._peaks(values)])
-            scores = sum((self._at(values, tried_s - from_s) for from_s, values in turned), np.zeros(len(tried_s)))
+            turned = [(one.delays_s[place], sign * one.signs[place], pair) for place, pair in pairs]
+            tried_s = np.unique(np.concatenate([from_s + self._peaks(pair, turn) for from_s, turn, pair in turned]))
+            scores = np.zeros(len(tried_s))
+            for from_s, turn, pair in turned:
+                scores += turn * self._at(self._values[pair], tried_s - from_s)
             grown += [
-                _Partial((*one.delays_s, float(tried)), (*one.signs, sign), one.score + float(score))
-                for tried, score in zip(tried_s, scores, strict=True)
+                _Partial((*one.delays_s, tried), (*one.signs, sign), one.score + score)
+                for tried, score in zip(tried_s.tolist(), scores.tolist(), strict=True)
             ]
         return grown
 
-    def _between(self, i: int, k: int) -> FloatArray | None:
-        """Correlation of microphones i and k, which are in ascending order in `live`; positive lag: k hears later."""
-        return self._values.get((i, k))
-
-    def _peaks(self, values: FloatArray) -> list[float]:
-        """Return the lags of the highest local maxima, seconds."""
-        inner = values[1:-1]
-        tops = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0.0)) + 1
-        highest = tops[np.argsort(-values[tops])[:PEAKS]]
-        return [self._first_s + self._step_s * float(top) for top in highest]
+    def _peaks(self, pair: tuple[int, int], sign: float) -> FloatArray:
+        """Return the lags of the highest local maxima of a pair, or of its lowest minima if the sign is -1, seconds."""
+        if (pair, sign) not in self._tops:
+            values = sign * self._values[pair]
+            inner = values[1:-1]
+            tops = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0.0)) + 1
+            highest = tops[np.argsort(-values[tops])[:PEAKS]]
+            self._tops[pair, sign] = np.asarray(self._first_s + self._step_s * highest, dtype=np.float64)
+        return self._tops[pair, sign]
 
     def _at(self, values: FloatArray, lags_s: FloatArray) -> FloatArray:
         """Interpolated correlation at lags; 0 outside the axis."""
         places = (lags_s - self._first_s) / self._step_s
-        return np.interp(places, np.arange(self._lags), values, left=0.0, right=0.0)
+        return np.interp(places, self._steps, values, left=0.0, right=0.0)
 
     def _peak_near(self, values: FloatArray, lag_s: float) -> tuple[float, float]:
         """Lag and height of the highest point near a lag, between the steps by a parabola."""
