@@ -3,8 +3,7 @@
     python benchmarks/exactness.py --out docs/performance
 
 Two to eight arrays, a voice, two voices and noise, grids of 0.1 and 0.05 m; the maps are those of
-the compiled mapper, the search may look up as much as it needs. How many searches the shipped limit gives up is told
-beside.
+the compiled mapper.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import machine
 from livessl.cli.progress import counted
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.kernels import kernels
-from livessl.core.locate.peak_search import MOST_LOOK_UPS, PeakSearch
+from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import Evidence, Float32Array
 from livessl.lab.bench.kernels import C_M_S, KINDS, PLACES_M, RATE_HZ, Blocks, array_specs
@@ -32,8 +31,6 @@ COUNTS: Final = (2, 3, 4, 6, 8)
 SPACINGS_M: Final = (0.1, 0.05)
 SOUNDS: Final = 6
 """Of each kind: with all else 180 maps."""
-
-UNBOUNDED: Final = sys.maxsize
 
 
 def compare(
@@ -47,8 +44,7 @@ def compare(
     Returns
     -------
     list of dict
-        For each case the number of `maps`, the number on which the search found the `same` grid point and value, the
-        number of searches `given_up` at the default limit, and the number of these with the right grid point.
+        For each case the number of `maps`, and the number on which the search found the `same` grid point and value.
     """
     specs = array_specs(max(counts))
     blocks = Blocks(specs)
@@ -68,15 +64,10 @@ def compare(
                 ]
                 maps = [mapper(one.gcc) for mapper, one in zip(mappers, heard, strict=True)]
                 for count, point, value in _peaks(maps, counts):
-                    (free,) = search.among(heard[:count], UNBOUNDED)(1)
-                    (limited,) = search.among(heard[:count])(1)
-                    case = cases.setdefault(
-                        (spacing_m, count, kind), {"maps": 0, "same": 0, "given_up": 0, "right_all_the_same": 0}
-                    )
+                    (found,) = search.among(heard[:count])(1)
+                    case = cases.setdefault((spacing_m, count, kind), {"maps": 0, "same": 0})
                     case["maps"] += 1
-                    case["same"] += (free.point, free.power, free.proven) == (point, value, True)
-                    case["given_up"] += not limited.proven
-                    case["right_all_the_same"] += not limited.proven and limited.point == point
+                    case["same"] += (found.point, found.power) == (point, value)
                 progress(done := done + 1, total)
     names = ("spacing_m", "arrays", "kind")
     return [dict(zip(names, key, strict=True)) | found for key, found in cases.items()]
@@ -101,26 +92,24 @@ def main() -> int:
     about = machine.describe()
     with threadpool_limits(limits=1), counted("maps", "sound") as show:
         cases = compare(sounds=arguments.sounds, progress=show)
-    maps, same, given_up = (sum(case[name] for case in cases) for name in ("maps", "same", "given_up"))
+    maps, same = (sum(case[name] for case in cases) for name in ("maps", "same"))
     report = {
         "machine": about,
         "kernels": kernels.NAME,
         "maps": maps,
         "same": same,
-        "given_up": given_up,
-        "most_look_ups": MOST_LOOK_UPS,
         "most_arrays": len(PLACES_M),
         "cases": cases,
     }
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "exactness.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     for case in cases:
-        if case["given_up"] or case["same"] < case["maps"]:
+        if case["same"] < case["maps"]:
             print(
-                f"{case['spacing_m']:g} m, {case['arrays']} arrays, {case['kind']}: {case['same']} of "
-                f"{case['maps']} the same; the default limit gives up {case['given_up']}"
+                f"{case['spacing_m']:g} m, {case['arrays']} arrays, {case['kind']}: "
+                f"{case['same']} of {case['maps']} the same"
             )
-    print(f"{same} of {maps} maps: the search finds the same point and value; the default limit gives up {given_up}")
+    print(f"{same} of {maps} maps: the search finds the same point and value")
     return 0 if same == maps else 1
 
 

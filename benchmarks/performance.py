@@ -292,21 +292,8 @@ def _exactness(exact: Json) -> Iterator[str]:
     yield ""
     yield _paragraph(
         f"{exact['same']} of {exact['maps']} maps: 2 to {exact['most_arrays']} arrays, a voice, two voices and noise,",
-        "grids of 0.1 and 0.05 m; here the search has no limit. With its default limit it gives up after",
-        f"{exact['most_look_ups'] / 1e6:g} million look-ups and reports it, which happened on {exact['given_up']} of",
-        "these maps.",
+        "grids of 0.1 and 0.05 m.",
     )
-    given_up = [case for case in exact["cases"] if case["given_up"]]
-    if given_up:
-        yield ""
-        yield from _table(
-            ("grid", "arrays", "sound", "given up", "right nevertheless"),
-            (
-                (f"{case['spacing_m']:g} m", str(case["arrays"]), case["kind"],
-                 f"{case['given_up']} of {case['maps']}", str(case["right_all_the_same"]))
-                for case in given_up
-            ),
-        )  # fmt: skip
 
 
 def _kernels(measured: Json) -> Iterator[str]:
@@ -333,16 +320,14 @@ def _searches(peers: Json) -> Iterator[str]:
     yield "## The search"
     yield ""
     yield _paragraph(
-        f"From GCCs to the highest grid point: median / 95 % of {peers['search_rounds']} rounds, in ms. A star marks",
-        "rows in which some searches gave up at the limit.",
+        f"From GCCs to the highest grid point: median / 95 % of {peers['search_rounds']} rounds, in ms.",
     )
     yield ""
     kinds = list(dict.fromkeys(row["kind"] for row in peers["searches"]))
     rows: dict[tuple[str, str, str], list[str]] = {}
     for row in peers["searches"]:
         key = (f"{row['spacing_m']:g} m", str(row["arrays"]), row["length"])
-        star = " \\*" if row["given_up"] else ""
-        rows.setdefault(key, []).append(f"{_number(row['median_ms'])} / {_number(row['p95_ms'])}{star}")
+        rows.setdefault(key, []).append(f"{_number(row['median_ms'])} / {_number(row['p95_ms'])}")
     yield from _table(("grid", "arrays", "sound of", *kinds), ((*key, *cells) for key, cells in rows.items()))
 
 

@@ -148,11 +148,6 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
         r"outside the room \(4, 5, 3\) m; give metres, not millimetres",
     ),
     "array under the floor": ({f"{ARRAY}.position_m": [1.0, 1.3, -0.5]}, ARRAY, "microphone 1 .* outside the room"),
-    "grid too fine": (
-        {"grid.spacing_m": 0.01},
-        "grid.spacing_m",
-        r"expected at most 50,000,000 grid points, got 60,000,000; use a spacing of 0.011 m or more",
-    ),
     "grid inside out": (
         {"grid.bounds_m": [[0, 4], [5, 0], [0, 3]]},
         "grid.bounds_m",
@@ -370,24 +365,12 @@ def test_duplicate_key_names_the_second() -> None:
     assert faults[f"site.yaml:{last}: room"] == "expected each key once, got it twice; remove one"
 
 
-def test_suggested_spacing_is_accepted() -> None:
-    changes: Changes = {"grid.spacing_m": 0.004}
-    [(_, said)] = faults_of(text_of(changes))
-    suggested = re.search(r"use a spacing of ([0-9.]+) m", said)
-    assert suggested is not None
-    spacing_m = float(suggested[1])
-    site_of(changes | {"grid.spacing_m": spacing_m})
-    # it is not needlessly coarse: half of it has eight times the grid points
-    faults_of(text_of(changes | {"grid.spacing_m": spacing_m / 2}))
-
-
 def test_several_faults_are_reported_at_once() -> None:
     changes: Changes = {
         "colour": "red",
         f"{ARRAY}.position_m": [9.0, 1.3, 1.4],
         "arrays.south.geometry.tetrahedron.edge_m": 0.0005,
         f"{NODE}.server": "nowhere",
-        "grid.spacing_m": 0.001,
         "fusion.method": "music",
         "server.http.port": -1,
     }
@@ -397,7 +380,6 @@ def test_several_faults_are_reported_at_once() -> None:
         ARRAY,
         "arrays.south",
         f"{NODE}.server",
-        "grid.spacing_m",
         "fusion.method",
         "server.http.port",
     }

@@ -187,7 +187,7 @@ class Grid:
 
     def points_m(self, which: slice = slice(None)) -> FloatArray:
         """Points (G, 3), metres, all or some, z fastest: point g is at `numpy.unravel_index(g, shape)`."""
-        cells = np.unravel_index(np.arange(self.size)[which], self.shape)
+        cells = np.unravel_index(np.arange(*which.indices(self.size)), self.shape)
         return np.stack([self.axis_m(axis)[cell] for axis, cell in enumerate(cells)], axis=1)
 
     def point_m(self, index: int) -> FloatArray:

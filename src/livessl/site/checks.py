@@ -33,9 +33,6 @@ HOT_C: Final = 50.0
 TALL_M: Final = 100.0
 """Shortest edge of a room, in metres, from which centimetres are more likely."""
 
-MAX_GRID_POINTS: Final = 50_000_000
-"""Most points of a grid. The search could handle more, but a grid point takes some tens of ns when an array joins."""
-
 SAMPLED_GRID_POINTS: Final = 500
 """Approximate number of grid points at which `_wide_arrays` compares the grid with an array: enough for a median."""
 
@@ -67,7 +64,6 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         joint = next((name for name, members in site.joint.items() if {one.name, other.name} <= {*members}), None)
         here: Place = ("arrays", other.name) if joint is None else ("joint", joint)
         yield from ((here, what) for what in _coincident(one, other))
-    yield from _grid_faults(site)
     yield from _node_faults(site)
 
 
@@ -148,17 +144,6 @@ def _coincident(one: ArraySpec, other: ArraySpec) -> Iterator[str]:
         yield (
             f"microphone {i + 1} of {one.name!r} and microphone {k + 1} of {other.name!r} are at one place "
             f"{_xyz(one.microphones_m[i])}; correct one of them"
-        )
-
-
-def _grid_faults(site: Site) -> Iterator[Finding]:
-    grid = search_grid(site)
-    if grid.size > MAX_GRID_POINTS:
-        fits = site.grid.spacing_m * (grid.size / MAX_GRID_POINTS) ** (1 / max(1, len(grid.free_axes)))
-        yield (
-            ("grid", "spacing_m"),
-            f"expected at most {MAX_GRID_POINTS:,} grid points, got {grid.size:,}; use a spacing of "
-            f"{np.ceil(fits * 1000) / 1000:g} m or more, or smaller bounds_m",
         )
 
 

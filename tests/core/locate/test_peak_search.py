@@ -7,16 +7,19 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, ideal_gcc, tetra, true_lags_s
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.geometry import Grid
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.kernels.arguments import BLOCKS, RUNS
-from livessl.core.locate import peak_search, refine, srp
+from livessl.core.kernels.search_with_numpy import lag_places
+from livessl.core.locate import peak_search, refine, search_cubes, srp
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPMapper
-from livessl.core.types import ArraySpec, Evidence, Float32Array
+from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 
 ROOM = ((0.0, 4.2), (0.0, 5.1), (0.0, 2.7))
 KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="NumPy")]
@@ -160,16 +163,92 @@ def test_arrays_of_different_rates_and_subsets_of_arrays(kernels: ModuleType) ->
         assert [found.point, found.power] == [int(power.argmax()), float(power.max())]
 
 
-def test_memory_does_not_grow_with_the_grid() -> None:
-    specs = arrays(2, 2)
-    coarse, fine = (PeakSearch(specs, Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), s), C_M_S) for s in (0.05, 0.01))
-    assert coarse.table_bytes == fine.table_bytes
-    hall = PeakSearch(specs, Grid(((0.0, 60.0), (0.0, 80.0), (0.0, 20.0)), 0.5), C_M_S)
+@pytest.mark.parametrize(
+    ("size_m", "spacing_m"), [((8.0, 10.0, 4.0), 0.01), ((60.0, 80.0, 20.0), 0.1), ((1000.0, 1000.0, 30.0), 0.05)]
+)
+def test_memory_is_bounded_whatever_the_grid(size_m: tuple[float, float, float], spacing_m: float) -> None:
+    specs = [tetra("a", np.array([2.0, 3.0, 1.0])), tetra("b", np.array([6.0, 7.0, 2.0]))]
+    searched = PeakSearch(specs, box(size_m, spacing_m), C_M_S)
     pairs = sum(len(spec.microphones_m) * (len(spec.microphones_m) - 1) // 2 for spec in specs)
-    bytes_per_cell = (
-        2 * pairs * (1 + 8 + 1 / 64)
-    )  # a place of 16 bits for the cell, for its halves and its cube's share
-    assert hall.table_bytes < 2 * peak_search.MOST_CELLS * bytes_per_cell
+    bytes_per_cell = pairs * (2 + 2 + 2 / 64)  # a place and two reaches of a cell, and its cube's share
+    assert searched.table_bytes < 1.2 * search_cubes.MOST_CELLS * bytes_per_cell
+
+
+def box(size_m: tuple[float, float, float], spacing_m: float) -> Grid:
+    x_m, y_m, z_m = size_m
+    return Grid(((0.0, x_m), (0.0, y_m), (0.0, z_m)), spacing_m)
+
+
+def far_apart(size_m: tuple[float, float, float], seed: int) -> tuple[Grid, list[ArraySpec], FloatArray]:
+    """A large volume with three arrays, and a source 1 m above the ground."""
+    rng = np.random.default_rng(seed)
+    edge_m = np.array(size_m)
+    specs = [tetra(name, rng.uniform(0.1, 0.9, 3) * edge_m) for name in "abc"]
+    source_m = np.array([*rng.uniform(0.1, 0.9, 2) * edge_m[:2], 1.0])
+    return box(size_m, 0.1), specs, source_m
+
+
+@settings(max_examples=4, deadline=None)
+@given(
+    size_m=st.tuples(st.floats(100.0, 400.0), st.floats(100.0, 400.0), st.floats(2.0, 12.0)), seed=st.integers(0, 99)
+)
+def test_a_source_in_a_yard_is_found(size_m: tuple[float, float, float], seed: int) -> None:
+    grid, specs, source_m = far_apart(size_m, seed)
+    evidence = [Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, source_m))) for spec in specs]
+    found = searching(evidence, grid).among(evidence)(3)
+    position_m, _ = refine.refine_peaks(srp.SRPFunctional(evidence, C_M_S), found, grid)
+    nearest_m = min(float(np.linalg.norm(spec.centre_m - source_m)) for spec in specs)
+    assert np.linalg.norm(position_m - source_m) < 0.05 + 1e-3 * nearest_m
+
+
+def test_noise_in_a_yard_is_searched_to_the_end() -> None:
+    """Cells beside an array span nearly all of its lags, at a rate at which there are a thousand of them."""
+    rate_hz = 48e3
+    grid, specs, _ = far_apart((120.0, 90.0, 8.0), 3)
+    rng = np.random.default_rng(3)
+    evidence = []
+    for spec in specs:
+        samples = rng.standard_normal((len(spec.microphones_m), 4096)).astype(np.float32)
+        evidence.append(Evidence(spec, GCCPhat(spec, rate_hz, C_M_S)([samples])))
+    found = searching(evidence, grid).among(evidence)(2)
+    at_m = np.stack([grid.point_m(peak.point) for peak in found])
+    power = srp.SRPFunctional(evidence, C_M_S).value(at_m)
+    np.testing.assert_allclose(power, [peak.power for peak in found], atol=0.05)
+    some_m = rng.uniform(0.0, 1.0, (20_000, 3)) * (120.0, 90.0, 8.0)
+    assert srp.SRPFunctional(evidence, C_M_S).value(some_m).max() < found[0].power + 0.05
+
+
+def test_the_peak_in_a_yard_is_the_highest_of_the_points_examined(
+    kernels: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With fewer points a whole yard can be compared; more than one stride takes part."""
+    monkeypatch.setattr(search_cubes, "MOST_POINTS", 60_000)
+    for seed in range(3):
+        grid, specs, _ = far_apart((60.0, 43.0, 5.3), seed)
+        evidence = sounds(specs, "noise", seed)
+        cubes = search_cubes.search_cubes(specs, grid, C_M_S)
+        assert len(np.unique(cubes.strides)) > 2
+        inner = np.stack(np.unravel_index(np.arange(cubes.points**3), (cubes.points,) * 3), axis=1)
+        begin = (cubes.corners[:, None] + inner * cubes.strides[:, None, None]).reshape(-1, 3)
+        stride = np.repeat(cubes.strides, len(inner))[:, None]
+        inside = (begin < grid.shape).all(axis=1)
+        at = np.minimum(begin + stride // 2, np.array(grid.shape) - 1)[inside]
+        points = np.unique(np.ravel_multi_index(tuple(at.T), grid.shape))
+        points_m = np.stack([grid.axis_m(axis)[at] for axis, at in enumerate(np.unravel_index(points, grid.shape))], 1)
+        power = np.zeros(len(points), np.float32)
+        for part in evidence:
+            on_axis = srp.LagPlaces.on(part.gcc.lags_s, C_M_S)
+            microphones_m = part.spec.microphones_m.astype(np.float32)
+            places = lag_places(
+                points_m.astype(np.float32), microphones_m, part.gcc.pairs, on_axis.scale, on_axis.offset
+            )
+            total = np.zeros(len(points), np.float32)
+            for row, place in zip(part.gcc.values, places, strict=True):
+                total += row[place]
+            power += np.float32(srp.pair_weight(len(microphones_m))) * total
+        (found,) = searching(evidence, grid).among(evidence)(1)
+        assert (found.point, found.power) == (points[power.argmax()], power.max())
+        assert found.stride in cubes.strides
 
 
 def test_more_lags_than_sixteen_bits_can_count_are_an_error() -> None:

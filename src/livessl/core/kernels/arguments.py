@@ -1,8 +1,9 @@
 """Groups of arguments that kernels take by name, and the constants that kernels share.
 
 In all kernels L is the number of lags, P of an array's pairs, A of arrays, M of their microphones together, R of rows
-(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest. Of a cube with stride s
-only the points `corner + n s + s // 2` along each axis are examined, n = 0, 1, …; at the grid's end it is the last one.
+(all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest. Of a cube
+with stride s only the points `corner + n s + s // 2` along each axis are examined, n = 0, 1, …; where such a point lies
+beyond the grid's end, the last point is examined instead.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ BLOCKS: Final = 256
 RUNS: Final = np.array([1, 2, 3, *(q << k for k in range(6) for q in (4, 5, 6, 7)), BLOCKS])
 """Lengths, in blocks, of the runs whose maxima are kept: none is more than a quarter longer than the one before."""
 
-REACHES: Final = np.array([*range(1, 8), *(q << k for k in range(1, 7) for q in (4, 5, 6, 7))])
+REACHES: Final = np.array([*range(1, 8), *(q << k for k in range(1, 15) for q in (4, 5, 6, 7))])
 """Lags on either side of a place over which `reaching_maxima` are kept: none is more than a quarter more than the one
-before, and the last is more than the halves of any cell need."""
+before, and the last is longer than any lag axis."""
 
 NO_LAG: Final = 65535
 """Place above every place on a lag axis: the lowest place in a cell without points."""

@@ -323,7 +323,7 @@ def _points_of(
 ) -> tuple[IntArray, BoolArray]:
     """Points of cells that begin at `first` (..., 3), and which of them are inside the grid."""
     begin = first + inner * stride[..., None]
-    return np.minimum(begin + stride[..., None] // 2, np.array(shape) - 1), (begin < shape).all(axis=-1)
+    return np.minimum(begin + stride[..., None] // 2, np.array(shape) - 1), np.all(begin < shape, axis=-1)
 
 
 def _corners(count: int) -> IntArray:

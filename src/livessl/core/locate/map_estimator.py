@@ -19,6 +19,10 @@ from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 MAP_SPACING_M: Final = 0.1
 """Finest spacing of maps that are drawn, in metres; a screen shows no finer detail of a room."""
 
+MAP_POINTS: Final = 1_000_000
+"""Most points of a map that is drawn: more than a screen has for one, and ten maps a second of that size can be drawn.
+A room of 8 x 10 x 4 m has a third as many at 0.1 m; a yard of 400 x 400 x 10 m is drawn at 1.2 m."""
+
 MAP_BYTES: Final = 128_000_000
 """Most memory for the look-up tables of all arrays' maps, in bytes."""
 
@@ -130,11 +134,11 @@ class MapEstimator(ABC):
 def map_grid(arrays: Sequence[ArraySpec], grid: Grid) -> Grid:
     """Return the grid on which maps are drawn: `grid`, or a coarser one if `grid` is finer than `MAP_SPACING_M`.
 
-    The spacing grows further until the look-up tables take at most `MAP_BYTES`.
+    The spacing grows further until there are at most `MAP_POINTS` and the look-up tables take at most `MAP_BYTES`.
     """
     pairs = sum(len(microphone_pairs(len(spec.microphones_m))) for spec in arrays)
     drawn = grid if grid.spacing_m >= MAP_SPACING_M else Grid(grid.bounds_m, MAP_SPACING_M)
-    while 2 * pairs * drawn.size > MAP_BYTES:
+    while drawn.size > MAP_POINTS or 2 * pairs * drawn.size > MAP_BYTES:
         drawn = Grid(grid.bounds_m, 1.1 * drawn.spacing_m)
     return drawn
 

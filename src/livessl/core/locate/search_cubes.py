@@ -95,7 +95,7 @@ def _divided(arrays: Sequence[ArraySpec], grid: Grid, far_m: Sequence[float] | F
         while points * stride < shape.max():
             stride *= 2
     extent = points * stride
-    corners = np.stack([axis.ravel() for axis in np.indices(-(-shape // extent))], axis=1) * extent
+    corners = np.stack([axis.ravel() for axis in np.indices(tuple(-(-shape // extent)))], axis=1) * extent
     kept: list[tuple[IntArray, int]] = []
     while stride > 1 and len(corners):
         low_m = grid.lower_m + corners * cell_m
