@@ -35,7 +35,7 @@ def as_16_bits(samples: Float32Array) -> Float32Array:
 
 def after_quiet(faults: ChannelFaults, frames: Sequence[Float32Array], array: str = "north") -> str | None:
     for index, samples in enumerate(frames):
-        faults.take(framed(array, index, samples))
+        faults.take(framed(array, index, samples, active=index >= QUIET_FRAMES))
     return faults.of(array)
 
 
@@ -47,12 +47,12 @@ def after_quiet(faults: ChannelFaults, frames: Sequence[Float32Array], array: st
     level=st.floats(1e-4, 0.1),
     hum=st.sampled_from([0.0, 0.1]),
 )
-def test_copies_are_named_from_the_background_alone(
+def test_copies_are_named_as_the_first_sound_begins(
     seed: int, taken: list[int], gain: float, level: float, hum: float
 ) -> None:
     rng = np.random.default_rng(seed)
     frames = []
-    for index in range(QUIET_FRAMES):
+    for index in range(QUIET_FRAMES + SHARED_FRAMES):
         t = (index * FRAME + np.arange(FRAME)) / RATE_HZ
         inputs = hiss(rng, 6, level) + hum * np.sin(2.0 * np.pi * 50.0 * t)
         samples = inputs[taken]
@@ -106,7 +106,8 @@ def test_copies_in_digital_silence_are_named_after_a_few_sounds() -> None:
     rng = np.random.default_rng(3)
     for index in range(3):
         assert faults.of("north") is None
-        faults.take(framed("north", 20 * index, hiss(rng, 4)[[0, 1, 0, 1]], active=True))
+        for frame_index in (20 * index, 20 * index + 1):
+            faults.take(framed("north", frame_index, hiss(rng, 4)[[0, 1, 0, 1]], active=True))
     assert faults.of("north") is not None
     for index in range(5):
         faults.take(framed("north", 100 + index, np.zeros((4, FRAME), dtype=np.float32)))
@@ -116,8 +117,8 @@ def test_copies_in_digital_silence_are_named_after_a_few_sounds() -> None:
 def test_a_fault_ends_when_the_channels_differ_again() -> None:
     rng = np.random.default_rng(4)
     faults = ChannelFaults(["north"])
-    assert after_quiet(faults, [hiss(rng, 4)[[0, 0, 1, 2]] for _ in range(5)]) is not None
-    faults.take(framed("north", 6, hiss(rng, 4)))
+    assert after_quiet(faults, [hiss(rng, 4)[[0, 0, 1, 2]] for _ in range(6)]) is not None
+    faults.take(framed("north", 8, hiss(rng, 4)))
     assert faults.of("north") is None
 
 

@@ -30,7 +30,10 @@ QUIET_FRAMES: Final = 3
 before and after every sound."""
 
 SHARED_FRAMES: Final = 2
-"""Number of frames with sound in which two arrays must also have the same channels."""
+"""Number of frames with sound in which channels must be the same as well."""
+
+COMPARED_FRAMES: Final = 4
+"""Number of frames, from the beginning of a sound, in which an array's channels are compared."""
 
 COPIED_SOUNDS: Final = 3
 """The same number of sounds, which counts where the background is digital silence. Two microphones may receive exactly
@@ -86,12 +89,9 @@ class _Likeness:
 
     @property
     def is_copy(self) -> bool:
-        return self.quiet_frames >= QUIET_FRAMES or self.sounds >= COPIED_SOUNDS
-
-    @property
-    def is_shared(self) -> bool:
-        """True if sound as well as background was the same; simulated arrays may differ in the sound alone."""
-        return self.is_copy and self.active_frames >= SHARED_FRAMES
+        """True if sound as well as background was the same; simulated microphones may differ in the sound alone."""
+        background = self.quiet_frames >= QUIET_FRAMES or self.sounds >= COPIED_SOUNDS
+        return background and self.active_frames >= SHARED_FRAMES
 
 
 @dataclass(slots=True)
@@ -99,6 +99,7 @@ class _Channels:
     """What is known of one array's channels, which are counted from 0."""
 
     last_active: int | None = None
+    active_frames: int = 0  # of the sound that goes on
     alike: dict[Pair, _Likeness] = field(default_factory=dict)
     signs: dict[int, tuple[int, ...]] = field(default_factory=dict)  # frame index of a sound's start -> signs
 
@@ -143,19 +144,20 @@ class ChannelFaults:
         begins = frame.active and known.last_active != frame.frame_index - 1
         if frame.active:
             known.last_active = frame.frame_index
-        if begins or not frame.active:
-            self._compare(known, frame.samples, begins=begins)
+            known.active_frames = 1 if begins else known.active_frames + 1
+        if not frame.active or known.active_frames <= COMPARED_FRAMES:
+            self._compare(known, frame, begins=begins)
         self._look_up(frame, begins=begins)
         self._word(frame.array)
 
-    def _compare(self, known: _Channels, samples: Float32Array, *, begins: bool) -> None:
+    def _compare(self, known: _Channels, frame: Frame, *, begins: bool) -> None:
         """Compare the channels of one array with one another."""
-        comparable, same = _same(samples)
+        comparable, same = _same(frame.samples)
         for pair in list(known.alike):
             if comparable[pair] and not same[pair]:
                 del known.alike[pair]
         for first, second in np.argwhere(np.triu(same, 1)).tolist():
-            known.alike.setdefault((first, second), _Likeness()).note(active=begins, begins=begins)
+            known.alike.setdefault((first, second), _Likeness()).note(active=frame.active, begins=begins)
 
     def _look_up(self, frame: Frame, *, begins: bool) -> None:
         """Compare the channels of an array with those of all others at the same frame index."""
@@ -224,7 +226,7 @@ class ChannelFaults:
         if copies:
             return _copied(copies)
         for both, (likeness, channels) in self._shared.items():
-            if array in both and likeness.is_shared:
+            if array in both and likeness.is_copy:
                 (other,) = both - {array}
                 return _taken_twice(channels[array], other, channels[other])
         latest = list(known.signs.values())
