@@ -12,6 +12,7 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.findings import Finding, set_up_findings, sharp_delays
+from livessl.core.commission.observe import observe
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredPose, measure_pose
 from livessl.core.commission.trial import PLACE_STD_M
 from livessl.core.types import Event, FloatArray
@@ -72,7 +73,7 @@ def claps_of(
 def verified(site: Site, claps: Sequence[Clap]) -> list[Finding]:
     """Find what explains the errors at known places: the faults of channels, and of the order and poses of arrays."""
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
-    sounds = [clap.event.observations for clap in claps]
+    sounds = [observe(clap.event.received) for clap in claps]
     of_channels = [one for one in find_set_up_faults(site, sounds) if one.channel is not None]
     delays = sharp_delays(microphones, sounds, of_channels)
     microphones = {name: microphones[name] for name in delays}
@@ -92,7 +93,7 @@ def measured_poses(site: Site, claps: Sequence[Clap], place_std_m: float = PLACE
     """
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
     places_m = np.array([clap.place_m for clap in claps])
-    delays = sharp_delays(microphones, [clap.event.observations for clap in claps], [])
+    delays = sharp_delays(microphones, [observe(clap.event.received) for clap in claps], [])
     found = {}
     for name, delays_s in delays.items():
         if (np.isfinite(delays_s).sum(axis=1) > 1).sum() >= LEAST_PLACES:

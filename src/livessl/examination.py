@@ -11,6 +11,7 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
 from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.observe import observe
 from livessl.core.types import Event
 from livessl.recordings.assign import AssignedRecording
 from livessl.site.build.set_up import find_set_up_faults, with_inputs
@@ -72,7 +73,7 @@ def examine_parts(
         If recordings of arrays that the site joins do not belong together.
     """
     outputs = offline.run(site, parts, UnpacedClock(), progress=progress)
-    sounds = [output.observations for output in outputs if isinstance(output, Event) and output.observations]
+    sounds = [observe(output.received) for output in outputs if isinstance(output, Event) and output.received]
     findings = [finding for part in parts for finding in _of_samples(part)] + find_set_up_faults(site, sounds)
     order = list(Severity)
     told = sorted(with_inputs(site, _without_consequences(findings)), key=lambda one: order.index(one.severity))

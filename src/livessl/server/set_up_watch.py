@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.observe import observe
 from livessl.core.commission.trial import LEAST_SOUNDS
-from livessl.core.types import Event, Observation
+from livessl.core.types import Event, Observation, Received
 from livessl.server.overload import Overload
 from livessl.site.build.set_up import find_set_up_faults
 from livessl.site.models import Site
@@ -43,8 +44,9 @@ class SetUpWatch:
         self._site = site
         self._overload = overload
         self._lock = threading.Lock()
-        self._sounds: deque[Sequence[Observation]] = deque(maxlen=KEPT_SOUNDS)
-        self._is_new = False
+        self._new: deque[Sequence[Received]] = deque(maxlen=KEPT_SOUNDS)
+        self._sounds: Sequence[Sequence[Observation]] = ()
+        self._run = 0  # number of times that all sounds were forgotten
         self._findings: tuple[Finding, ...] = ()
         self._by_array: Mapping[str, str] = {}
         self._stop = threading.Event()
@@ -68,16 +70,16 @@ class SetUpWatch:
 
     def take(self, event: Event) -> None:
         """Take in a final event."""
-        if event.source == 1 and len(event.observations) > 0:
+        if event.source == 1 and len(event.received) > 0:
             with self._lock:
-                self._sounds.append(event.observations)
-                self._is_new = True
+                self._new.append(event.received)
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
         with self._lock:
-            self._sounds.clear()
-            self._is_new = False
+            self._new.clear()
+            self._sounds = ()
+            self._run += 1
             self._note(())
 
     def start(self) -> None:
@@ -94,13 +96,15 @@ class SetUpWatch:
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
-            sounds, is_new = list(self._sounds), self._is_new
-            self._is_new = False
-        if not is_new or len(sounds) < LEAST_SOUNDS:
+            new, known, run = list(self._new), list(self._sounds), self._run
+            self._new.clear()
+        if not new:
             return
-        findings = tuple(find_set_up_faults(self._site, sounds))
+        sounds = [*known, *(observe(received) for received in new)][-KEPT_SOUNDS:]
+        findings = tuple(find_set_up_faults(self._site, sounds)) if len(sounds) >= LEAST_SOUNDS else ()
         with self._lock:
-            if self._sounds:  # otherwise another run has begun
+            if run == self._run:
+                self._sounds = sounds
                 self._note(findings)
 
     def _note(self, findings: tuple[Finding, ...]) -> None:

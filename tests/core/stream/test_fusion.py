@@ -528,7 +528,8 @@ def test_estimates_with_candidates_are_directions_and_start_no_track() -> None:
     assert event.reason == "all microphones lie in one plane"
     updates = [output for _, output in said if isinstance(output, Update)]
     assert updates
-    for answer in (event, *updates):
+    answers: list[Event | Update] = [event, *updates]
+    for answer in answers:
         assert answer.status is Status.DIRECTION_ONLY
         assert answer.estimate is not None
         assert [each.probability for each in answer.estimate.candidates] == [0.5, 0.5]

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
-from livessl.core.types import Evidence, Float32Array, FloatArray, IntArray, Observation
+from livessl.core.types import Evidence, Float32Array, FloatArray, IntArray, Observation, Received
 
 PEAKS: Final = 3
 """Peaks of each pair, up and down, that are tried as its delay: reverberation and tones have several."""
@@ -30,23 +30,23 @@ INVERSION: Final = 1.15
 some pairs a deeper trough than a peak."""
 
 
-def observe(evidence: Evidence, segments: Iterable[Float32Array]) -> Observation | None:
+def receive(evidence: Evidence, segments: Iterable[Float32Array]) -> Received:
+    """Keep what `observe` needs of an array's evidence and of its samples, segments of (K, n)."""
+    return Received(evidence, _powers(segments))
+
+
+def observe(received: Iterable[Received]) -> tuple[Observation, ...]:
+    """Measure what the channels of each array received of a sound; arrays without an exact delay are left out."""
+    observed = (_observe(one.evidence, one.powers) for one in received)
+    return tuple(one for one in observed if one is not None)
+
+
+def _observe(evidence: Evidence, powers: FloatArray) -> Observation | None:
     """Measure what the channels of one array received of a sound.
 
     The delays t and polarities s are those for which the sum over all pairs (i, k) of s_i s_k R_ik(t_k - t_i) is
-    highest. Microphones are added one by one; the candidates of each are the highest peaks of its pairs.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    segments : iterable of (K, n) float32
-        Its samples.
-
-    Returns
-    -------
-    Observation or None
-        None if fewer than two channels carry sound, or the correlations are envelopes, which have no polarity and no
-        exact peak.
+    highest. Microphones are added one by one; the candidates of each are the highest peaks of its pairs. Return None if
+    fewer than two channels carry sound, or the correlations are envelopes, which have no polarity and no exact peak.
     """
     if uses_envelope(evidence.spec.band_hz):
         return None
@@ -57,7 +57,7 @@ def observe(evidence: Evidence, segments: Iterable[Float32Array]) -> Observation
     if min(found.signs) < 0.0:
         upright = pairs.best(signs=(1.0,))
         found = found if found.score > INVERSION * upright.score else upright
-    return pairs.observation(found, _powers(segments))
+    return pairs.observation(found, powers)
 
 
 def _powers(segments: Iterable[Float32Array]) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.commission.observe import observe
+from livessl.core.commission.observe import receive
 from livessl.core.geometry import direction_deg
 from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
@@ -27,7 +27,7 @@ from livessl.core.types import (
     Estimate,
     Event,
     FloatArray,
-    Observation,
+    Received,
     Status,
     Update,
 )
@@ -121,12 +121,12 @@ class Verdicts:
         few = why if len(received.sounds) < least else None
         first = self._refused(event, excerpt, now_ns, _joined(few, faults))
         if len(used.sounds) < least:
-            return Verdict([replace(first, observations=self._observations(None, received, faults))], None)
+            return Verdict([replace(first, received=self._received(None, received, faults))], None)
         found = self._state.estimator.locate(used.sounds)
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
-        observations = self._observations(found, received, faults)
-        first = replace(first, status=status, reason=_joined(reason, faults) or None, observations=observations)
+        heard = self._received(found, received, faults)
+        first = replace(first, status=status, reason=_joined(reason, faults) or None, received=heard)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
@@ -137,7 +137,7 @@ class Verdicts:
                 source=source,
                 status=Status.LOCATED,
                 reason=_joined(None, faults) or None,
-                observations=(),
+                received=(),
                 estimate=other,  # the power stays that of both sources: it cannot be divided
                 contributions=self._contributions(used.powers, other, found, backfilled),
             )
@@ -145,20 +145,17 @@ class Verdicts:
         )
         return Verdict([first, *others], found)
 
-    def _observations(
-        self, found: Localization | None, received: Excerpt, faulty: Iterable[str]
-    ) -> tuple[Observation, ...]:
-        """Return what the channels of each array received, also of those that were not used; none under overload."""
+    def _received(self, found: Localization | None, excerpt: Excerpt, faulty: Iterable[str]) -> tuple[Received, ...]:
+        """Return what each array received, also those that were not used; nothing under overload."""
         estimator = self._state.estimator
         if self._state.relief.shed:
             return ()
         evidence = [] if found is None else list(found.evidence)
-        if isinstance(estimator, MapEstimator):
-            known = {part.spec.name for part in evidence}
-            missing = faulty if found is not None else received.sounds
-            evidence += estimator.evidence({name: received.sounds[name] for name in missing if name not in known})
-        observed = (observe(part, received.sounds[part.spec.name].segments) for part in evidence)
-        return tuple(one for one in observed if one is not None)
+        known = {part.spec.name for part in evidence}
+        missing = [name for name in (faulty if found is not None else excerpt.sounds) if name not in known]
+        if missing and isinstance(estimator, MapEstimator):
+            evidence += estimator.evidence({name: excerpt.sounds[name] for name in missing})
+        return tuple(receive(part, excerpt.sounds[part.spec.name].segments) for part in evidence)
 
     def _channel_faults(self, event: PendingEvent, excerpt: Excerpt) -> dict[str, str]:
         """Return the faults, in words, of those arrays of an excerpt whose channels are faulty."""

@@ -39,6 +39,7 @@ from livessl.core.types.sound import (
     Mark,
     Message,
     Observation,
+    Received,
 )
 
 __all__ = [
@@ -68,6 +69,7 @@ __all__ = [
     "Observation",
     "Output",
     "RealArray",
+    "Received",
     "Status",
     "Track",
     "TrackState",

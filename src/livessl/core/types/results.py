@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from livessl.core.types.arrays import FloatArray, read_only
-from livessl.core.types.sound import Evidence, Observation
+from livessl.core.types.sound import Evidence, Received
 
 
 class Status(StrEnum):
@@ -179,8 +179,9 @@ class Event:
         Site time at which the last sound needed for the answer ended: the end of the hang-over.
     source : int
         1, or 2 for the second of two sources that sounded at the same time, each of which has an event.
-    observations : tuple of Observation
-        What each array's channels received, for the examination of the set-up; empty for a second source.
+    received : tuple of Received
+        What each array received, for the examination of the set-up; empty for a second source and under overload.
+        Events are compared without it.
     """
 
     id: str
@@ -198,7 +199,7 @@ class Event:
     late: bool = False
     complete_ns: int = 0
     source: int = 1
-    observations: tuple[Observation, ...] = ()
+    received: tuple[Received, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def duration_s(self) -> float:

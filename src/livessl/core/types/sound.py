@@ -314,3 +314,18 @@ class Observation:
     def __post_init__(self) -> None:
         for array in (self.delays_s, self.inverted, self.coherence, self.powers):
             read_only(array)
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """What one array received of one sound, from which an `Observation` is made when it is needed.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    powers : (K,) float64
+        Mean power of each channel, with hum and rumble attenuated, full scale squared.
+    """
+
+    evidence: Evidence
+    powers: FloatArray

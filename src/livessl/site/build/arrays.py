@@ -131,7 +131,7 @@ def _measured_m(file: SiteFile, directory: Path) -> tuple[dict[str, FloatArray],
         calibrated = _read_model(CalibrationFile, directory / file.calibration, "calibration file")
     except ConfigError as error:
         return {}, [(("calibration",), str(fault)) for fault in error.faults]
-    strangers = [
+    strangers: list[Finding] = [
         (("calibration",), unknown_array(name, file.arrays)) for name in calibrated.arrays.keys() - file.arrays
     ]
     return {name: as_positions_m(array.microphones_m) for name, array in calibrated.arrays.items()}, strangers
