@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import claps
 import recordings as r
 from livessl.cli.main import main
 
@@ -61,3 +62,17 @@ def test_a_talker_beside_a_small_circle_is_heard_from_the_right_side(take: str) 
     errors_deg = r.talker_errors_deg(take)
     assert errors_deg
     assert max(errors_deg) <= 12.0
+
+
+@pytest.mark.parametrize("arrays", ["recorders", "frames"])
+def test_a_clap_is_one_source_and_is_not_refused_for_clocks_inside_an_array(arrays: str) -> None:
+    """Eight pairs of microphones, or four frames whose two recorders agree to 0 to 8 samples only: every third clap."""
+    need("lab_claps")
+    site = claps.site(arrays)
+    found = claps.summary([claps.clap(name, site) for name in claps.names()[::3]])
+    assert found["claps"] == 10
+    assert found["with_second"] == 0
+    assert found["refused"] == 0
+    assert found["wrong"] <= 1
+    assert found["with_outlier"] <= 1
+    assert found["median_m"] <= 0.2

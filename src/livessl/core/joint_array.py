@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
-from livessl.core.types import MAX_MICROPHONES, ArraySpec
+from livessl.core.types import MAX_MICROPHONES, ArraySpec, Uncertainty
 
 
 def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) -> ArraySpec:
@@ -42,7 +43,8 @@ def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) ->
             "join fewer arrays, or let their maps be summed instead"
         )
     microphones_m = np.ascontiguousarray(np.vstack([spec.microphones_m for spec in arrays]))  # sums depend on the order
-    return ArraySpec(name, microphones_m, bands_hz.pop())
+    worst = Uncertainty(*np.max([astuple(spec.uncertainty) for spec in arrays], axis=0).tolist())
+    return ArraySpec(name, microphones_m, bands_hz.pop(), worst)
 
 
 def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:

@@ -16,13 +16,14 @@ from pydantic_core.core_schema import ValidationInfo, ValidatorFunctionWrapHandl
 from livessl.core.methods import ONSET
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.parameters import FusionParameters
-from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec
+from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, Uncertainty
 from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
 
 _ACTIVITY: Final = ActivityParameters()
 _FUSION: Final = FusionParameters()
+_UNCERTAINTY: Final = Uncertainty()
 
 MicrophonesM = Annotated[list[Position], Field(min_length=MIN_MICROPHONES, max_length=MAX_MICROPHONES)]
 
@@ -136,6 +137,15 @@ class Orientation(Model):
     roll: Coordinate = 0.0
 
 
+class UncertaintyConfig(Model):
+    """Standard deviations of what is known of an array's set-up: see `livessl.core.types.Uncertainty`."""
+
+    position_m: Annotated[float, Field(ge=0, le=1)] = _UNCERTAINTY.position_m
+    orientation_deg: Annotated[float, Field(ge=0, le=45)] = _UNCERTAINTY.orientation_deg
+    clock_s: Annotated[float, Field(ge=0, le=0.01)] = _UNCERTAINTY.clock_s
+    temperature_c: Annotated[float, Field(ge=0, le=50)] = _UNCERTAINTY.temperature_c
+
+
 class ArrayConfig(Model):
     """One microphone array: absolute positions, or a shape (or geometry file) and a pose."""
 
@@ -144,6 +154,7 @@ class ArrayConfig(Model):
     position_m: Position | None = None
     orientation_deg: Orientation | None = None
     band_hz: BandHz | None = None
+    uncertainty: UncertaintyConfig | None = None
     wav_offset_s: Coordinate = 0.0
 
     @field_validator("geometry", mode="before")
@@ -221,6 +232,7 @@ class SiteFile(Model):
     speed_of_sound_m_s: Annotated[float, Field(gt=100, lt=2000)] | None = None
     temperature_c: Annotated[float, AfterValidator(_celsius)] | None = None
     band_hz: BandHz = (100.0, 6000.0)
+    uncertainty: UncertaintyConfig = UncertaintyConfig()
     grid: GridConfig = GridConfig()
     arrays: Annotated[dict[str, ArrayConfig], Field(min_length=1)]
     calibration: FileName | None = None

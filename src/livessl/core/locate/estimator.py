@@ -18,7 +18,26 @@ from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
 from livessl.core.geometry import Grid
 from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.core.methods import METHODS, is_method, unknown_method
-from livessl.core.types import GCC, ArraySpec, Candidate, Evidence, Float32Array, FloatArray
+from livessl.core.types import GCC, ArraySpec, Candidate, Evidence, Float32Array, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The frames that an array's onsets were taken from: when each one was, and how loud.
+
+    Parameters
+    ----------
+    frame_indices : (F,) int64
+        Ascending; those of a site's arrays count from one origin.
+    powers : (F,) float64
+        In-band mean power, full scale squared.
+    begin : int
+        Frame index from which on the sound is active; the frames before it are its pre-roll.
+    """
+
+    frame_indices: IntArray
+    powers: FloatArray
+    begin: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +62,8 @@ class Sound:
         can skip its slower second look.
     detected : bool
         Whether the array detected the sound by itself; if not, its frames were requested.
+    course : Course or None
+        The frames of `onsets`, one for each; None if unknown.
     """
 
     segments: Sequence[Float32Array]
@@ -52,6 +73,7 @@ class Sound:
     sources: int = 1
     ended: bool = True
     detected: bool = True
+    course: Course | None = None
 
     @property
     def onset_strength(self) -> float:
@@ -112,6 +134,9 @@ class Localization:
         none. With candidates, fusion reports at most a direction.
     ambiguity : str or None
         Why there are candidates, in words; None without them.
+    power : float or None
+        Greatest in-band mean power of a frame that the source has, full scale squared; None if all power is its own, or
+        cannot be divided.
     """
 
     position_m: FloatArray
@@ -125,6 +150,7 @@ class Localization:
     others: tuple[Localization, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     ambiguity: str | None = None
+    power: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,12 +15,13 @@ from livessl.core.locate import ambiguity, outliers
 from livessl.core.locate.confidence import LEAST_CONFIDENCE, Judgement
 from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
+from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.outside import Outside, find_outside
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place, highest_place
-from livessl.core.locate.second_source import FrameGCCs, SecondSourceSearch
+from livessl.core.locate.second_source import SecondSourceSearch
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.methods import ONSET
 from livessl.core.types import GCC, ArraySpec, Evidence
@@ -128,7 +129,8 @@ class Onset(MapEstimator):
             answer = max(answer, second_look, key=_Answer.rank)
             outside = self._outside(answer)
         found = self._localization(answer) if outside is None else self._beyond(answer, outside)
-        return replace(found, unneeded=sounds.keys() - answer.contributing, others=others)
+        power = None if separation is None else separation.power
+        return replace(found, unneeded=sounds.keys() - answer.contributing, others=others, power=power)
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
@@ -146,7 +148,7 @@ class Onset(MapEstimator):
         def place_of(parts: Sequence[Evidence]) -> Place:
             return known.get(_names(parts)) or self._place(parts)
 
-        consensus = outliers.consensus(kept, suspect, self._search, self.grid, place_of)
+        consensus = outliers.consensus(kept, suspect, self._search, self.grid, self.c_m_s, place_of)
         judgement = consensus.place.judgement(self.grid, whole=whole)
         return _Answer(kept, _names(kept), consensus, judgement, consensus.refused or judgement.refused)
 
@@ -223,7 +225,8 @@ class Onset(MapEstimator):
 
     def _frames(self, evidence: Evidence, sound: Sound) -> FrameGCCs:
         sampling = self._sampling(evidence.spec.name, sound.sample_rate_hz)
-        return FrameGCCs.of(evidence.spec, sampling, sound.onsets, np.any(evidence.gcc.values, axis=1))
+        live = np.any(evidence.gcc.values, axis=1)
+        return FrameGCCs.of(evidence.spec, sampling, sound.onsets, live, sound.course)
 
     def _onset_evidence(self, array: str, sound: Sound) -> Evidence:
         if sound.onsets:

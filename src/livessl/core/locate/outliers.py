@@ -2,7 +2,8 @@
 
 Each array's map has a highest place of its own. At the common position an array that agrees loses next to nothing of
 its peak-to-RMS ratio. An array that is turned or moved, or records something else, loses nearly all of it there, or
-makes the others lose theirs.
+makes the others lose theirs. What is lost by errors that a set-up has anyway is no disagreement: delays may be off by
+what its `livessl.core.types.Uncertainty` allows.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from livessl.core.geometry import Grid, angle_deg
 from livessl.core.locate.confidence import NEAR_M, array_power, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
-from livessl.core.locate.srp import pair_weight
-from livessl.core.types import Evidence, FloatArray
+from livessl.core.locate.srp import PairTerms, pair_weight
+from livessl.core.types import ArraySpec, Evidence, FloatArray, IntArray
 
 MAX_LOSS: Final = 0.8
 """Summed loss of peak-to-RMS ratio above which arrays are taken to disagree. An array is an outlier if the loss without
@@ -35,6 +36,16 @@ MIN_LEAD: Final = 0.05
 """Loss of peak-to-RMS ratio by which one outlier must explain the disagreement better than another that would lead
 elsewhere. Within it both explanations are as good: two directions may meet in a false position as well as in the right
 one."""
+
+DEVIATIONS: Final = 2.0
+"""Standard deviations of a delay up to which arrays do not disagree."""
+
+MAX_SHARE: Final = 0.15
+"""Most that a delay may be off, as a share of the array's largest delay: 9 degrees broadside. An array whose delays
+were known less well would agree with anything."""
+
+KELVIN: Final = 293.0
+"""Usual absolute temperature; the speed of sound changes by half its relative change."""
 
 MAX_CANDIDATES: Final = 3
 """Most arrays that are tried as outliers in one round, those that lose most first: each costs a search."""
@@ -63,6 +74,7 @@ def consensus(
     suspect: Collection[str],
     search: PeakSearch,
     grid: Grid,
+    c_m_s: float,
     locate: Callable[[Sequence[Evidence]], Place],
 ) -> Consensus:
     """Find the place that most arrays agree on.
@@ -80,10 +92,12 @@ def consensus(
     search : PeakSearch
     grid : Grid
         Grid of the search.
+    c_m_s : float
+        Speed of sound, m/s.
     locate : callable
         Returns the place of the evidence of some arrays.
     """
-    own = _OwnPeaks(search, grid)
+    own = _OwnPeaks(search, grid, c_m_s)
     trusted, last = _by_trust(evidence, suspect)
     outliers: list[Evidence] = []
     place = locate(trusted)
@@ -95,9 +109,9 @@ def consensus(
             break
         if 2 * (len(place.evidence) - 1) > len(evidence):
             places = [locate([part for part in place.evidence if part is not one]) for one in candidates]
-            losses = [sum(own.loss(without).values()) for without in places]
-            best = int(np.argmin(losses))
-            if sum(loss.values()) - losses[best] <= MAX_LOSS:
+            losses = [sum(own.loss(without, exact=True).values()) for without in places]
+            best = int(np.argmin(losses))  # by exact delays: with some latitude several may explain it as well
+            if sum(loss.values()) - sum(own.loss(places[best]).values()) <= MAX_LOSS:
                 break
             if not _is_ambiguous(places, losses, best):
                 outliers.append(candidates[best])
@@ -145,20 +159,23 @@ def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -
 class _OwnPeaks:
     """Each array's own highest place; every one is searched for when it is first needed."""
 
-    def __init__(self, search: PeakSearch, grid: Grid) -> None:
+    def __init__(self, search: PeakSearch, grid: Grid, c_m_s: float) -> None:
         self._search = search
         self._grid = grid
+        self._c_m_s = c_m_s
         self._highest: dict[str, tuple[float, FloatArray]] = {}
 
-    def loss(self, place: Place) -> dict[str, float]:
+    def loss(self, place: Place, *, exact: bool = False) -> dict[str, float]:
         """Peak-to-RMS ratio that each array loses at `place` against its own highest place.
+
+        Delays may be off by what the set-up allows, unless they are `exact`.
 
         Where the sum may exceed `MAX_LOSS` the larger losses are exact; all others are upper bounds, which need no
         search.
         """
         terms = place.functional.pair_terms(place.position_m)
         here = {
-            part.spec.name: peak_to_rms(part, array_power(part, term))
+            part.spec.name: peak_to_rms(part, array_power(part, term) if exact else self._power(part, term, place))
             for part, term in zip(place.evidence, terms, strict=True)
         }
         loss = {part.spec.name: max(0.0, _upper_bound(part) - here[part.spec.name]) for part in place.evidence}
@@ -168,6 +185,16 @@ class _OwnPeaks:
                 if loss[name] > MAX_LOSS / MAX_CANDIDATES:
                     loss[name] = max(0.0, peak_to_rms(part, self._at(part)[0]) - here[name])
         return loss
+
+    def _power(self, evidence: Evidence, term: PairTerms, place: Place) -> float:
+        """Greatest SRP of an array at a place if each pair's delay may be off by what the set-up allows."""
+        values, lags_s = evidence.gcc.values, evidence.gcc.lags_s
+        distance_m = float(np.linalg.norm(place.position_m - evidence.spec.centre_m))
+        off_s = allowed_s(evidence.spec, evidence.gcc.pairs, term.lags_s, distance_m, self._c_m_s)
+        first = np.searchsorted(lags_s, term.lags_s - off_s)
+        last = np.maximum(np.searchsorted(lags_s, term.lags_s + off_s, side="right"), first + 1)
+        highest = sum(float(row[a:b].max(initial=0.0)) for row, a, b in zip(values, first, last, strict=True))
+        return max(array_power(evidence, term), pair_weight(len(evidence.spec.microphones_m)) * highest)
 
     def angle_deg(self, evidence: Evidence, position_m: FloatArray) -> float:
         """Angle at an array between its own highest place and a position, in degrees."""
@@ -180,6 +207,29 @@ class _OwnPeaks:
             (peak,) = self._search.among([evidence])(1)
             self._highest[name] = (peak.power, self._grid.point_m(peak.point))
         return self._highest[name]
+
+
+def allowed_s(spec: ArraySpec, pairs: IntArray, delays_s: FloatArray, distance_m: float, c_m_s: float) -> FloatArray:
+    """Greatest amount by which delays (P,) may be off if the set-up is right, in seconds: (P,).
+
+    Parameters
+    ----------
+    spec : ArraySpec
+    pairs : (P, 2) int64
+    delays_s : (P,) float64
+        Delays of a source, seconds.
+    distance_m : float
+        Distance of the source from the array, metres.
+    c_m_s : float
+        Speed of sound, m/s.
+    """
+    known = spec.uncertainty
+    apart = spec.microphones_m[pairs]
+    apart_s = np.linalg.norm(apart[:, 1] - apart[:, 0], axis=1) / c_m_s
+    turned = np.hypot(np.radians(known.orientation_deg), known.position_m / max(distance_m, spec.aperture_m))
+    warmer = 0.5 * known.temperature_c / KELVIN
+    deviation_s = np.sqrt(known.clock_s**2 + (apart_s * turned) ** 2 + (delays_s * warmer) ** 2)
+    return np.asarray(np.minimum(DEVIATIONS * deviation_s, MAX_SHARE * spec.aperture_m / c_m_s))
 
 
 def _upper_bound(evidence: Evidence) -> float:

@@ -1,10 +1,8 @@
 """Finds a second source that sounds at the same time, after removing from the evidence what the first one explains.
 
-All pairs of an array receive a source with one spectrum, so its share of their GCCs is one even function of lag,
-shifted to each pair's delay. The mean over the pairs around their delays gives that share frame by frame. What remains
-comes from other sources and from reverberation. A loud frame leaves much behind, so the remainder of a frame counts
-less the louder it is: a second source often stands out best while the first is silent. A source differs from what
-reverberation leaves in that it is prominent in some frame.
+What remains without the first source (`livessl.core.locate.frame_gccs`) comes from a second one, from reverberation of
+the first, or from noise that was there before. A second source stands out from all of these in some frame, at more than
+half of the arrays, and is the highest place of all that remains.
 """
 
 from __future__ import annotations
@@ -16,17 +14,16 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
-from livessl.core.correlate.gcc_phat import LagSampling
-from livessl.core.correlate.onset_gcc import OnsetGCC, summed
-from livessl.core.geometry import Grid, microphone_pairs
+from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import Judgement
+from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M, Judgement, array_power, peak_to_rms
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
+from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
 from livessl.core.locate.srp import SRPFunctional
-from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array, FloatArray, IntArray
+from livessl.core.types import Evidence, FloatArray
 
 APART_M: Final = 1.0
 """Distance, in metres, below which two places are one source."""
@@ -34,135 +31,78 @@ APART_M: Final = 1.0
 MOST_ARRAYS_SEPARATED: Final = 8
 """Most arrays used to separate two sources; the time it takes is in proportion to their number."""
 
-MAX_FRAMES: Final = 40
-"""Most frames that are kept apart; those of a longer sound are merged, so that memory and time do not grow with it."""
-
 CANDIDATES: Final = 6
 """Places examined for each source; the right one is hardly ever further down."""
 
 CANDIDATES_APART_M: Final = 0.5
 """Least distance between candidates along one of the axes, in metres."""
 
-LITTLE: Final = 200.0
-"""Onset weight of a frame below which it is mostly noise and counts less: noise at 10 dB gives some 30, a source in a
-clear frame thousands."""
-
-LEAST_SECOND_SOURCE: Final = 0.5
-"""Confidence below which a second source is not reported."""
-
 LEAST_PROSPECT: Final = 0.1
 """Confidence at first sight below which a second source is not examined further."""
 
-_PROMINENCE_FIT: Final = (-11.6, 6.9)
-"""Log-odds of a second source at a place: intercept, weight of the prominence. Fitted to the pairs of sounds and the
-single sounds of the development half."""
+CLEAR: Final = 1.0
+"""Prominence of the second source in a frame from which the frame's power is divided between both sources; below it the
+remainder may be reflections."""
 
-
-def prominence(of_arrays: Sequence[float]) -> float:
-    """Prominence of a place from each array's `FrameGCCs.prominence`: the mean of the two highest.
-
-    Two lines of sight determine a place.
-    """
-    return float(np.mean(sorted(of_arrays)[-2:]))
-
-
-def confidence(prominence: float) -> float:
-    """Probability that there is a second source at a place of this `prominence`."""
-    intercept, slope = _PROMINENCE_FIT
-    return float(1.0 / (1.0 + np.exp(-(intercept + slope * prominence))))
+_FIT: Final = (-7.52, 14.62, -6.40, 8.48, 1.81)
+"""Log-odds of a second source at a place: intercept and the weights of the fields of `SecondSourceFeatures` in their
+order. Fitted to pairs of sounds and to single sounds of the development half, at two and four tetrahedra, eight pairs
+of microphones and four frames of a metre."""
 
 
 @dataclass(frozen=True, slots=True)
-class FrameGCCs:
-    """One array's correlations frame by frame.
+class SecondSourceFeatures:
+    """The measurements from which the confidence of a second source is computed.
 
     Parameters
     ----------
-    spec : ArraySpec
-    lags_s : (L,) float64
-        Seconds.
-    values : (F, P, L) float32
-        GCCs of the frames, not normalised.
-    weights : (F,) float64
-        Onset weight of each frame.
+    above_all, above_noise : float
+        Means over the arrays of each one's greatest prominence in a frame, above reflections and noise and above noise
+        alone (`livessl.core.locate.frame_gccs.Remainder.prominences`). In the frames of a source of its own the first
+        one is weak and both are nearly equal; reflections of the first come with it.
+    margin : float
+        1 - (power at the best other place) / (power at the place), of what remains without the first source.
+    peak_to_rms : float
+        Mean over the arrays of the peak-to-RMS ratio at the place, of what remains without the first source.
     """
 
-    spec: ArraySpec
-    lags_s: FloatArray
-    values: Float32Array
-    weights: FloatArray
-
-    @classmethod
-    def of(cls, spec: ArraySpec, sampling: LagSampling, frames: Sequence[OnsetGCC], live: BoolArray) -> FrameGCCs:
-        """Interpolate an array's onset GCCs, which must not be envelopes.
-
-        Pairs that are not `live` (P,) become zeros.
-        """
-        size = -(-len(frames) // MAX_FRAMES)
-        together = [summed(frames[first : first + size]) for first in range(0, len(frames), size)]
-        whole = summed(together)
-        even = live[:, None] * np.float32(whole.weight) / whole.heights(microphone_pairs(len(spec.microphones_m)))
-        coarse = np.asarray(np.stack([one.lags for one in together]).real * even, dtype=np.float32)
-        fine = sampling.fine(coarse.reshape(-1, coarse.shape[2])).reshape(*coarse.shape[:2], -1)
-        return cls(spec, sampling.fine_lags_s, fine, np.array([one.weight for one in together]))
-
-    def without(self, delays_s: FloatArray) -> Evidence:
-        """Evidence that remains when a source at these delays of the pairs (P,), in seconds, is removed."""
-        share, starts = self._share(delays_s)
-        count, live = len(self.lags_s), self._live
-        scale = 1.0 / np.maximum(self.weights, LITTLE)
-        scale /= max(float((self.weights * scale).sum()), 1e-9)
-        values = np.einsum("f,fpl->pl", scale.astype(np.float32), self.values)
-        weighed = scale.astype(np.float32) @ share
-        for pair in live:
-            values[pair] -= weighed[starts[pair] : starts[pair] + count]
-        return Evidence(self.spec, GCC(microphone_pairs(len(self.spec.microphones_m)), self.lags_s, values))
-
-    def prominence(self, delays_s: FloatArray, without_s: FloatArray) -> float:
-        """Prominence of a source at delays (P,) after removing the one at delays `without_s`, in its clearest frame.
-
-        It is the mean height over the pairs, over the root mean square of the frame's GCCs with both sources.
-        """
-        share, starts = self._share(without_s)
-        at, live = self._nearest(delays_s), self._live
-        if not len(live):
-            return 0.0
-        heights = (self.values[:, live, at[live]] - share[:, starts[live] + at[live]]).mean(axis=1)
-        both = self.values[:, live]
-        rms = np.sqrt(np.einsum("fpl,fpl->f", both, both) / (both.shape[1] * both.shape[2]))
-        return float((heights / np.maximum(rms, 1e-9)).max())
+    above_all: float
+    above_noise: float
+    margin: float
+    peak_to_rms: float
 
     @property
-    def _live(self) -> IntArray:
-        return np.flatnonzero(self.values.any(axis=(0, 2)))
+    def confidence(self) -> float:
+        """Probability that there is a second source at the place.
 
-    def _nearest(self, delays_s: FloatArray) -> IntArray:
-        step_s = self.lags_s[1] - self.lags_s[0]
-        places = np.rint((delays_s - self.lags_s[0]) / step_s).astype(np.int64)
-        return np.asarray(np.clip(places, 0, len(self.lags_s) - 1))
-
-    def _share(self, delays_s: FloatArray) -> tuple[Float32Array, IntArray]:
-        """Share of a source at delays (P,) in each frame, (F, 2 L - 1), and where in it each pair's lags begin, (P,).
-
-        The share is r(t) = mean over pairs of [R_p(tau_p + t) + R_p(tau_p - t)] / 2, t as far as the lags reach.
+        It is 0 if the place is not the highest of all that remains: then it is a side lobe, or was pushed out of the
+        neighbourhood of the first source by one too near to be told apart.
         """
-        frames, _, count = self.values.shape
-        share = np.zeros((frames, 2 * count - 1), dtype=np.float32)
-        terms = np.zeros(2 * count - 1, dtype=np.float32)
-        starts = count - 1 - self._nearest(delays_s)
-        for pair in self._live:
-            share[:, starts[pair] : starts[pair] + count] += self.values[:, pair]
-            terms[starts[pair] : starts[pair] + count] += 1.0
-        return (share + share[:, ::-1]) / np.maximum(terms + terms[::-1], 1.0), starts
+        return self.prospect if self.margin > 0.0 else 0.0
+
+    @property
+    def prospect(self) -> float:
+        """Probability that there is a second source, here or near to a higher place."""
+        log_odds = float(np.dot(_FIT, (1.0, self.above_all, self.above_noise, self.margin, self.peak_to_rms)))
+        return float(1.0 / (1.0 + np.exp(-log_odds)))
+
+
+def majority(of_arrays: Sequence[float]) -> float:
+    """Mean of the prominences at more than half of the arrays, the greatest ones."""
+    return float(np.mean(sorted(of_arrays)[-(len(of_arrays) // 2 + 1) :]))
 
 
 @dataclass(frozen=True, slots=True)
 class TwoSources:
-    """Two places at which sources sounded at the same time, and the confidence that the second one is a source."""
+    """Two places at which sources sounded at the same time, and the confidence that the second one is a source.
+
+    `powers` are the greatest in-band powers of a frame that each of them has, full scale squared.
+    """
 
     first: Place
     second: Place
     confidence: float
+    powers: tuple[float, float]
 
     @property
     def stand_out_everywhere(self) -> bool:
@@ -179,11 +119,14 @@ class Separation:
     first : Place
     judgement : Judgement
         Judgement of the first place.
+    power : float
+        Greatest in-band power of a frame that the first source has, full scale squared.
     second : Localization
     """
 
     first: Place
     judgement: Judgement
+    power: float
     second: Localization
 
 
@@ -253,12 +196,14 @@ class SecondSourceSearch:
         return Separation(
             first,
             judgement,
+            found.powers[0],
             Localization(
                 found.second.position_m,
                 second.covariance_m2,
                 found.confidence,
                 found.second.evidence,
                 features=second.features,
+                power=found.powers[1],
                 outliers={name: off_deg for name, off_deg in consensus.outliers.items() if name not in used},
             ),
         )
@@ -267,7 +212,7 @@ class SecondSourceSearch:
         """Find a second source; None if there is none.
 
         The first source is removed and the second searched for; with the second removed the first is searched for
-        again, and then the second once more.
+        again, and then the second once more. If the first would then be elsewhere, both stay where they were found.
 
         Parameters
         ----------
@@ -276,40 +221,72 @@ class SecondSourceSearch:
         frames : sequence of FrameGCCs
             Frames of the same arrays in the same order.
         """
-        second, prospect = self.beside(first, frames)
-        if prospect < LEAST_PROSPECT:
+        second, features = self.beside(first, frames)
+        if features.prospect < LEAST_PROSPECT:
             return None
         again, _ = self.beside(second, frames)
-        second, confidence = self.beside(again, frames)
-        if confidence < LEAST_SECOND_SOURCE or again.apart_m(second) < APART_M:
+        if again.apart_m(first) > NEAR_M:
+            again = first
+        else:
+            second, features = self.beside(again, frames)
+        if features.confidence < LEAST_CONFIDENCE or again.apart_m(second) < APART_M:
             return None
-        return TwoSources(again, second, confidence)
+        return TwoSources(again, second, features.confidence, _powers(again, second, frames))
 
-    def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, float]:
-        """Most likely other place once the source at `place` is removed, and the confidence that it is a source.
+    def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, SecondSourceFeatures]:
+        """Most likely other place once the source at `place` is removed, and what shows whether it is a source.
 
         Of the candidates with the highest power, the one with the highest product of power and prominence wins.
         """
-        delays_s = [term.lags_s for term in place.functional.pair_terms(place.position_m)]
-        evidence = tuple(each.without(taken_s) for each, taken_s in zip(frames, delays_s, strict=True))
+        remainders = [each.without(taken_s) for each, taken_s in zip(frames, _delays_s(place), strict=True)]
+        evidence = tuple(each.evidence() for each in remainders)
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [refine.neighbourhood(place.position_m, self._grid)]
         apart_points = round(CANDIDATES_APART_M / self._grid.spacing_m)
-        best, chosen = 0.0, (place, 0.0)
+        best, chosen, prominences = 0.0, place, [(0.0, 0.0)]
         for _ in range(CANDIDATES):
             found = find(1, without=known)
             if not found:
                 break
             position_m, power = refine.refine_peaks(functional, found, self._grid)
-            terms = functional.pair_terms(position_m)
-            each = zip(frames, terms, delays_s, strict=True)
-            prominent = prominence([one.prominence(term.lags_s, taken_s) for one, term, taken_s in each])
-            if power * prominent > best:
-                candidate = Place(evidence, functional, position_m, power, power)
-                best, chosen = power * prominent, (candidate, confidence(prominent))
+            candidate = Place(evidence, functional, position_m, power, power)
+            of_arrays = [
+                tuple(float(each.max()) for each in one.prominences(delays_s))
+                for one, delays_s in zip(remainders, _delays_s(candidate), strict=True)
+            ]
+            score = power * majority([above_all for above_all, _ in of_arrays])
+            if score > best:
+                best, chosen, prominences = score, candidate, of_arrays
             known.append(refine.box_around(self._grid, found[0].point, apart_points))
-        other, other_confidence = chosen
-        return replace(other, rival_power=refine.rival_power(find, self._grid, other.position_m)), other_confidence
+        chosen = replace(chosen, rival_power=refine.rival_power(find, self._grid, chosen.position_m))
+        above_all, above_noise = np.mean(prominences, axis=0)
+        terms = chosen.functional.pair_terms(chosen.position_m)
+        each = zip(chosen.evidence, terms, strict=True)
+        peaks = [peak_to_rms(part, array_power(part, term)) for part, term in each]
+        margin = refine.margin(chosen.power, chosen.rival_power)
+        return chosen, SecondSourceFeatures(above_all, above_noise, margin, float(np.mean(peaks)))
+
+
+def _delays_s(place: Place) -> list[FloatArray]:
+    """Delays of each array's pairs (P,) at a place, in seconds."""
+    return [term.lags_s for term in place.functional.pair_terms(place.position_m)]
+
+
+def _powers(first: Place, second: Place, frames: Sequence[FrameGCCs]) -> tuple[float, float]:
+    """Greatest power of a frame that each source has, full scale squared.
+
+    A frame's power is divided in proportion to the heights of both where the second source is clear, and belongs to the
+    first one elsewhere.
+    """
+    powers = np.zeros(2)
+    for each, first_s, second_s in zip(frames, _delays_s(first), _delays_s(second), strict=True):
+        remainder = each.without(first_s)
+        heights = np.maximum(remainder.heights(second_s)[0], 0.0)
+        share = heights / np.maximum(heights + remainder.removed_heights, 1e-9)
+        share = np.where(remainder.prominences(second_s)[0] >= CLEAR, share, 0.0)
+        of_sound = np.where(each.quiet, 0.0, each.powers)
+        powers = np.maximum(powers, [(of_sound * (1.0 - share)).max(), (of_sound * share).max()])
+    return float(powers[0]), float(powers[1])
 
 
 def _separable(evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.locate.estimator import Estimator
+from livessl.core.locate.estimator import Course, Estimator
 from livessl.core.stream.evidence import BackfilledSound
 from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
@@ -153,7 +153,8 @@ def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: in
         return None
     pushed = zip(indices, frames, strict=True)
     onsets = tuple(front_end.push(frame.samples, quiet=frame_index < start) for frame_index, frame in pushed)
-    return BackfilledSound(loud, onsets)
+    powers = np.array([frame.power for frame in frames])
+    return BackfilledSound(loud, onsets, Course(np.array(indices, dtype=np.int64), powers, start))
 
 
 def is_sure(event: Event) -> bool:

@@ -13,7 +13,7 @@ from typing import Final, overload
 import numpy as np
 
 from livessl.core.correlate.onset_gcc import OnsetGCC
-from livessl.core.locate.estimator import Sound
+from livessl.core.locate.estimator import Course, Sound
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_stream import ArrayStream
@@ -72,6 +72,7 @@ class Sounds(Mapping[str, Sound]):
         self.ended = ended
         self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
         self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
+        self._courses: dict[str, Course] = {}
         self._requested: set[str] = set()
 
     def add(
@@ -79,14 +80,15 @@ class Sounds(Mapping[str, Sound]):
         array: str,
         segments: Sequence[Sequence[Frame]],
         onsets: tuple[OnsetGCC, ...],
+        course: Course,
         *,
         requested: bool = False,
     ) -> None:
-        """Add the sound of an array: its segments of frames, at least one, and the correlations of its frames.
+        """Add the sound of an array: its segments of frames, at least one, and its frames' correlations and course.
 
         `requested` if the array did not detect the sound, and its frames were requested.
         """
-        self._segments[array], self._onsets[array] = segments, onsets
+        self._segments[array], self._onsets[array], self._courses[array] = segments, onsets, course
         if requested:
             self._requested.add(array)
 
@@ -95,6 +97,7 @@ class Sounds(Mapping[str, Sound]):
         copy = Sounds(self.sources, self.suspects, ended=self.ended)
         copy._segments |= self._segments
         copy._onsets |= self._onsets
+        copy._courses |= self._courses
         copy._requested |= self._requested
         return copy
 
@@ -104,6 +107,7 @@ class Sounds(Mapping[str, Sound]):
         for array in arrays:
             copy._segments.pop(array, None)
             copy._onsets.pop(array, None)
+            copy._courses.pop(array, None)
         return copy
 
     @property
@@ -121,6 +125,7 @@ class Sounds(Mapping[str, Sound]):
             self.sources,
             self.ended,
             array not in self._requested,
+            self._courses[array],
         )
 
     def __iter__(self) -> Iterator[str]:
@@ -132,10 +137,14 @@ class Sounds(Mapping[str, Sound]):
 
 @dataclass(frozen=True, slots=True)
 class BackfilledSound:
-    """The sound of an array that was requested: its frames from the event's start on, and their correlations."""
+    """The sound of an array that was requested: its frames from the event's start on.
+
+    The correlations and their course include the pre-roll.
+    """
 
     frames: list[Frame]
     onsets: tuple[OnsetGCC, ...]
+    course: Course
 
 
 @dataclass(slots=True)
@@ -158,10 +167,15 @@ class Excerpt:
     powers: dict[str, FloatArray] = field(default_factory=dict)
 
     def add(
-        self, array: str, segments: Sequence[Sequence[Frame]], onsets: tuple[OnsetGCC, ...], powers: FloatArray
+        self,
+        array: str,
+        segments: Sequence[Sequence[Frame]],
+        onsets: tuple[OnsetGCC, ...],
+        course: Course,
+        powers: FloatArray,
     ) -> None:
         """Add the sound of an array: see `Sounds.add`; `powers` (n,) are those of its frames, full scale squared."""
-        self.sounds.add(array, segments, onsets)
+        self.sounds.add(array, segments, onsets, course)
         self.powers[array] = powers
 
     def extend(self, start_ns: int, end_ns: int) -> None:
@@ -188,7 +202,7 @@ class Excerpt:
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
         for name, sound in backfilled.items():
             powers = np.array([frame.power for frame in sound.frames])
-            joined.sounds.add(name, [sound.frames], sound.onsets, requested=True)
+            joined.sounds.add(name, [sound.frames], sound.onsets, sound.course, requested=True)
             joined.powers[name] = powers
         return joined
 
@@ -377,9 +391,9 @@ class EvidenceCollector:
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
             if segments and not self._votes.is_suspect(name) and self._channel_faults.of(name) is None:
                 excerpt.powers[name] = np.array([stream.frames[k].power for k in there])
-                onsets = stream.correlations.at(window)
+                onsets, course = _correlated(stream, window, there[0])
                 if self._is_located(stream) and (onsets or Segments(segments)):
-                    excerpt.sounds.add(name, segments, onsets)
+                    excerpt.sounds.add(name, segments, onsets, course)
         return excerpt
 
     def whole_sounds(self, arrays: Iterable[str], span: range) -> list[tuple[ArraySpec, list[Frame]]]:
@@ -414,7 +428,14 @@ class EvidenceCollector:
             if not stream.correlations.has(needed) and stream.has_samples(needed):  # some frames came late
                 stream.begin_correlations()
                 self._correlate([stream], range(span.start, end))
-            onsets = stream.correlations.at(range(span.start, end))
+            onsets, course = _correlated(stream, range(span.start, end), start)
             if onsets or Segments(segments):
-                excerpt.sounds.add(stream.spec.name, segments, onsets)
+                excerpt.sounds.add(stream.spec.name, segments, onsets, course)
         excerpt.extend(start * FRAME_NS - stream.rest_ns, end * FRAME_NS - stream.rest_ns)
+
+
+def _correlated(stream: ArrayStream, span: range, begin: int) -> tuple[tuple[OnsetGCC, ...], Course]:
+    """Return the correlations of an array's frames in a span, and their course; its sound begins at `begin`."""
+    there = [k for k in span if k in stream.correlations.onsets and k in stream.frames]
+    powers = np.array([stream.frames[k].power for k in there])
+    return stream.correlations.at(there), Course(np.array(there, dtype=np.int64), powers, begin)

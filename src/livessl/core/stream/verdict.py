@@ -126,7 +126,8 @@ class Verdicts:
         estimate = _estimate(found, used)
         status, reason = self._judged(estimate, found)
         heard = self._received(found, received, faults)
-        first = replace(first, status=status, reason=_joined(reason, faults) or None, received=heard)
+        reason, power = _joined(reason, faults) or None, found.power or first.power
+        first = replace(first, status=status, reason=reason, power=power, received=heard)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
             first = replace(first, estimate=estimate, contributions=contributions)
@@ -138,8 +139,9 @@ class Verdicts:
                 status=Status.LOCATED,
                 reason=_joined(None, faults) or None,
                 received=(),
-                estimate=other,  # the power stays that of both sources: it cannot be divided
-                contributions=self._contributions(used.powers, other, found, backfilled),
+                estimate=_estimate(other, used),
+                power=other.power or first.power,
+                contributions=self._contributions(used.powers, _estimate(other, used), found, backfilled),
             )
             for source, other in enumerate(self._others(found, used), 2)
         )
@@ -191,7 +193,7 @@ class Verdicts:
             power=excerpt.greatest_power,
             contributions=self._contributions(excerpt.powers, estimate, found),
             complete_ns=excerpt.end_ns,
-            others=self._others(found, excerpt),
+            others=tuple(_estimate(other, excerpt) for other in self._others(found, excerpt)),
         ), found
 
     def count_votes(self, event: PendingEvent, excerpt: Excerpt, verdict: Verdict) -> None:
@@ -199,10 +201,9 @@ class Verdicts:
         if verdict.found is not None and verdict.events[0].status is not Status.REFUSED:
             self._state.votes.count(event.start, verdict.found, excerpt.sounds)
 
-    def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Estimate, ...]:
-        """Return the estimates of those further sources of the same sound that are positions."""
-        estimates = ((_estimate(other, excerpt), other) for other in found.others)
-        return tuple(estimate for estimate, other in estimates if self._judged(estimate, other)[0] is Status.LOCATED)
+    def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Localization, ...]:
+        """Return those further sources of the same sound that are positions."""
+        return tuple(o for o in found.others if self._judged(_estimate(o, excerpt), o)[0] is Status.LOCATED)
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         status, reason = judged(found, self._state.specs(estimate.arrays))

@@ -40,6 +40,7 @@ from livessl.core.types.sound import (
     Message,
     Observation,
     Received,
+    Uncertainty,
 )
 
 __all__ = [
@@ -75,6 +76,7 @@ __all__ = [
     "TrackState",
     "UInt8Array",
     "UInt16Array",
+    "Uncertainty",
     "Update",
     "Window",
     "read_only",

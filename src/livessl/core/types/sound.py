@@ -208,6 +208,28 @@ class GCC:
 
 
 @dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Standard deviations of what is known of an array's set-up.
+
+    Parameters
+    ----------
+    position_m : float
+        Place of the array and of its microphones, metres.
+    orientation_deg : float
+        Angle by which it may be turned, degrees.
+    clock_s : float
+        Delay between two channels of the array, seconds: 0 if one converter samples them all.
+    temperature_c : float
+        Air temperature, degrees Celsius.
+    """
+
+    position_m: float = 0.02
+    orientation_deg: float = 1.5
+    clock_s: float = 1e-4
+    temperature_c: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
 class ArraySpec:
     """A microphone array as the core needs it.
 
@@ -219,6 +241,8 @@ class ArraySpec:
         Absolute positions in channel order, metres.
     band_hz : (float, float)
         Lowest and highest frequency used.
+    uncertainty : Uncertainty
+        How well its set-up is known.
 
     Raises
     ------
@@ -229,6 +253,7 @@ class ArraySpec:
     name: str
     microphones_m: FloatArray
     band_hz: tuple[float, float]
+    uncertainty: Uncertainty = Uncertainty()
 
     def __post_init__(self) -> None:
         count, *rest = self.microphones_m.shape

@@ -11,10 +11,19 @@ from pydantic import BaseModel, ValidationError
 
 from livessl.core.geometry import as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
 from livessl.core.joint_array import joined
-from livessl.core.types import ArraySpec, FloatArray
+from livessl.core.types import ArraySpec, FloatArray, Uncertainty
 from livessl.errors import ConfigError, Fault
 from livessl.site.findings import dotted, read_yaml, reason, unknown_array, validation_findings
-from livessl.site.models import ArrayConfig, CalibrationFile, GeometryFile, Orientation, Shape, Site, SiteFile
+from livessl.site.models import (
+    ArrayConfig,
+    CalibrationFile,
+    GeometryFile,
+    Orientation,
+    Shape,
+    Site,
+    SiteFile,
+    UncertaintyConfig,
+)
 from livessl.site.place import Finding, Place
 
 Read = TypeVar("Read", bound=BaseModel)
@@ -64,8 +73,14 @@ def _array_specs(file: SiteFile, directory: Path) -> tuple[tuple[ArraySpec, ...]
             faults.append((("arrays", name, "band_hz"), what))
             continue
         if file.band_hz[0] < file.band_hz[1]:
-            specs.append(ArraySpec(name, positions, array.band_hz or file.band_hz))
+            known = Uncertainty(**(file.uncertainty.model_dump() | _given(array.uncertainty)))
+            specs.append(ArraySpec(name, positions, array.band_hz or file.band_hz, known))
     return tuple(specs), faults
+
+
+def _given(uncertainty: UncertaintyConfig | None) -> dict[str, float]:
+    """Return what an array's own entry says; the rest is the site's."""
+    return {} if uncertainty is None else uncertainty.model_dump(exclude_unset=True)
 
 
 def _processed_specs(file: SiteFile, specs: tuple[ArraySpec, ...]) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
