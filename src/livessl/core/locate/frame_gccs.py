@@ -104,7 +104,8 @@ class FrameGCCs:
     def rms(self) -> FloatArray:
         """Root mean square of each frame's GCCs over the live pairs: (F,)."""
         of_live = self.values[:, self.live]
-        return np.sqrt(np.einsum("fpl,fpl->f", of_live, of_live, dtype=np.float64) / max(1, of_live[0].size))
+        square = np.einsum("fpl,fpl->f", of_live, of_live, dtype=np.float64)
+        return np.asarray(np.sqrt(square / max(1, of_live[0].size)))
 
     def lag_indices(self, delays_s: FloatArray) -> IntArray:
         """Return the nearest lag of each delay."""

@@ -250,10 +250,9 @@ class SecondSourceSearch:
                 break
             position_m, power = refine.refine_peaks(functional, found, self._grid)
             candidate = Place(evidence, functional, position_m, power, power)
-            of_arrays = [
-                tuple(float(each.max()) for each in one.prominences(delays_s))
-                for one, delays_s in zip(remainders, _delays_s(candidate), strict=True)
-            ]
+            each = zip(remainders, _delays_s(candidate), strict=True)
+            of_frames = [one.prominences(delays_s) for one, delays_s in each]
+            of_arrays = [(float(above_all.max()), float(above_noise.max())) for above_all, above_noise in of_frames]
             score = power * majority([above_all for above_all, _ in of_arrays])
             if score > best:
                 best, chosen, prominences = score, candidate, of_arrays
@@ -261,8 +260,7 @@ class SecondSourceSearch:
         chosen = replace(chosen, rival_power=refine.rival_power(find, self._grid, chosen.position_m))
         above_all, above_noise = np.mean(prominences, axis=0)
         terms = chosen.functional.pair_terms(chosen.position_m)
-        each = zip(chosen.evidence, terms, strict=True)
-        peaks = [peak_to_rms(part, array_power(part, term)) for part, term in each]
+        peaks = [peak_to_rms(part, array_power(part, term)) for part, term in zip(chosen.evidence, terms, strict=True)]
         margin = refine.margin(chosen.power, chosen.rival_power)
         return chosen, SecondSourceFeatures(above_all, above_noise, margin, float(np.mean(peaks)))
 
