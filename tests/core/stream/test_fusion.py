@@ -164,7 +164,8 @@ def only_event(said: Iterable[tuple[float, Output]]) -> Event:
 
 def told(outputs: Iterable[Output]) -> str:
     """All that events say, to the last bit."""
-    return json.dumps([asdict(output) for output in outputs if isinstance(output, Event)], default=np.ndarray.tolist)
+    told = [asdict(replace(output, received=())) for output in outputs if isinstance(output, Event)]
+    return json.dumps(told, default=np.ndarray.tolist)
 
 
 def status_of(fusion: Fusion, array: str, now: float) -> ArrayStatus:
