@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import livessl
-from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.simulation.of_site import Simulation
 from livessl.simulation.scene import render

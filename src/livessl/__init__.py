@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from livessl.core.commission.findings import Finding
+    from livessl.core.commission.finding import Finding
     from livessl.core.geometry import Grid
     from livessl.core.locate.estimator import Estimator, Localization, Sound, register
     from livessl.core.locate.map_estimator import MapEstimator
@@ -58,7 +58,7 @@ _HOMES: Final = {
     "Estimator": "core.locate.estimator",
     "Event": "core.types",
     "Examination": "examination",
-    "Finding": "core.commission.findings",
+    "Finding": "core.commission.finding",
     "Grid": "core.geometry",
     "Localization": "core.locate.estimator",
     "MapEstimator": "core.locate.map_estimator",

@@ -11,7 +11,8 @@ import numpy as np
 from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.diagnosis import verify
-from livessl.core.commission.findings import Finding, set_up_findings, sharp_delays
+from livessl.core.commission.finding import Finding
+from livessl.core.commission.findings import set_up_findings, sharp_delays
 from livessl.core.commission.observe import observe
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredPose, measure_pose
 from livessl.core.commission.trial import PLACE_STD_M

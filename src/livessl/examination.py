@@ -10,7 +10,7 @@ import numpy as np
 from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
-from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.finding import Finding, Severity
 from livessl.core.commission.observe import observe
 from livessl.core.types import Event
 from livessl.recordings.assign import AssignedRecording

@@ -20,7 +20,7 @@ def test_check_summarizes_a_valid_site(run: Run, recorded: Recorded) -> None:
     assert checked == {**expected, "nodes": 3840}
 
 
-FAULTY = {"fusion.method": "music", "colour": "red", "arrays.north.position_m": [9, 9, 9], "grid.spacing_m": 0.001}
+FAULTY = {"fusion.method": "music", "colour": "red", "arrays.north.position_m": [9, 9, 9], "grid.spacing_m": 0}
 
 
 WIDE = [[0.1, 0.1, 2.5], [3.9, 0.1, 2.5], [3.9, 4.9, 2.5], [0.1, 4.9, 2.5]]

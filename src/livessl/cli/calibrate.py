@@ -20,7 +20,7 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav
 from livessl.cli.output import complain, print_warnings, xyz
 from livessl.clock import SystemClock, utc_text
-from livessl.core.commission.findings import Severity
+from livessl.core.commission.finding import Severity
 from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M, MeasuredPose
 from livessl.errors import UseError
 from livessl.site.models import Site

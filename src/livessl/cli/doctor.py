@@ -14,8 +14,7 @@ from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.core.commission.findings import Finding, Severity
-from livessl.core.commission.trial import LEAST_SOUNDS
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.errors import RunError, UseError
 from livessl.examination import Examination, examine_parts
 from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions, span_ns

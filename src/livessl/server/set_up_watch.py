@@ -11,12 +11,9 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from livessl.core.commission.findings import Finding, Severity
-from livessl.core.commission.observe import observe
-from livessl.core.commission.trial import LEAST_SOUNDS
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.types import Event, Observation, Received
 from livessl.server.overload import Overload
-from livessl.site.build.set_up import find_set_up_faults
 from livessl.site.models import Site
 
 KEPT_SOUNDS: Final = 12
@@ -95,6 +92,9 @@ class SetUpWatch:
 
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
+        from livessl.core.commission.observe import observe  # scipy's optimizer takes a while, and no event needs it
+        from livessl.site.build.set_up import find_set_up_faults
+
         with self._lock:
             new, known, run = list(self._new), list(self._sounds), self._run
             self._new.clear()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from livessl.core.commission.channels import ChannelMeter
-from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import Float32Array
 
 

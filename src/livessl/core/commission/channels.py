@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.commission.findings import Finding, Severity
+from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import Float32Array, FloatArray
 
 CLIPPED: Final = 0.995

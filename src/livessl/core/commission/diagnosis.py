@@ -14,8 +14,9 @@ from typing import Final
 import numpy as np
 
 from livessl.core.commission.alternative import Alternative
+from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
-from livessl.core.commission.trial import LEAST_SOUNDS, Trial
+from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
 
 MIN_GAIN: Final = 12.0

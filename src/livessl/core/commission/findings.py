@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.commission.places import Microphones, stacked
-from livessl.core.commission.trial import LEAST_SOUNDS
 from livessl.core.types import BoolArray, FloatArray, Observation
 
 LEAST_SHARPNESS: Final = 3.5
@@ -41,47 +39,6 @@ APART_M: Final = 0.02
 
 SILENT: Final = 1e-9
 """Power relative to the array's median below which a channel is dead: converters leave more noise."""
-
-
-class Severity(StrEnum):
-    """Weight of a finding: with an error, positions are wrong or refused; with a warning, they are worse."""
-
-    ERROR = "error"
-    WARNING = "warning"
-    INFO = "info"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is wrong with a set-up.
-
-    Parameters
-    ----------
-    fault : str
-        Code of the fault, such as `swapped`.
-    array : str or None
-        The array; None for the whole site.
-    channel : int or None
-        Channel of the array, from 1; None for all.
-    severity : Severity
-    confidence : float
-        0 to 1.
-    message : str
-        What is wrong, in one sentence without a full stop.
-    cure : str
-        What to do.
-    input : int or None
-        Input of the device that carries the channel, from 1, where the site file says so.
-    """
-
-    fault: str
-    array: str | None
-    channel: int | None
-    severity: Severity
-    confidence: float
-    message: str
-    cure: str
-    input: int | None = None
 
 
 def find_faults(

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.alternative import LEAST_SHIFT_M, LEAST_TURN_DEG, Alternative
+from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, Places, PlaceSearch, degrees_of_freedom
 from livessl.core.commission.poses import DELAY_STD_S, UNKNOWN_M, Adjusted, Freedom, adjust
 from livessl.core.types import FloatArray, IntArray
@@ -23,9 +24,6 @@ REFINED: Final = 6
 
 MIN_FOR_ONE: Final = 4
 """Fewest microphones of an array of which a single one is examined: the others must say what it ought to receive."""
-
-LEAST_SOUNDS: Final = 3
-"""Fewest sounds from which anything is concluded."""
 
 FLOOR_S: Final = 12e-6
 """Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from livessl.core.commission.findings import Severity
+from livessl.core.commission.finding import Severity
 from livessl.server.api.schema import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
 
 IntervalM = Annotated[

@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from livessl.core.commission.findings import Severity
+from livessl.core.commission.finding import Severity
 from livessl.server.api.encode import JsonObject
 from livessl.server.parts import Parts
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from livessl.core.commission.findings import Finding, find_faults
+from livessl.core.commission.finding import Finding
+from livessl.core.commission.findings import find_faults
 from livessl.core.types import Observation
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site

@@ -1,0 +1,51 @@
+"""What is wrong with a set-up, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+LEAST_SOUNDS: Final = 3
+"""Fewest sounds from which anything is concluded."""
+
+
+class Severity(StrEnum):
+    """Weight of a finding: with an error, positions are wrong or refused; with a warning, they are worse."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a set-up.
+
+    Parameters
+    ----------
+    fault : str
+        Code of the fault, such as `swapped`.
+    array : str or None
+        The array; None for the whole site.
+    channel : int or None
+        Channel of the array, from 1; None for all.
+    severity : Severity
+    confidence : float
+        0 to 1.
+    message : str
+        What is wrong, in one sentence without a full stop.
+    cure : str
+        What to do.
+    input : int or None
+        Input of the device that carries the channel, from 1, where the site file says so.
+    """
+
+    fault: str
+    array: str | None
+    channel: int | None
+    severity: Severity
+    confidence: float
+    message: str
+    cure: str
+    input: int | None = None
