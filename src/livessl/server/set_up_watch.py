@@ -92,14 +92,14 @@ class SetUpWatch:
 
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
-        from livessl.core.commission.observe import observe  # scipy's optimizer takes a while, and no event needs it
-        from livessl.site.build.set_up import find_set_up_faults
-
         with self._lock:
             new, known, run = list(self._new), list(self._sounds), self._run
             self._new.clear()
         if not new:
             return
+        from livessl.core.commission.observe import observe  # scipy's optimizer takes memory, and no event needs it
+        from livessl.site.build.set_up import find_set_up_faults
+
         sounds = [*known, *(observe(received) for received in new)][-KEPT_SOUNDS:]
         findings = tuple(find_set_up_faults(self._site, sounds)) if len(sounds) >= LEAST_SOUNDS else ()
         with self._lock:
