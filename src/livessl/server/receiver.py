@@ -28,9 +28,10 @@ from livessl.site.models import Site
 POLL_MS: Final = 20
 """Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
-PEER_MESSAGES: Final = 8
-"""Messages of one node that ZeroMQ receives before they are read: 0.2 s of two arrays. The rest waits with the node,
-whose memory is bounded, while by ZeroMQ's default each node would fill 35 MB here."""
+PEER_MESSAGES: Final = 64
+"""Messages of one node that ZeroMQ receives before they are read: 1.6 s of two arrays. The rest waits with the node,
+whose memory is bounded, while by ZeroMQ's default each node would fill 35 MB here. With 8, a node that ended on a busy
+machine could not hand over its last messages in time."""
 
 DRAIN: Final = 64
 """Most messages that are read before they are put into the queue: one frame index of 64 arrays. Waking the fusion for
