@@ -12,14 +12,14 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.finding import Finding
-from livessl.core.commission.findings import set_up_findings, sharp_delays
+from livessl.core.commission.findings import channel_findings, set_up_findings, sharp_delays
 from livessl.core.commission.observe import observe
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredPose, measure_pose
 from livessl.core.commission.trial import PLACE_STD_M
 from livessl.core.types import Event, FloatArray
 from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording
-from livessl.site.build.set_up import find_set_up_faults, with_inputs
+from livessl.site.build.set_up import with_inputs
 from livessl.site.models import Site
 
 MOST_CLAPS: Final = 64
@@ -75,7 +75,7 @@ def verified(site: Site, claps: Sequence[Clap]) -> list[Finding]:
     """Find what explains the errors at known places: the faults of channels, and of the order and poses of arrays."""
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
     sounds = [observe(clap.event.received) for clap in claps]
-    of_channels = [one for one in find_set_up_faults(site, sounds) if one.channel is not None]
+    of_channels = with_inputs(site, channel_findings(microphones, sounds))
     delays = sharp_delays(microphones, sounds, of_channels)
     microphones = {name: microphones[name] for name in delays}
     if not microphones:

@@ -35,7 +35,7 @@ class Examination:
 
     @property
     def is_sound(self) -> bool:
-        """Whether no finding is an error."""
+        """True if no finding is an error."""
         return all(finding.severity is not Severity.ERROR for finding in self.findings)
 
 

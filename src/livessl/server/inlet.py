@@ -36,7 +36,7 @@ class Inlet(Generic[T]):
         self.nbytes = 0
         """Bytes in the queue."""
         self.delay_s = 0.0
-        """How long the first item of the last `take` had waited, in seconds; 0 if there was none."""
+        """Time, in seconds, that the first item of the last `take` had waited; 0 if there was none."""
 
     def __len__(self) -> int:
         return len(self._items)

@@ -118,7 +118,7 @@ class Inbox(Protocol):
 
     @property
     def delay_s(self) -> float:
-        """How long the first item of the last `take` had waited, in seconds; 0 if there was none."""
+        """Time, in seconds, that the first item of the last `take` had waited; 0 if there was none."""
         ...
 
     def start(self) -> None:
@@ -210,7 +210,7 @@ class Receiver:
 
     @property
     def delay_s(self) -> float:
-        """How long the first item of the last `take` had waited, in seconds; 0 if there was none."""
+        """Time, in seconds, that the first item of the last `take` had waited; 0 if there was none."""
         return self._inlet.delay_s
 
     def request(self, request: BackfillRequest) -> None:

@@ -53,7 +53,7 @@ class SetUpWatch:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong, errors first."""
+        """Faults of the set-up, errors first."""
         return self._findings
 
     @property

@@ -117,7 +117,7 @@ class ChannelMeter:
     def _hum_dbfs(self) -> list[tuple[float, float] | None]:
         """Frequency and level of each channel's hum; None where there is none."""
         # power of a sine at each bin; the median over the windows leaves out voices, which have lines as well
-        spectrum = 4.0 * np.median(self._low, axis=0) / self._hann.sum() ** 2 / 2.0
+        spectrum = 2.0 * np.median(self._low, axis=0) / self._hann.sum() ** 2
         found: list[tuple[float, float] | None] = []
         for channel in spectrum:
             best: tuple[float, float] | None = None

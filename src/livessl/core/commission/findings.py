@@ -57,15 +57,21 @@ def find_faults(
     c_m_s : float
         Speed of sound as the site file has it, m/s.
     """
-    findings: list[Finding] = []
-    for array, at_m in microphones.items():
-        observed = [one for sound in sounds for one in sound if one.array == array]
-        findings += _of_channels(array, at_m, observed)
+    findings = channel_findings(microphones, sounds)
     delays = sharp_delays(microphones, [sound for sound in sounds if len(sound) > 1], findings)
     microphones = {array: microphones[array] for array in delays}
     if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
         findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s))
     return sorted(findings, key=lambda one: (list(Severity).index(one.severity), one.array or "", one.channel or 0))
+
+
+def channel_findings(microphones: Microphones, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
+    """Find the faults of single channels, which need no geometry: see `find_faults`."""
+    findings: list[Finding] = []
+    for array, at_m in microphones.items():
+        observed = [one for sound in sounds for one in sound if one.array == array]
+        findings += _of_channels(array, at_m, observed)
+    return findings
 
 
 def sharp_delays(

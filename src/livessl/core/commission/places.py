@@ -120,7 +120,8 @@ class PlaceSearch:
         """Refine places (S, 3) by the method of Levenberg and Marquardt, all sounds at once, within the volume."""
         c = self.c_m_s if c_m_s is None else c_m_s
         positions_m, damping = starts_m.copy(), np.full(len(starts_m), _FIRST_DAMPING)
-        off, slope = _residuals(microphones, delays, positions_m, c)
+        off = contradictions_s(microphones, delays, positions_m, c)
+        slope = slopes_s_m(microphones, delays, positions_m, c)
         cost = (off**2).sum(axis=1)
         for _ in range(_STEPS):
             normal = np.einsum("sri,srj->sij", slope, slope)
@@ -132,7 +133,8 @@ class PlaceSearch:
                 self.bounds_m[:, 0],
                 self.bounds_m[:, 1],
             )
-            tried, tried_slope = _residuals(microphones, delays, moved_m, c)
+            tried = contradictions_s(microphones, delays, moved_m, c)
+            tried_slope = slopes_s_m(microphones, delays, moved_m, c)
             tried_cost = (tried**2).sum(axis=1)
             better = tried_cost < cost
             done = np.linalg.norm(moved_m - positions_m, axis=1).max() < _LEAST_M
@@ -176,26 +178,32 @@ class KnownPlaces(PlaceSearch):
         c_m_s: float | None = None,
     ) -> Places:
         """The places, and how far the delays are from them."""
-        off, _ = _residuals(microphones, delays, self._points_m, self.c_m_s if c_m_s is None else c_m_s)
+        off = contradictions_s(microphones, delays, self._points_m, self.c_m_s if c_m_s is None else c_m_s)
         count = np.sum([np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in delays.values()], axis=0)
         return Places(self._points_m, np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1)))
 
 
-def _residuals(
-    microphones: Microphones, delays: Delays, positions_m: FloatArray, c_m_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """What the delays at places (S, 3) are off by, (S, R) seconds, and its slope (S, R, 3); R counts all channels."""
-    parts, slopes = [], []
+def contradictions_s(microphones: Microphones, delays: Delays, positions_m: FloatArray, c_m_s: float) -> FloatArray:
+    """What the delays of sounds at places (S, 3) are off by, (S, R) seconds; R counts all channels of all arrays."""
+    parts = []
     for name, measured in delays.items():
-        towards = positions_m[:, None] - microphones[name][None]
-        away_m = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
-        there = np.isfinite(measured)
-        predicted = np.where(there, away_m / c_m_s, np.nan)
+        away_m = np.linalg.norm(positions_m[:, None] - microphones[name], axis=2)
+        predicted = np.where(np.isfinite(measured), away_m / c_m_s, np.nan)
         parts.append(centred(predicted) - centred(measured))
-        unit = np.where(there[..., None], towards / (away_m * c_m_s)[..., None], 0.0)
-        count = np.maximum(there.sum(axis=1), 1)[:, None, None]
-        slopes.append(np.where(there[..., None], unit - unit.sum(axis=1, keepdims=True) / count, 0.0))
-    return np.concatenate(parts, axis=1), np.concatenate(slopes, axis=1)
+    return np.concatenate(parts, axis=1)
+
+
+def slopes_s_m(microphones: Microphones, delays: Delays, positions_m: FloatArray, c_m_s: float) -> FloatArray:
+    """Slope (S, R, 3) of `contradictions_s` by the places, seconds per metre."""
+    parts = []
+    for name, measured in delays.items():
+        towards = positions_m[:, None] - microphones[name]
+        away_m = np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
+        there = np.isfinite(measured)[..., None]
+        slopes = np.where(there, towards / (away_m * c_m_s), 0.0)
+        mean = slopes.sum(axis=1, keepdims=True) / np.maximum(there.sum(axis=1, keepdims=True), 1)
+        parts.append(np.where(there, slopes - mean, 0.0))
+    return np.concatenate(parts, axis=1)
 
 
 def _points(bounds_m: FloatArray) -> FloatArray:

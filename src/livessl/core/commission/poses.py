@@ -15,8 +15,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from livessl.core.commission.places import Delays, Microphones, centred
-from livessl.core.types import BoolArray, FloatArray
+from livessl.core.commission.places import Delays, Microphones, contradictions_s, slopes_s_m
+from livessl.core.types import FloatArray
 
 DELAY_STD_S: Final = 20e-6
 """Standard deviation of a measured delay in a room, seconds."""
@@ -31,6 +31,9 @@ _TOLERANCE: Final = 1e-5
 _MOST_STEPS: Final = 40
 _STEP: Final = 1e-4
 """Step of the differences, in units of these scales of the unknowns."""
+
+_UNKNOWNS: Final = 6
+"""Unknowns of a pose: three of the shift, three of the turn."""
 
 _SHIFT_SCALE_M: Final = 0.1
 _TURN_SCALE_RAD: Final = 0.1
@@ -47,13 +50,10 @@ class Freedom:
         Standard deviations of the position in metres and of the orientation in degrees; arrays that are not named stay.
     speed_std_m_s : float
         Standard deviation of the speed of sound, m/s; 0 if it is known.
-    upright : bool
-        Whether arrays may turn about the vertical only.
     """
 
     arrays: Mapping[str, tuple[float, float]]
     speed_std_m_s: float = 0.0
-    upright: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,12 +167,9 @@ class _Problem:
         self._microphones, self._delays, self._places_m = microphones, delays, places_m
         self._c_m_s, self._freedom, self._place_std_m = c_m_s, freedom, place_std_m
         self._free = [name for name in microphones if name in freedom.arrays]
-        self._measured = {name: centred(one) for name, one in delays.items()}
-        self._there = {name: np.isfinite(one) for name, one in delays.items()}
-        self._turns = 1 if freedom.upright else 3
-        count = len(self._free) * (3 + self._turns) + (freedom.speed_std_m_s > 0.0)
+        count = len(self._free) * _UNKNOWNS + (freedom.speed_std_m_s > 0.0)
         self.start = np.concatenate([np.zeros(count), places_m.ravel()])
-        pose_scale = [_SHIFT_SCALE_M] * 3 + [_TURN_SCALE_RAD] * self._turns
+        pose_scale = [_SHIFT_SCALE_M] * 3 + [_TURN_SCALE_RAD] * 3
         self.scale = np.array(
             [*pose_scale * len(self._free), *([_SPEED_SCALE_M_S] if freedom.speed_std_m_s > 0.0 else [])]
             + [1.0] * places_m.size
@@ -202,7 +199,7 @@ class _Problem:
             slopes[:, column] = (self.residuals(moved) - here) / step
         poses, speed_m_s, places_m = self._unpack(unknowns)
         sounds = np.arange(len(places_m))
-        of_places = _by_place(self._moved(poses), self._there, places_m, speed_m_s) / DELAY_STD_S
+        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / DELAY_STD_S
         rows = of_places.shape[1]
         blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
         blocks[sounds, :, sounds] = of_places
@@ -212,29 +209,24 @@ class _Problem:
     def result(self, unknowns: FloatArray, jacobian: FloatArray) -> Adjusted:
         """The unknowns as a result, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
-        covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+        covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
         off = self._off(poses, speed_m_s, places_m)
-        count = sum(there.sum(axis=1) - 1 for there in self._there.values())
+        count = sum(np.isfinite(one).sum(axis=1) - 1 for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
-        size = 3 + self._turns
         found = {}
         for index, name in enumerate(self._free):
-            own = covariance[index * size : (index + 1) * size, index * size : (index + 1) * size]
-            full = np.zeros((6, 6))
-            axes = [0, 1, 2, 5] if self._freedom.upright else list(range(6))
-            full[np.ix_(axes, axes)] = own
+            own = slice(index * _UNKNOWNS, (index + 1) * _UNKNOWNS)
             shift_m, turn = poses[name]
-            found[name] = Pose(shift_m, np.degrees(turn), full)
-        at = len(self._free) * size
+            found[name] = Pose(shift_m, np.degrees(turn), covariance[own, own])
+        at = len(self._free) * _UNKNOWNS
         c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
         return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
 
     def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
         poses, at = {}, 0
         for name in self._free:
-            shift_m, turn = unknowns[at : at + 3], unknowns[at + 3 : at + 3 + self._turns]
-            poses[name] = shift_m, np.array([0.0, 0.0, turn[0]]) if self._freedom.upright else turn
-            at += 3 + self._turns
+            poses[name] = unknowns[at : at + 3], unknowns[at + 3 : at + _UNKNOWNS]
+            at += _UNKNOWNS
         speed_m_s = self._c_m_s
         if self._freedom.speed_std_m_s > 0.0:
             speed_m_s, at = self._c_m_s + unknowns[at], at + 1
@@ -243,36 +235,16 @@ class _Problem:
     def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, FloatArray]:
         return {
             name: moved(self._microphones[name], *poses[name]) if name in poses else self._microphones[name]
-            for name in self._measured
+            for name in self._delays
         }
 
     def _off(
         self, poses: Mapping[str, tuple[FloatArray, FloatArray]], c_m_s: float, places_m: FloatArray
     ) -> FloatArray:
-        """What the delays are off by, (S, R) seconds; R counts all channels."""
-        parts = []
-        for name, at_m in self._moved(poses).items():
-            away_m = np.linalg.norm(places_m[:, None] - at_m[None], axis=2)
-            parts.append(centred(np.where(self._there[name], away_m / c_m_s, np.nan)) - self._measured[name])
-        return np.concatenate(parts, axis=1)
+        return contradictions_s(self._moved(poses), self._delays, places_m, c_m_s)
 
 
 def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
     """Positions after a turn (a vector, radians) about their centre and a shift, metres."""
     centre_m = microphones_m.mean(axis=0)
     return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
-
-
-def _by_place(
-    microphones: Microphones, there: Mapping[str, BoolArray], places_m: FloatArray, c_m_s: float
-) -> FloatArray:
-    """Slope (S, R, 3) of the centred delays by the places, seconds per metre."""
-    parts = []
-    for name, at_m in microphones.items():
-        towards = places_m[:, None] - at_m[None]
-        away_m = np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
-        here = there[name][..., None]
-        slopes = np.where(here, towards / (away_m * c_m_s), 0.0)
-        mean = slopes.sum(axis=1, keepdims=True) / np.maximum(here.sum(axis=1, keepdims=True), 1)
-        parts.append(np.where(here, slopes - mean, 0.0))
-    return np.concatenate(parts, axis=1)

@@ -157,7 +157,7 @@ class Finding(BaseModel):
 
 
 class Findings(_Versioned):
-    """What the last sounds say is wrong with the set-up, errors first."""
+    """Faults of the set-up that the last sounds show, errors first."""
 
     sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
     findings: list[Finding]

@@ -110,7 +110,7 @@ def state_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
-        """What the last sounds say is wrong with the set-up, errors first."""
+        """Faults of the set-up that the last sounds show, errors first."""
         watch = parts.set_up_watch
         findings = [{"kind": "finding", **asdict(finding)} for finding in watch.findings]
         return as_json({"v": API_VERSION, "sounds": watch.sounds, "findings": findings})

@@ -1,4 +1,4 @@
-"""What sounds say about a site's set-up: the findings of the core, with the inputs of the site's devices."""
+"""Faults of a site's set-up that sounds show: the findings of the core, with the inputs of the site's devices."""
 
 from __future__ import annotations
 
