@@ -15,9 +15,9 @@ import yaml
 
 from livessl.calibration import MOST_CLAPS, Clap, claps_of, measured_poses, verified
 from livessl.cli import argument, progress
-from livessl.cli.doctor import finding_line, recordings_given
+from livessl.cli.doctor import add_recordings, finding_line, recordings_given
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_joint, add_json, add_wav
+from livessl.cli.options import add_json
 from livessl.cli.output import complain, print_warnings, xyz
 from livessl.clock import SystemClock, utc_text
 from livessl.core.commission.finding import Severity
@@ -41,12 +41,7 @@ def add_arguments(parser: Any) -> None:
             epilog=f"example: livessl calibrate {example}",
         )
         sub.set_defaults(act=act)
-        sub.add_argument("--site", type=Path, help="site file (default: the session's own)")
-        sub.add_argument(
-            "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
-        )
-        add_wav(sub, "recording of an array instead, WAV or FLAC; repeat for each array")
-        add_joint(sub)
+        add_recordings(sub)
         sub.add_argument(
             "--at",
             action="append",

@@ -28,19 +28,24 @@ ANSWER_S: Final = 10.0
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own); not needed with --url")
+    add_recordings(parser)
     parser.add_argument(
         "--url", help="running server to ask, such as http://127.0.0.1:8000; it examines its last sounds"
     )
     parser.add_argument(
         "--token-file", type=Path, metavar="FILE", help="file that holds a token for the server, where it wants one"
     )
+    add_json(parser, "print one JSON object per finding")
+
+
+def add_recordings(parser: Any) -> None:
+    """Add --site, --session, --wav, --channels and --joint, which `recordings_given` reads."""
+    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
     add_wav(parser, "recording of an array instead, WAV or FLAC; repeat for each array")
     add_joint(parser)
-    add_json(parser, "print one JSON object per finding")
 
 
 def run(arguments: argparse.Namespace) -> int:
