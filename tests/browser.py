@@ -25,9 +25,15 @@ def running_browser() -> Iterator[Browser]:
 
 @contextmanager
 def faultless_page(browser: Browser) -> Iterator[Page]:
-    """Open a page; the test fails at the end if the page's code has raised an error."""
+    """Open a page; the test fails if the page's code has raised an error, and then also says which requests failed."""
     page = browser.new_page()
     faults: list[str] = []
+    failed: list[str] = []
     page.on("pageerror", lambda error: faults.append(str(error)))
-    yield page
+    page.on("requestfailed", lambda request: failed.append(f"{request.url}: {request.failure}"))
+    try:
+        yield page
+    except AssertionError as error:
+        error.add_note(f"errors of the page: {faults}; requests that failed: {failed}")
+        raise
     assert faults == []
