@@ -137,9 +137,9 @@ def test_page_loads_again_if_a_file_of_it_did_not_arrive(browser: Browser, repla
     with faultless_page(browser) as page:
         page.route(f"**/static/{name}", lambda route: route.abort(), times=1)
         page.goto(replayed.url)
-        expect(page.get_by_test_id("banner")).to_contain_text("did not load completely", timeout=1000 * HANG_S)
+        expect(page.get_by_test_id("incomplete")).to_be_visible(timeout=1000 * HANG_S)
         expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
-        expect(page.get_by_test_id("banner")).to_be_hidden()
+        expect(page.get_by_test_id("incomplete")).to_be_hidden()
 
 
 @pytest.mark.parametrize(
