@@ -80,6 +80,7 @@ COMMANDS: Final = (
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
+    Command("init", "write a first site file", "livessl init --room 8,10,4 --arrays 2 --interface UMC1820"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
 )

@@ -87,16 +87,16 @@ def read_site(arguments: argparse.Namespace) -> Site:
 
 def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
     """Return the names of the arrays that --joint joins, by the name of the joint array."""
-    return _each_once(arguments.joint, "--joint")
+    return each_once(arguments.joint, "--joint")
 
 
 def wavs(arguments: argparse.Namespace) -> tuple[dict[str, tuple[Path, ...]], dict[str, list[int]]]:
     """Return the files of --wav and the channels of --channels, by array."""
     each = "; give one file for each microphone as ARRAY=FILE,FILE,…"
-    return _each_once(arguments.wav, "--wav", each), _each_once(arguments.channels, "--channels")
+    return each_once(arguments.wav, "--wav", each), each_once(arguments.channels, "--channels")
 
 
-def _each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
+def each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
     names = [name for name, _ in pairs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
