@@ -39,7 +39,7 @@ INTERFACES: Final = (
     Interface("UMC404HD", 4, range(1, 5), 48000.0),
     Interface("Scarlett 18i20", 26, range(1, 9), 48000.0, "S/PDIF, ADAT and loopback inputs"),
     Interface("ReSpeaker 4 Mic", 6, range(2, 6), 16000.0, "its processed sound (1) and its playback (6)"),
-    Interface("XVF3800", 6, range(3, 7), 48000.0, "its processed sound"),
+    Interface("XVF3800", 6, range(3, 7), 16000.0, "its processed sound (1 and 2)"),
 )
 """Interfaces that `docs/hardware.md` describes, with the sources of these numbers."""
 
