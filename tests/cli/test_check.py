@@ -17,7 +17,9 @@ def test_check_summarizes_a_valid_site(run: Run, recorded: Recorded) -> None:
     assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid points" in done.out
     [checked] = run("check", recorded.site, "--json").objects
     expected = {"valid": True, "faults": [], "warnings": [], "site": "small", "arrays": ["north", "south"]}
+    layout = checked.pop("layout")
     assert checked == {**expected, "nodes": 3840}
+    assert set(layout["arrays"]) == {"north", "south"}
 
 
 FAULTY = {"fusion.method": "music", "colour": "red", "arrays.north.position_m": [9, 9, 9], "grid.spacing_m": 0}

@@ -57,8 +57,10 @@ def test_proposed_site_is_valid_and_causes_no_warning(
     assert site.warnings == ()
     for array, spec in zip(arrays, site.specs, strict=True):
         assert np.linalg.norm(spec.centre_m - array.centre_m) < 1e-3
-        radii = (np.linalg.norm(places - places.mean(axis=0), axis=1) for places in (spec.microphones_m, shape_m(array)))
-        assert np.allclose(*radii, atol=1e-4)
+        built, meant = (
+            np.linalg.norm(places - places.mean(axis=0), axis=1) for places in (spec.microphones_m, shape_m(array))
+        )
+        assert np.allclose(built, meant, atol=1e-4)
 
 
 @settings(max_examples=20, deadline=None)
@@ -72,7 +74,9 @@ def test_names_are_read_back_as_they_were_given(names: list[str], interface: str
     arrays = tuple(
         DraftArray(name, "tetrahedron", 0.5, 4, (1.0 + 3 * index, 2.0, 1.2), 0.0) for index, name in enumerate(names)
     )
-    node = DraftNode("pc", interface, 48000.0, {name: (4 * k + 1, 4 * k + 2, 4 * k + 3, 4 * k + 4) for k, name in enumerate(names)})
+    node = DraftNode(
+        "pc", interface, 48000.0, {name: (4 * k + 1, 4 * k + 2, 4 * k + 3, 4 * k + 4) for k, name in enumerate(names)}
+    )
     site = parse_site(site_text(Draft("lab", (6.0, 5.0, 2.7), 20.0, arrays, (node,))))
     assert list(site.arrays) == names
     assert list(site.nodes["pc"].arrays) == names
@@ -82,7 +86,18 @@ def test_names_are_read_back_as_they_were_given(names: list[str], interface: str
 def test_flags_determine_the_site(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     arrays = ("--array", "north=tetrahedron:0.4@4,2.5,1.5@90", "--array", "south=line:0.1x6@4,7.5,1.2")
-    options = ("--room", "8,10,4", "--temperature", "24", "--name", "hall", "--interface", "my interface", "--rate", 96000)
+    options = (
+        "--room",
+        "8,10,4",
+        "--temperature",
+        "24",
+        "--name",
+        "hall",
+        "--interface",
+        "my interface",
+        "--rate",
+        96000,
+    )
     done = run("init", path, "--yes", *options, *arrays, "--channels", "south=9,10,11,12,13,14")
     assert done.code == 0
     assert f"next: livessl check {path}" in done.out
@@ -118,14 +133,14 @@ def test_arrays_are_dealt_to_the_inputs_of_known_interfaces(
 
 
 def test_connected_interface_is_proposed(run: Run, tmp_path: Path, connected: Callable[..., None]) -> None:
-    connected(InputDevice("HDA Intel: (hw:0,0)", "ALSA", 2, 44100.0), InputDevice("Zoom F8: (hw:1,0)", "ALSA", 8, 48000.0))
+    connected(
+        InputDevice("HDA Intel: (hw:0,0)", "ALSA", 2, 44100.0), InputDevice("Zoom F8: (hw:1,0)", "ALSA", 8, 48000.0)
+    )
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
     assert load_site(tmp_path / "site.yaml").nodes["pc"].device.name == "Zoom F8"  # type: ignore[union-attr]
 
 
-def test_machine_without_portaudio_gets_a_site_file(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> list[InputDevice]:
         raise DeviceError("no PortAudio")
 
@@ -139,7 +154,9 @@ def test_existing_file_is_replaced_only_on_request(run: Run, tmp_path: Path) -> 
     path.write_text("mine", encoding="utf-8")
     done = run("init", path, *UMC)
     assert done.code == 2
-    assert done.err == f"livessl: error: {path}: expected a new file, but it exists; give another name, or add --force\n"
+    assert (
+        done.err == f"livessl: error: {path}: expected a new file, but it exists; give another name, or add --force\n"
+    )
     assert path.read_text(encoding="utf-8") == "mine"
     assert run("init", path, *UMC, "--force").code == 0
     assert load_site(path).site == "lab"
@@ -153,13 +170,22 @@ def test_existing_file_is_replaced_only_on_request(run: Run, tmp_path: Path) -> 
         (("--array", "north=square:0.5x5"), "expected square:SIZE, which has 4 microphones, got"),
         (("--array", "n=line:0.1@1,2"), "expected x,y,z in metres"),
         (("--array", "n=line:0.1", "--array", "n=line:0.1"), "expected each array once, got 'n' twice"),
-        (("--array", "n=line", "--array", "s=line", "--arrays", "1"), "expected at least the 2 arrays of --array, got 1"),
+        (
+            ("--array", "n=line", "--array", "s=line", "--arrays", "1"),
+            "expected at least the 2 arrays of --array, got 1",
+        ),
         (("--room", "8,0,4"), "expected three lengths above 0"),
         (("--room", "8000,10000,4000"), "did you mean [8, 10, 4], from millimetres?"),
         (("--array", "n=tetrahedron@9,1,1"), "is outside the room"),
-        (("--array", "n=line:0.02x6", "--interface", "UMC404HD"), "at most 4 microphones, the inputs of UMC404HD, got 6"),
+        (
+            ("--array", "n=line:0.02x6", "--interface", "UMC404HD"),
+            "at most 4 microphones, the inputs of UMC404HD, got 6",
+        ),
         (("--channels", "west=1,2,3,4"), "expected one of the arrays array-1, array-2, got 'west'"),
-        (("--interface", "a", "--interface", "b", "--interface", "c"), "at most one interface for each array, got 3 for 2"),
+        (
+            ("--interface", "a", "--interface", "b", "--interface", "c"),
+            "at most one interface for each array, got 3 for 2",
+        ),
         (("--name", "our lab"), "expected a name of letters"),
     ],
 )

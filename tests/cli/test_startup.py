@@ -44,6 +44,13 @@ def loaded(*arguments: str, code: int) -> set[str]:
     return set(names)
 
 
+def loaded_before_exit(*arguments: str) -> set[str]:
+    """Return the names of all modules that a command has imported which argparse ends."""
+    script = f"import atexit, sys; atexit.register(lambda: print(sorted(sys.modules), file=sys.stderr))\n{RUN}"
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True)
+    return {name.strip("'") for name in done.stderr.strip("[]\n").split(", ")}
+
+
 def test_capture_imports_nothing_that_localizes() -> None:
     names = loaded("capture", "--site", str(PAPER), "--node", "nobody", code=2)
     assert {"livessl.capture.node", "livessl.capture.link", "livessl.site.models"} <= names
@@ -76,7 +83,15 @@ def test_evaluate_imports_the_evaluation() -> None:
     assert loaded("evaluate", "report", "--out", "unused", code=2) >= EVALUATION
 
 
-def test_check_of_a_method_of_ones_own_imports_nothing_that_localizes(tmp_path: Path) -> None:
+def test_check_of_a_method_of_ones_own_imports_neither_the_method_nor_the_fusion(tmp_path: Path) -> None:
     """The module of the method does not exist, and the check does not look for it."""
     site = write_site(tmp_path, {"fusion.method": "nowhere:Method"})
-    assert loaded("check", str(site), code=0) & LOCALIZES == set()
+    names = loaded("check", str(site), code=0)
+    assert "livessl.lab.plan.prediction" in names, "the expected error"
+    live = {"livessl.core.stream.fusion", "livessl.core.locate.peak_search", "livessl.server", "fastapi", "matplotlib"}
+    assert names & live == set()
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",)])
+def test_help_of_all_commands_imports_no_numerics(arguments: tuple[str, ...]) -> None:
+    assert loaded_before_exit(*arguments) & {"numpy", "pydantic", "yaml", "threadpoolctl", "zmq"} == set()

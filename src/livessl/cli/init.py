@@ -67,7 +67,10 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--yes", action="store_true", help="ask nothing; take defaults for what is not given")
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
     parser.add_argument(
-        "--drawing", type=Path, metavar="FILE", help="instead of a site file, write a printable drawing (SVG) of the array"
+        "--drawing",
+        type=Path,
+        metavar="FILE",
+        help="instead of a site file, write a printable drawing (SVG) of the array",
     )
 
 

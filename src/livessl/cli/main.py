@@ -80,6 +80,7 @@ COMMANDS: Final = (
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("init", "write a first site file", "livessl init --room 8,10,4 --arrays 2 --interface UMC1820"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
+    Command("config", "show the settings that are in effect", "livessl config show site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
 )
 """All commands, in the order in which the help lists them."""

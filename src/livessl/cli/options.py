@@ -97,6 +97,7 @@ def wavs(arguments: argparse.Namespace) -> tuple[dict[str, tuple[Path, ...]], di
 
 
 def each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
+    """Return what an option says of each array; raise `ConfigError` if it names one twice."""
     names = [name for name, _ in pairs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -45,7 +45,9 @@ class Questions:
             print(f"{question} [{default if shown is None else shown}]: ", end="", file=sys.stderr, flush=True)
             line = sys.stdin.readline()
             if not line:
-                raise UseError("the input ended before the last question, and nothing was written; use --yes for defaults")
+                raise UseError(
+                    "the input ended before the last question, and nothing was written; use --yes for defaults"
+                )
             if not line.strip():
                 break
             try:

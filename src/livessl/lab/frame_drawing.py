@@ -9,7 +9,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from livessl.core.geometry import microphone_pairs
-from livessl.core.types import FloatArray
+from livessl.core.types import FloatArray, IntArray
 
 PAGE_MM: Final = (210.0, 297.0)
 """Width and height of the page, in millimetres: A4."""
@@ -85,8 +85,9 @@ def _view(what: str, axes: tuple[str, str], seen_mm: FloatArray, middle: float) 
     yield _text(15, middle - VIEW_MM[1] / 2 - 4, what, 'font-weight="bold"')
     yield from _axes(15 + 4, middle + VIEW_MM[1] / 2 - 4, *axes)
     for i, k in _rods(seen_mm):
-        yield _stroke(*points[i], *points[k], _LINE)
-    yield f'<path d="M {centre - 2:g} {middle:g} h 4 M {centre:g} {middle - 2:g} v 4" stroke="{_LINE}" stroke-width="0.2"/>'
+        yield _stroke(points[i, 0], points[i, 1], points[k, 0], points[k, 1], _LINE)
+    yield _stroke(centre - 2, middle, centre + 2, middle, _LINE)
+    yield _stroke(centre, middle - 2, centre, middle + 2, _LINE)
     drawn: list[list[int]] = []
     for index in np.argsort(seen_mm[:, 2], kind="stable"):
         near = next((group for group in drawn if np.hypot(*(points[group[0]] - points[index])) < _SAME_MM), None)
@@ -136,14 +137,12 @@ def _tables(places_mm: FloatArray, y: float) -> Iterator[str]:
         yield _text(115 + 40 * column, y + 4.6 * (line + 1), f"{i + 1} to {k + 1}: {length:.1f}")
 
 
-def _distances(places: FloatArray, pairs: FloatArray) -> FloatArray:
+def _distances(places: FloatArray, pairs: IntArray) -> FloatArray:
     return np.asarray(np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1))
 
 
 def _stroke(x: float, y: float, to_x: float, to_y: float, colour: str = _INK) -> str:
-    return (
-        f'<line x1="{x:.2f}" y1="{y:.2f}" x2="{to_x:.2f}" y2="{to_y:.2f}" stroke="{colour}" stroke-width="0.5"/>'
-    )
+    return f'<line x1="{x:.2f}" y1="{y:.2f}" x2="{to_x:.2f}" y2="{to_y:.2f}" stroke="{colour}" stroke-width="0.5"/>'
 
 
 def _text(x: float, y: float, text: str, style: str = "") -> str:

@@ -120,7 +120,8 @@ def _array_faults(site: Site, spec: ArraySpec) -> Iterator[str]:
     outside = ((positions < 0) | (positions > size)).any(axis=1)
     if outside.any():
         k = int(outside.argmax())
-        yield f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; {position_cure(site, spec)}"
+        what = f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m"
+        yield f"{what}; {position_cure(site, spec)}"
 
 
 def _coincident(one: ArraySpec, other: ArraySpec) -> Iterator[str]:

@@ -132,11 +132,15 @@ def searchable(draft: Draft) -> Draft:
 
 
 def _halves(draft: Draft) -> Iterator[Bounds]:
-    """Yield the parts of the room on one side of the arrays, also in the horizontal plane of their centre."""
+    """Yield the parts of the room on one side of the arrays, also in the horizontal plane of their centre.
+
+    Horizontal lines cannot tell up from down, so that only a plane is left.
+    """
     whole = [(0.0, length) for length in draft.room_m]
     centres = [[array.centre_m[axis] for array in draft.arrays] for axis in range(3)]
     middle = [round(sum(each) / len(each), 4) for each in centres]
-    for height in (whole[2], (middle[2], middle[2])):
+    plane = (middle[2], middle[2])
+    for height in (plane,) if all(array.kind == "line" for array in draft.arrays) else (whole[2], plane):
         for axis in range(3 if height is whole[2] else 2):
             edges = sorted({min(centres[axis]), middle[axis], max(centres[axis])})
             for part in (*((0.0, edge) for edge in edges), *((edge, draft.room_m[axis]) for edge in edges)):
@@ -155,15 +159,15 @@ def site_text(draft: Draft) -> str:
 
 
 def _lines(draft: Draft) -> Iterator[str]:
-    yield "# Made by `livessl init`. Lengths in metres from one corner of the floor: x and y along the walls, z up."
+    yield "# Made by `livessl init`. Lengths in metres from a corner of the floor: x and y along the walls, z up."
     yield "# `livessl check` finds mistakes and draws the room; `livessl config show` prints every setting."
     yield f"site: {_text(draft.site)}"
     yield _noted(f"room: {{size_m: {_list(draft.room_m)}}}", "length (x), width (y), height (z)")
     yield _noted(f"temperature_c: {_number(draft.temperature_c)}", "sets the speed of sound; 5 degrees are 1 %")
     if draft.bounds_m is not None:
         yield ""
-        yield "# Flat arrays cannot tell a position from its mirror image, so only one side of them is searched. Change the"
-        yield "# bounds if sounds come from the other side."
+        yield "# Flat arrays cannot tell a position from its mirror image, so only one side of them is searched."
+        yield "# Change the bounds if sounds come from the other side."
         yield f"grid: {{bounds_m: [{', '.join(map(_list, draft.bounds_m))}]}}"
     yield ""
     yield "arrays:"

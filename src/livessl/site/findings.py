@@ -104,12 +104,16 @@ class Locator:
 
     def fault(self, place: Place, what: str) -> Fault:
         """Return a fault with the line of `place`, or of the innermost part of it that the file has."""
+        line = self.line(place)
+        where = self._source if line is None else f"{self._source}:{line}"
+        return Fault(f"{where}: {dotted(place)}" if place else where, what)
+
+    def line(self, place: Place) -> int | None:
+        """Return the line of `place`, or of the innermost part of it that the file has; None if it has none."""
         known = tuple(map(str, place))
         while known and known not in self._lines:
             known = known[:-1]
-        line = self._lines.get(known)
-        where = self._source if line is None else f"{self._source}:{line}"
-        return Fault(f"{where}: {dotted(place)}" if place else where, what)
+        return self._lines.get(known)
 
 
 def dotted(place: Place) -> str:

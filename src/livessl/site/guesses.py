@@ -7,7 +7,7 @@ value that is only unlikely is a warning.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import permutations
 from typing import Final
 
@@ -33,7 +33,7 @@ USUAL_SPACING_M: Final = 0.1
 """Grid spacing, in metres, next to which a value in another unit is sought."""
 
 LARGE_M: Final = 2.0
-"""Size of an array, in metres, above which a guess about its unit is not made: arrays are built much smaller."""
+"""Size of an array, in metres, above which it is likely to be in another unit: arrays are built much smaller."""
 
 FAR: Final = 10.0
 """Multiple of the room's longest edge beyond which the bounds of a box are more likely in a smaller unit."""
@@ -54,8 +54,8 @@ SPEEDS: Final = ((0.3048, "feet per second"), (1 / 3.6, "kilometres per hour"), 
 """Units of speed that are mistaken for metres per second, in metres per second."""
 
 _STEP_DEG: Final = {2: 45.0, 3: 15.0, 4: 15.0}
-"""Angles to which arrays are usually turned are multiples of this, by the decimals of an angle in radians. An angle with
-more decimals is taken as one with four."""
+"""Angles to which arrays are usually turned, in degrees, are multiples of this, by the decimals of an angle in radians.
+An angle with more decimals is taken as one with four."""
 
 
 def unlikely(site: Site) -> Iterator[str]:
@@ -85,7 +85,7 @@ def position_cure(site: Site, spec: ArraySpec) -> str:
         meant = _meant(given, place, fits, size_m)
         if meant is not None:
             return f"did you mean {key}: {meant}"
-    if isinstance(array.geometry, Shape):
+    if isinstance(array.geometry, Shape) and spec.aperture_m > LARGE_M:
         centre_m = np.array(array.position_m)
         for per_metre, unit in UNITS:
             smaller_m = centre_m + (spec.microphones_m - centre_m) / per_metre
@@ -113,8 +113,10 @@ def rate_cure(rate_hz: float, least_hz: float) -> str:
     return "lower band_hz or raise sample_rate_hz"
 
 
-def _movable(array: ArrayConfig, spec: ArraySpec) -> Iterator[tuple[str, FloatArray, Callable[[FloatArray], FloatArray]]]:
-    """Yield what may be in another unit or order: its key, its value, and a function from such a value to microphones."""
+def _movable(
+    array: ArrayConfig, spec: ArraySpec
+) -> Iterator[tuple[str, FloatArray, Callable[[FloatArray], FloatArray]]]:
+    """Yield what may be in another unit or order: key, value, and a function from it to microphones."""
     if array.microphones_m is not None:
         yield "microphones_m", np.array(array.microphones_m), lambda given: given
     elif array.position_m is not None:
@@ -146,6 +148,8 @@ def _meant(
     for per_metre, unit in UNITS if np.abs(given).max() > MANY * size_m.max() else ():
         if fits(place(given / per_metre)):
             return f"{_text(shown(given / per_metre))}, from {unit}?"
+    if ((given >= 0) & (given <= size_m)).all():  # only the edge of an array is outside: it is too near to a wall
+        return None
     for order in sorted(permutations(range(3)), key=lambda order: sum(i != k for i, k in enumerate(order)))[1:]:
         if fits(place(given[..., list(order)])):
             moved = " and ".join("xyz"[i] for i, k in enumerate(order) if i != k)
@@ -243,7 +247,9 @@ def _inputs(node: NodeConfig) -> Iterator[str]:
     if not isinstance(node.device, SoundDeviceConfig):
         return
     known = known_interface(node.device.name)
-    for name, channels in node.arrays.items() if known is not None else ():
+    if known is None:
+        return
+    for name, channels in node.arrays.items():
         if max(channels) > known.inputs:
             yield f"{name}: {known.name} has {known.inputs} inputs, got {max(channels)}; correct the channels"
         elif known.others and channels == list(range(1, len(channels) + 1)) and 1 not in known.microphones:
