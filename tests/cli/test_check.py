@@ -80,3 +80,12 @@ def test_missing_site_file_is_an_error(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--site", tmp_path / "site.yaml")
     assert done.code == 2
     assert done.err == f"livessl: error: {tmp_path / 'site.yaml'}: cannot be read: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "config").glob("*.yaml")), ids=lambda path: path.stem
+)
+def test_shipped_configs_pass_the_check_without_a_note(run: Run, path: Path) -> None:
+    done = run("check", path)
+    assert (done.code, done.err) == (0, "")
+    assert "expected error at 1.5 m height" in done.out

@@ -75,12 +75,15 @@ def test_names_are_read_back_as_they_were_given(names: list[str], interface: str
         DraftArray(name, "tetrahedron", 0.5, 4, (1.0 + 3 * index, 2.0, 1.2), 0.0) for index, name in enumerate(names)
     )
     node = DraftNode(
-        "pc", interface, 48000.0, {name: (4 * k + 1, 4 * k + 2, 4 * k + 3, 4 * k + 4) for k, name in enumerate(names)}
+        "lab-pc",
+        interface,
+        48000.0,
+        {name: (4 * k + 1, 4 * k + 2, 4 * k + 3, 4 * k + 4) for k, name in enumerate(names)},
     )
     site = parse_site(site_text(Draft("lab", (6.0, 5.0, 2.7), 20.0, arrays, (node,))))
     assert list(site.arrays) == names
-    assert list(site.nodes["pc"].arrays) == names
-    assert site.nodes["pc"].device.name == interface  # type: ignore[union-attr]
+    assert list(site.nodes["lab-pc"].arrays) == names
+    assert site.nodes["lab-pc"].device.name == interface  # type: ignore[union-attr]
 
 
 def test_flags_determine_the_site(run: Run, tmp_path: Path) -> None:
@@ -103,8 +106,8 @@ def test_flags_determine_the_site(run: Run, tmp_path: Path) -> None:
     assert f"next: livessl check {path}" in done.out
     site = load_site(path)
     assert (site.site, site.room.size_m, site.temperature_c) == ("hall", (8.0, 10.0, 4.0), 24.0)
-    assert site.nodes["pc"].device.sample_rate_hz == 96000
-    assert site.nodes["pc"].arrays == {"north": [1, 2, 3, 4], "south": [9, 10, 11, 12, 13, 14]}
+    assert site.nodes["lab-pc"].device.sample_rate_hz == 96000
+    assert site.nodes["lab-pc"].arrays == {"north": [1, 2, 3, 4], "south": [9, 10, 11, 12, 13, 14]}
     north, south = site.specs
     assert north.microphones_m[1] == pytest.approx([4.0, 2.5 + 0.4 / 3**0.5, 1.5 - 0.1 * (2 / 3) ** 0.5], abs=1e-4)
     assert south.aperture_m == pytest.approx(0.5)
@@ -115,11 +118,11 @@ def test_flags_determine_the_site(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("interfaces", "count", "nodes"),
     [
-        (["UMC1820"], 2, {"pc": {"array-1": [1, 2, 3, 4], "array-2": [5, 6, 7, 8]}}),
-        (["UMC404HD"], 2, {"pc-1": {"array-1": [1, 2, 3, 4]}, "pc-2": {"array-2": [1, 2, 3, 4]}}),
-        (["UMC1820", "UMC1820"], 2, {"pc-1": {"array-1": [1, 2, 3, 4]}, "pc-2": {"array-2": [1, 2, 3, 4]}}),
-        (["ReSpeaker 4 Mic Array"], 1, {"pc": {"array-1": [2, 3, 4, 5]}}),
-        (["XVF3800", "UMC404HD"], 2, {"pc-1": {"array-1": [3, 4, 5, 6]}, "pc-2": {"array-2": [1, 2, 3, 4]}}),
+        (["UMC1820"], 2, {"lab-pc": {"array-1": [1, 2, 3, 4], "array-2": [5, 6, 7, 8]}}),
+        (["UMC404HD"], 2, {"lab-pc-1": {"array-1": [1, 2, 3, 4]}, "lab-pc-2": {"array-2": [1, 2, 3, 4]}}),
+        (["UMC1820", "UMC1820"], 2, {"lab-pc-1": {"array-1": [1, 2, 3, 4]}, "lab-pc-2": {"array-2": [1, 2, 3, 4]}}),
+        (["ReSpeaker 4 Mic Array"], 1, {"lab-pc": {"array-1": [2, 3, 4, 5]}}),
+        (["XVF3800", "UMC404HD"], 2, {"lab-pc-1": {"array-1": [3, 4, 5, 6]}, "lab-pc-2": {"array-2": [1, 2, 3, 4]}}),
     ],
 )
 def test_arrays_are_dealt_to_the_inputs_of_known_interfaces(
@@ -137,7 +140,7 @@ def test_connected_interface_is_proposed(run: Run, tmp_path: Path, connected: Ca
         InputDevice("HDA Intel: (hw:0,0)", "ALSA", 2, 44100.0), InputDevice("Zoom F8: (hw:1,0)", "ALSA", 8, 48000.0)
     )
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
-    assert load_site(tmp_path / "site.yaml").nodes["pc"].device.name == "Zoom F8"  # type: ignore[union-attr]
+    assert load_site(tmp_path / "site.yaml").nodes["lab-pc"].device.name == "Zoom F8"  # type: ignore[union-attr]
 
 
 def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +234,7 @@ def test_answers_in_a_terminal_determine_the_site(tmp_path: Path) -> None:
     assert "expected x,y,z in metres, such as 2.5,3,1.2, got '8 m'" in asked
     site = load_site(tmp_path / "site.yaml")
     assert (site.site, site.room.size_m, site.temperature_c, list(site.arrays)) == ("hall", (8, 10, 4), 20, ["desk"])
-    assert site.nodes["pc"].arrays == {"desk": [8, 7, 6, 5]}
+    assert site.nodes["lab-pc"].arrays == {"desk": [8, 7, 6, 5]}
     [desk] = site.specs
     assert desk.microphones_m[0] == pytest.approx([4.15, 5.15, 1.2], abs=1e-4), "a corner of the square"
 

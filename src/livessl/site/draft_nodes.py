@@ -108,5 +108,5 @@ def _named(places: Sequence[_Place], rate_hz: float | None) -> Iterator[DraftNod
     for number, place in enumerate(places, 1):
         known = known_interface(place.interface)
         own_hz = UNKNOWN_RATE_HZ if known is None else known.rate_hz
-        name = "pc" if len(places) == 1 else f"pc-{number}"
+        name = "lab-pc" if len(places) == 1 else f"lab-pc-{number}"
         yield DraftNode(name, place.interface, rate_hz or own_hz, place.channels)
