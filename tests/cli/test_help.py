@@ -84,7 +84,7 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         seen.append(threads())
         return site_of()
 
-    monkeypatch.setattr("livessl.cli.check.load_site", load)
+    monkeypatch.setattr("livessl.site.load.load_site", load)
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")

@@ -19,8 +19,9 @@ from cli.command_runs import Run
 from livessl.capture.sound_device import InputDevice
 from livessl.errors import DeviceError
 from livessl.lab.frame_drawing import PAGE_MM, drawing
-from livessl.site.draft import SIZE_M, Draft, DraftArray, DraftNode, proposed_pose, searchable, shape_m, site_text
+from livessl.site.draft import proposed_pose, searchable, shape_m, site_text
 from livessl.site.draft_nodes import nodes_of
+from livessl.site.draft_parts import SIZE_M, Draft, DraftArray, DraftNode
 from livessl.site.load import load_site, parse_site
 from small_site import HANG_S
 

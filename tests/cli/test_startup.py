@@ -92,6 +92,10 @@ def test_check_of_a_method_of_ones_own_imports_neither_the_method_nor_the_fusion
     assert names & live == set()
 
 
-@pytest.mark.parametrize("arguments", [("--help",), ("--version",)])
-def test_help_of_all_commands_imports_no_numerics(arguments: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "arguments",
+    [("--help",), ("--version",), ("init", "--help"), ("check", "--help"), ("config", "show", "--help")],
+    ids=" ".join,
+)
+def test_help_imports_no_numerics(arguments: tuple[str, ...]) -> None:
     assert loaded_before_exit(*arguments) & {"numpy", "pydantic", "yaml", "threadpoolctl", "zmq"} == set()

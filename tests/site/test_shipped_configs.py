@@ -16,7 +16,8 @@ from livessl.core.geometry import circle, posed, tetrahedron
 from livessl.core.types import FloatArray
 from livessl.lab.frame_drawing import drawing
 from livessl.lab.plan.design import predict
-from livessl.site.draft import DraftArray, order, shape_m
+from livessl.site.draft import order, shape_m
+from livessl.site.draft_parts import DraftArray
 from livessl.site.interfaces import known_interface
 from livessl.site.load import load_site
 from livessl.site.models import GeometryFile, Site

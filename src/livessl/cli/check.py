@@ -12,9 +12,6 @@ from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json
 from livessl.cli.output import print_warnings
 from livessl.errors import ConfigError, Fault
-from livessl.site.build.grid import search_grid
-from livessl.site.checks import unprotected_addresses
-from livessl.site.load import load_site
 
 
 def add_arguments(parser: Any) -> None:
@@ -33,6 +30,10 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.site.build.grid import search_grid
+    from livessl.site.checks import unprotected_addresses
+    from livessl.site.load import load_site
+
     try:
         site = load_site(arguments.site)
         doors = unprotected_addresses(site)

@@ -9,7 +9,6 @@ from typing import Any
 
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
-from livessl.site.effective import DEFAULT, as_yaml, effective_settings
 
 
 def add_arguments(parser: Any) -> None:
@@ -29,6 +28,8 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.site.effective import DEFAULT, as_yaml, effective_settings
+
     settings = effective_settings(arguments.site)
     if arguments.given:
         settings = [setting for setting in settings if setting.line is not None]

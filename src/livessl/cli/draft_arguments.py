@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from livessl.cli import argument
-from livessl.site.draft import MICROPHONES, SIZE_M
+from livessl.site.draft_parts import MICROPHONES, SIZE_M
 
 SIZES: Final = {
     "tetrahedron": "edge",
@@ -17,7 +17,7 @@ SIZES: Final = {
     "line": "distance between neighbours",
     "circle": "radius",
 }
-"""What the size of each kind of array is."""
+"""Name of the size of each kind of array."""
 
 COUNTED: Final = ("line", "circle")
 """Kinds of arrays with any number of microphones."""
@@ -28,7 +28,7 @@ _EXPECTED: Final = "expected NAME=KIND:SIZE@X,Y,Z@YAW, such as north=tetrahedron
 
 @dataclass(frozen=True, slots=True)
 class ArrayWish:
-    """What is known of a new array; None where the place or the size is proposed. Metres and degrees."""
+    """A new array as it was asked for, in metres and degrees; None where size, place or yaw is proposed."""
 
     name: str
     kind: str = "tetrahedron"

@@ -6,13 +6,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from livessl.cli import argument
 from livessl.core.methods import METHODS
 from livessl.errors import ConfigError, Fault
-from livessl.site.load import load_site
-from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from livessl.site.models import Site
 
 T = TypeVar("T")
 
@@ -82,6 +83,8 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 def read_site(arguments: argparse.Namespace) -> Site:
     """Read the site file that --site names, with the arrays that --joint joins."""
+    from livessl.site.load import load_site
+
     return load_site(arguments.site, joints(arguments))
 
 

@@ -1,6 +1,6 @@
-"""A first site file, from what somebody knows on the first day: room, arrays, interfaces and channels.
+"""The text of a first site file, from room, arrays, interfaces and channels.
 
-It turns answers into text. It asks nothing, and it neither reads nor writes files.
+It asks nothing, and it neither reads nor writes files.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import yaml
@@ -17,14 +17,9 @@ from livessl.core import mirror
 from livessl.core.geometry import Grid, circle, line, tetrahedron
 from livessl.core.types import FloatArray
 from livessl.site.build.grid import search_grid
+from livessl.site.draft_parts import Draft, DraftArray
 from livessl.site.fields import Bounds
 from livessl.site.load import parse_site
-
-SIZE_M: Final = {"tetrahedron": 0.5, "square": 0.5, "line": 0.1, "circle": 0.05}
-"""Kinds of arrays with their default size in metres: the edge, the distance of neighbours on a line, the radius."""
-
-MICROPHONES: Final = 4
-"""Number of microphones of an array, where nothing else is given."""
 
 CLEARANCE: Final = 0.3
 """Distance of the proposed arrays from the middle of the room, as a share of its length and width: metres apart, and
@@ -34,57 +29,8 @@ WALL_M: Final = 0.6
 """Distance, in metres, of proposed lines from the wall behind them: far enough that its reflection can be separated."""
 
 LIFT_M: Final = 0.25
-"""Distance, in metres, by which proposed arrays lie above and below half the height of the room, in turn: flat arrays
-at one height cannot tell a position from its mirror image."""
-
-
-@dataclass(frozen=True, slots=True)
-class DraftArray:
-    """One array.
-
-    Parameters
-    ----------
-    name : str
-    kind : str
-        A key of `SIZE_M`.
-    size_m : float
-        Edge, distance of neighbours, or radius, metres.
-    count : int
-        Number of microphones; 4 for a tetrahedron and a square.
-    centre_m : tuple of float
-        Its centre in the room, metres.
-    yaw_deg : float
-        Turn about the vertical, counter-clockwise from above, degrees.
-    """
-
-    name: str
-    kind: str
-    size_m: float
-    count: int
-    centre_m: tuple[float, float, float]
-    yaw_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class DraftNode:
-    """One audio interface: its name, its sampling rate in hertz, and the channels, from 1, of each of its arrays."""
-
-    name: str
-    interface: str
-    rate_hz: float
-    channels: dict[str, tuple[int, ...]]
-
-
-@dataclass(frozen=True, slots=True)
-class Draft:
-    """A whole site; lengths in metres, temperature in degrees Celsius. `bounds_m` None searches the whole room."""
-
-    site: str
-    room_m: tuple[float, float, float]
-    temperature_c: float
-    arrays: tuple[DraftArray, ...]
-    nodes: tuple[DraftNode, ...]
-    bounds_m: Bounds | None = None
+"""Distance, in metres, by which proposed arrays lie above and below half the height of the room, in turn: for flat
+arrays at one height, a position and its mirror image look alike."""
 
 
 def proposed_pose(
@@ -112,7 +58,7 @@ def proposed_pose(
 
 
 def searchable(draft: Draft) -> Draft:
-    """Return the draft with the largest search volume in which positions can be told from their mirror images.
+    """Return the draft with the largest search volume in which no position looks like its mirror image.
 
     Flat arrays in one plane and arrays on one line need a volume on one side of them. If no box is free of mirror
     images, the draft is returned as it is.
@@ -134,7 +80,7 @@ def searchable(draft: Draft) -> Draft:
 def _halves(draft: Draft) -> Iterator[Bounds]:
     """Yield the parts of the room on one side of the arrays, also in the horizontal plane of their centre.
 
-    Horizontal lines cannot tell up from down, so that only a plane is left.
+    To horizontal lines up and down look alike, so that only a plane is left.
     """
     whole = [(0.0, length) for length in draft.room_m]
     centres = [[array.centre_m[axis] for array in draft.arrays] for axis in range(3)]
@@ -166,7 +112,7 @@ def _lines(draft: Draft) -> Iterator[str]:
     yield _noted(f"temperature_c: {_number(draft.temperature_c)}", "sets the speed of sound; 5 degrees are 1 %")
     if draft.bounds_m is not None:
         yield ""
-        yield "# Flat arrays cannot tell a position from its mirror image, so only one side of them is searched."
+        yield "# To flat arrays a position and its mirror image look alike, so that only one side is searched."
         yield "# Change the bounds if sounds come from the other side."
         yield f"grid: {{bounds_m: [{', '.join(map(_list, draft.bounds_m))}]}}"
     yield ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from livessl.errors import ConfigError, Fault
-from livessl.site.draft import DraftArray, DraftNode
+from livessl.site.draft_parts import DraftArray, DraftNode
 from livessl.site.interfaces import known_interface
 
 UNKNOWN_RATE_HZ: Final = 48000.0

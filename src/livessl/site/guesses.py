@@ -1,4 +1,4 @@
-"""What somebody probably meant: values in another unit, swapped axes, numbers that count from 0, addresses that differ.
+"""Guesses at what was meant: values in another unit, swapped axes, channels that are none, addresses that differ.
 
 Guesses come with the values to write instead. A value that is certainly wrong is a fault, and its guess is the cure; a
 value that is only unlikely is a warning.
@@ -74,7 +74,7 @@ def unlikely(site: Site) -> Iterator[str]:
 
 
 def position_cure(site: Site, spec: ArraySpec) -> str:
-    """Return how to mend an array that is outside the room, with the values that somebody probably meant."""
+    """Return how to mend an array that is outside the room, with the values that were probably meant."""
     array = site.arrays[spec.name]
     size_m = np.array(site.room.size_m)
 
