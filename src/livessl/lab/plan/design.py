@@ -13,6 +13,7 @@ from livessl.core.geometry import Grid
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction
+from livessl.lab.plan.defaults import CALIBRATION_M
 from livessl.simulation.room import absorption
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
@@ -28,9 +29,6 @@ SHARES: Final = (5, 25, 50, 75, 95)
 
 HEIGHT_M: Final = 1.5
 """Default height, in metres, of the expected sounds: about that of a mouth, a table or a door handle."""
-
-CALIBRATION_M: Final = 0.002
-"""Default error, in metres, of a microphone's position: a careful tape measurement. The paper's own left 0.7 mm."""
 
 SOUND_S: Final = 0.5
 """Length, in seconds, of the expected sound; it hardly matters with reverberation, see `prediction.observation_s`."""
