@@ -240,6 +240,54 @@ def test_answers_in_a_terminal_determine_the_site(tmp_path: Path) -> None:
     assert desk.microphones_m[0] == pytest.approx([4.15, 5.15, 1.2], abs=1e-4), "a corner of the square"
 
 
+def test_wrong_answers_in_a_terminal_are_explained_and_asked_again(tmp_path: Path) -> None:
+    answers = [
+        "",
+        *("8000,10000,4000", ""),
+        *("8,10,4", "86"),
+        *("", "21"),  # the default room
+        "2",
+        *("west", "", "", "1,9,1", ""),
+        *("west", "", "", "1.5,2.5,1.2", ""),
+        *("west", "", "", "4,3,1.2", ""),
+        *("east", "", "", "4,3,1.2", ""),
+        *("1,2,3", ""),
+        *("", ""),
+    ]
+    code, asked = in_terminal(tmp_path / "site.yaml", "\n".join([*answers, ""]))
+    assert code == 0, asked
+    for explained in (
+        "did you mean [8, 10, 4], from millimetres?",
+        "did you mean 30.0, from Fahrenheit?",
+        "is outside the room (6, 5, 2.7) m; correct the array's position or room.size_m",
+        "expected each key once, got it twice; remove one",
+        "expected 4 channels, one for each microphone of 'west', got 3",
+    ):
+        assert explained in asked
+    site = load_site(tmp_path / "site.yaml")
+    assert (site.room.size_m, site.temperature_c, list(site.arrays)) == ((6, 5, 2.7), 21, ["west", "east"])
+    assert site.nodes["lab-pc"].arrays == {"west": [1, 2, 3, 4], "east": [5, 6, 7, 8]}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("", "expected the name of a file, got a folder"), ("no/site.yaml", "expected a folder that exists, got ")],
+)
+def test_place_that_cannot_be_written_is_refused_before_anything_is_asked(
+    run: Run, tmp_path: Path, name: str, message: str
+) -> None:
+    done = run("init", tmp_path / name, *UMC, "--force")
+    assert done.code == 2
+    assert done.err.startswith(f"livessl: error: {tmp_path / name}: {message}")
+
+
+def test_faults_of_flags_name_no_line_of_a_file_that_does_not_exist(run: Run, tmp_path: Path) -> None:
+    arrays = ("--array", "a=tetrahedron@3,2,1", "--array", "b=tetrahedron@3,2,1")
+    done = run("init", tmp_path / "site.yaml", *UMC, *arrays)
+    assert done.code == 2
+    assert done.err.startswith("livessl: error: arrays.b: microphone 1 of 'a' and microphone 1 of 'b' are at one place")
+
+
 def test_end_of_input_writes_nothing(tmp_path: Path) -> None:
     code, asked = in_terminal(tmp_path / "site.yaml", "hall\n\x04")
     assert code == 2

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from livessl.cli import argument, draft_arguments
 from livessl.cli.draft_arguments import ArrayWish
@@ -19,9 +20,13 @@ from livessl.cli.questions import Questions, one_of
 from livessl.errors import ConfigError, DeviceError, Fault
 from livessl.site.draft import order, proposed_pose, searchable, shape_m, site_text
 from livessl.site.draft_nodes import nodes_of
-from livessl.site.draft_parts import SIZE_M, Draft, DraftArray
+from livessl.site.draft_parts import SIZE_M, Draft, DraftArray, DraftNode
+from livessl.site.fields import Position
 from livessl.site.interfaces import INTERFACES, known_interface
 from livessl.site.load import parse_site
+from livessl.site.models import Site
+
+T = TypeVar("T")
 
 ROOM_M: Final = (6.0, 5.0, 2.7)
 """Size of the room, in metres, where nothing is given: one to be replaced."""
@@ -42,14 +47,13 @@ def write(arguments: argparse.Namespace) -> int:
         If the file exists, or if what is described is no valid site; nothing is written then.
     """
     path = arguments.site if arguments.drawing is None else arguments.drawing
-    if path.exists() and not arguments.force:
-        raise ConfigError([Fault(str(path), "expected a new file, but it exists; give another name, or add --force")])
+    _refuse_to_overwrite(path, arguments.force)
     questions = Questions(ask=not arguments.yes and sys.stdin.isatty())
     if not (questions.asks or arguments.yes):
         logging.info("the input is no terminal: nothing is asked, as with --yes")
     draft = _draft(arguments, questions)
     text = site_text(draft)
-    warnings = parse_site(text, str(path)).warnings
+    warnings = _parsed(draft).warnings
     if arguments.drawing is not None:
         from livessl.lab.frame_drawing import drawing
 
@@ -65,6 +69,54 @@ def write(arguments: argparse.Namespace) -> int:
     return OK
 
 
+def _refuse_to_overwrite(path: Path, force: bool) -> None:
+    """Raise an error if the file cannot be written, before anything is asked."""
+    what = None
+    if path.is_dir():
+        what = "expected the name of a file, got a folder; give a name in it, such as site.yaml"
+    elif not path.parent.is_dir():
+        what = f"expected a folder that exists, got {path.parent}; make it, or give another name"
+    elif path.exists() and not force:
+        what = "expected a new file, but it exists; give another name, or add --force"
+    if what is not None:
+        raise ConfigError([Fault(str(path), what)])
+
+
+def _parsed(draft: Draft) -> Site:
+    """Return the site of a draft.
+
+    Raises
+    ------
+    ConfigError
+        With every fault, by its place in the site, since there is no file with lines yet.
+    """
+    try:
+        return parse_site(site_text(draft), "")
+    except ConfigError as error:
+        raise ConfigError([Fault(fault.where.partition(": ")[2], fault.what) for fault in error.faults]) from error
+
+
+def _valid(questions: Questions, ask: Callable[[], T], draft_of: Callable[[T], Draft]) -> T:
+    """Return what `ask` returns, once a draft with it is a valid site; faults are explained and asked about again.
+
+    Raises
+    ------
+    ConfigError
+        If it is no valid site, and nothing is asked.
+    """
+    while True:
+        answered = ask()
+        try:
+            _parsed(draft_of(answered))
+        except ConfigError as error:
+            if not questions.asks:
+                raise
+            for fault in error.faults:
+                questions.say(f"  {fault.what}")
+            continue
+        return answered
+
+
 def _print_next(path: Path, draft: Draft) -> None:
     nodes = ", ".join(f"{node.name} ({node.interface})" for node in draft.nodes)
     print(f"{path}: site {draft.site!r} with arrays {', '.join(array.name for array in draft.arrays)}; nodes {nodes}")
@@ -76,36 +128,61 @@ def _print_next(path: Path, draft: Draft) -> None:
 
 def _draft(arguments: argparse.Namespace, questions: Questions) -> Draft:
     site = arguments.name or questions.answer("Name of the site", "lab", draft_arguments.name)
+    room_m, celsius = _valid(
+        questions if arguments.room is None or arguments.temperature is None else Questions(ask=False),
+        lambda: _room(arguments, questions),
+        lambda answered: Draft(site, *answered, (_in_the_middle(answered[0]),), ()),
+    )
+    arrays = _arrays(arguments, questions, Draft(site, room_m, celsius, (), ()))
+    draft = Draft(site, room_m, celsius, arrays, ())
+    channels = each_once(arguments.channels, "--channels")
+    known = bool(arguments.interface) and all(map(known_interface, arguments.interface))
+    connected = {} if known else _connected()
+    interfaces = arguments.interface or [_interface(questions, connected)]
+    nodes = nodes_of(arrays, interfaces, connected, arguments.rate, channels)
+    if not channels:
+        nodes = _valid(questions, lambda: _wired(nodes, questions), lambda wired: replace(draft, nodes=wired))
+    return searchable(replace(draft, nodes=nodes))
+
+
+def _room(arguments: argparse.Namespace, questions: Questions) -> tuple[Position, float]:
+    """Return the size of the room in metres and its temperature in degrees Celsius."""
     room_m = arguments.room or questions.answer(
         "Length, width and height of the room in metres", ROOM_M, draft_arguments.room, ",".join(map(str, ROOM_M))
     )
     celsius = arguments.temperature
     if celsius is None:
         celsius = questions.answer("Temperature in degrees Celsius", USUAL_C, draft_arguments.finite, f"{USUAL_C:g}")
-    arrays = _arrays(arguments, questions, room_m)
-    channels = each_once(arguments.channels, "--channels")
-    known = bool(arguments.interface) and all(map(known_interface, arguments.interface))
-    connected = {} if known else _connected()
-    interfaces = arguments.interface or [_interface(questions, connected)]
-    nodes = nodes_of(arrays, interfaces, connected, arguments.rate, channels)
-    if questions.asks and not channels:
-        asked = {
-            name: questions.answer(
-                f"Inputs of {name} on {node.interface}, in the order of its microphones",
-                given,
-                draft_arguments.inputs,
-                ",".join(map(str, given)),
-            )
-            for node in nodes
-            for name, given in node.channels.items()
-        }
-        nodes = tuple(replace(node, channels={name: asked[name] for name in node.channels}) for node in nodes)
-    return searchable(Draft(site, room_m, celsius, arrays, nodes))
+    return room_m, celsius
 
 
-def _arrays(
-    arguments: argparse.Namespace, questions: Questions, room_m: tuple[float, float, float]
-) -> tuple[DraftArray, ...]:
+def _in_the_middle(room_m: Position) -> DraftArray:
+    """Return a small array with which a site of this room is complete and without faults of its own."""
+    x, y, z = room_m
+    return DraftArray("array", "tetrahedron", min(room_m) / 10.0, 4, (x / 2.0, y / 2.0, z / 2.0), 0.0)
+
+
+def _wired(nodes: Sequence[DraftNode], questions: Questions) -> tuple[DraftNode, ...]:
+    """Return the nodes with the inputs that are asked for."""
+    return tuple(
+        replace(
+            node,
+            channels={
+                name: questions.answer(
+                    f"Inputs of {name} on {node.interface}, in the order of its microphones",
+                    given,
+                    draft_arguments.inputs,
+                    ",".join(map(str, given)),
+                )
+                for name, given in node.channels.items()
+            },
+        )
+        for node in nodes
+    )
+
+
+def _arrays(arguments: argparse.Namespace, questions: Questions, room: Draft) -> tuple[DraftArray, ...]:
+    """Return the arrays, each valid in the room beside those before it."""
     wishes: list[ArrayWish] = list(arguments.array)
     count = arguments.arrays or len(wishes)
     if not count:
@@ -113,18 +190,22 @@ def _arrays(
     if len(wishes) > count:
         what = f"expected at least the {len(wishes)} arrays of --array, got {count}; correct one of them"
         raise ConfigError([Fault("--arrays", what)])
-    asked = range(len(wishes), count)
-    wishes += [ArrayWish(name) for name in _free_names([wish.name for wish in wishes], len(asked))]
+    given = len(wishes)
+    wishes += [ArrayWish(name) for name in _free_names([wish.name for wish in wishes], count - given)]
     each_once([(wish.name, None) for wish in wishes], "--array")
-    return tuple(
-        _array(wish, room_m, (index, count), questions if index in asked else Questions(ask=False))
-        for index, wish in enumerate(wishes)
-    )
+    arrays: list[DraftArray] = []
+    for index, wish in enumerate(wishes):
+        asks = questions if index >= given else Questions(ask=False)
+        array = _valid(
+            asks,
+            partial(_array, wish, room.room_m, (index, count), asks),
+            lambda array: replace(room, arrays=(*arrays, array)),
+        )
+        arrays.append(array)
+    return tuple(arrays)
 
 
-def _array(
-    wish: ArrayWish, room_m: tuple[float, float, float], place: tuple[int, int], questions: Questions
-) -> DraftArray:
+def _array(wish: ArrayWish, room_m: Position, place: tuple[int, int], questions: Questions) -> DraftArray:
     """Return one array; `place` is its index and the number of arrays."""
     name = questions.answer("Name of an array", wish.name, draft_arguments.name)
     kind = questions.answer(f"  kind of {name}: {', '.join(SIZE_M)}", wish.kind, one_of(list(SIZE_M)))

@@ -124,8 +124,9 @@ def _lines(draft: Draft) -> Iterator[str]:
         yield _noted(f"    position_m: {_list(array.centre_m)}", "the centre; measure it to the centimetre")
         yaw = f"    orientation_deg: {{yaw: {_number(array.yaw_deg)}}}"
         yield _noted(yaw, "turn from +x, counter-clockwise from above; to the degree")
-    yield ""
-    yield "nodes:"
+    if draft.nodes:
+        yield ""
+        yield "nodes:"
     for node in draft.nodes:
         yield _noted(f"  {_text(node.name)}:", f"livessl capture --site FILE --node {node.name}")
         yield _noted("    server: tcp://127.0.0.1:5570", "address of the server, seen from this node")
