@@ -84,7 +84,7 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         seen.append(threads())
         return site_of()
 
-    monkeypatch.setattr("livessl.cli.check.load_site", load)
+    monkeypatch.setattr("livessl.site.load.load_site", load)
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")
@@ -110,8 +110,8 @@ def test_demo_on_a_port_in_use_fails_at_once(capsys: pytest.CaptureFixture[str])
     assert "cannot be used: Address already in use" in capsys.readouterr().err
 
 
-TEXT_ONLY = {"serve", "capture", "record", "simulate", "keys", "calibrate"}
-"""Commands that print no results; the actions of `keys` and `calibrate` that do are tested elsewhere."""
+TEXT_ONLY = {"serve", "capture", "record", "simulate", "keys", "calibrate", "init", "config"}
+"""Commands that print no results; the actions of `keys`, `calibrate` and `config` that do are tested elsewhere."""
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in TEXT_ONLY])
