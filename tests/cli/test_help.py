@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from cli.command_runs import COMMANDS, Run, interrupted
 from livessl import __version__
-from livessl.capture.sound_device import InputDevice
+from livessl.capture.portaudio import InputDevice
 from livessl.cli.main import main
 from livessl.site.models import Site
 from small_site import site_of, write_site

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from livessl.capture.sound_device import input_devices
+from livessl.capture.portaudio import input_devices
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json
 from livessl.cli.output import complain
