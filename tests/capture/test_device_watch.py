@@ -31,9 +31,7 @@ def test_stream_that_ends_is_reported_within_two_seconds(idle_s: float, beats: i
 
 
 @given(st.floats(1.6, 2.0), st.integers(0, 30), st.floats(0.0, 2.0))
-def test_device_that_never_delivers_is_reported_within_two_seconds(
-    idle_s: float, beats: int, silent_s: float
-) -> None:
+def test_device_that_never_delivers_is_reported_within_two_seconds(idle_s: float, beats: int, silent_s: float) -> None:
     assert problem(Seen(OPEN, idle_s=idle_s, beats=beats, silent_s=silent_s)) != ""
 
 
@@ -55,30 +53,45 @@ def test_lack_of_processor_time_is_not_blamed_on_the_device(idle_s: float, silen
     beats = int(idle_s * BEATS_PER_S / 2) - 1
     assume(silent_s <= idle_s)
     assert problem(Seen(OPEN, delivered=True, idle_s=idle_s, beats=beats, silent_s=silent_s)).startswith(
-        f"this machine lags: the process that reads device 'UMC' ran for a tenth of a second only {beats} times"
+        f"this machine lags: the process that reads device 'UMC' got only {beats} of "
     )
+
+
+UMC = "device 'UMC'"
+LIBRARY = f"the sound library of {UMC}"
+SERVER = Report(DeviceState.OPEN)
 
 
 @pytest.mark.parametrize(
     ("seen", "words"),
     [
-        (Seen(OPEN, delivered=True, idle_s=1.1, beats=11), "device 'UMC' stopped delivering sound; opening it again (over)"),
-        (Seen(OPEN, idle_s=1.6, beats=16), "device 'UMC' is open but delivers no sound; opening it again (over)"),
-        (Seen(OPEN, delivered=True, idle_s=2.1, silent_s=2.1), "the sound library of device 'UMC' hangs; it was started again (over)"),
-        (Seen(Report(DeviceState.OPEN), idle_s=3.9, beats=39), ""),
-        (Seen(Report(DeviceState.OPEN), idle_s=4.1, beats=41), "device 'UMC' is open but delivers no sound; opening it again (over)"),
-        (Seen(OPEN, floods=FLOODS), "the sound library of device 'UMC' prints without end; it was started again (over)"),
-        (Seen(OPEN, delivered=True, idle_s=9.0, beats=90, flagged=400), "device 'UMC' loses sound in every block: this machine is too busy; stop other programs, or set device.latency_s to a longer time"),
-        (Seen(Report(DeviceState.STOPPED), delivered=True), "device 'UMC' has stopped; was it unplugged? Waiting for it (over)"),
+        (Seen(OPEN, delivered=True, idle_s=1.1, beats=11), f"{UMC} stopped delivering sound; opening it again (over)"),
+        (Seen(OPEN, idle_s=1.6, beats=16), f"{UMC} is open but delivers no sound; opening it again (over)"),
+        (
+            Seen(OPEN, delivered=True, idle_s=2.1, silent_s=2.1),
+            f"{LIBRARY} hangs; it was started again (over)",
+        ),
+        (Seen(SERVER, idle_s=3.9, beats=39), ""),
+        (Seen(SERVER, idle_s=4.1, beats=41), f"{UMC} is open but delivers no sound; opening it again (over)"),
+        (Seen(OPEN, floods=FLOODS), f"{LIBRARY} prints without end; it was started again (over)"),
+        (
+            Seen(OPEN, delivered=True, idle_s=9.0, beats=90, flagged=400),
+            f"{UMC} loses sound in every block: this machine is too busy; stop other programs, or set device.latency_s "
+            "to a longer time",
+        ),
+        (
+            Seen(Report(DeviceState.STOPPED), delivered=True),
+            f"{UMC} has stopped; was it unplugged? Waiting for it (over)",
+        ),
         (Seen(None), ""),
-        (Seen(None, silent_s=1.6), "the sound library has not opened device 'UMC' yet; waiting for it"),
-        (Seen(None, silent_s=15.1), "the sound library of device 'UMC' does not start; it was started again (over)"),
-        (Seen(ABSENT), "device 'UMC' is not connected; connect it"),
-        (Seen(ABSENT, delivered_before=True), "device 'UMC' was unplugged; waiting for it"),
-        (Seen(ABSENT, silent_s=5.1), "the sound library of device 'UMC' hangs; it was started again (over)"),
-        (Seen(None, exit_code=-9), "the process that reads device 'UMC' ended by signal 9; it was started again (over)"),
-        (Seen(None, exit_code=1), "the process that reads device 'UMC' ended with code 1; it was started again (over)"),
+        (Seen(None, silent_s=1.6), f"the sound library has not opened {UMC} yet; waiting for it"),
+        (Seen(None, silent_s=15.1), f"{LIBRARY} does not start; it was started again (over)"),
+        (Seen(ABSENT), f"{UMC} is not connected; connect it"),
+        (Seen(ABSENT, delivered_before=True), f"{UMC} was unplugged; waiting for it"),
+        (Seen(ABSENT, silent_s=5.1), f"{LIBRARY} hangs; it was started again (over)"),
+        (Seen(None, exit_code=-9), f"the process that reads {UMC} ended by signal 9; it was started again (over)"),
+        (Seen(None, exit_code=1), f"the process that reads {UMC} ended with code 1; it was started again (over)"),
     ],
-)  # fmt: skip
+)
 def test_each_state_has_its_own_words(seen: Seen, words: str) -> None:
     assert problem(seen) == words

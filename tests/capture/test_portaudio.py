@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from livessl.capture import device_main, hardware
 from livessl.capture.device_main import Receiver
-from livessl.capture.device_report import DeviceState, DeviceTrouble, Report, Wanted
+from livessl.capture.device_report import DeviceState, OpeningError, Report, Wanted
 from livessl.capture.portaudio import input_devices, library, open_stream
 from livessl.capture.ring import RingReader, RingWriter
 from livessl.clock import UnpacedClock
@@ -137,8 +137,8 @@ def opened(sd: FakePortAudio, name: str = "UMC1820", channels: int = 4, **more: 
     return stream
 
 
-def trouble(sd: FakePortAudio, name: str = "UMC1820", channels: int = 4, **more: Any) -> DeviceTrouble:
-    with pytest.raises(DeviceTrouble) as caught:
+def trouble(sd: FakePortAudio, name: str = "UMC1820", channels: int = 4, **more: Any) -> OpeningError:
+    with pytest.raises(OpeningError) as caught:
         opened(sd, name, channels, **more)
     return caught.value
 
@@ -225,7 +225,7 @@ def test_missing_portaudio_is_reported(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "sounddevice.py").write_text('raise OSError("PortAudio library not found")\n')
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "sounddevice", raising=False)
-    with pytest.raises(DeviceTrouble, match="apt install libportaudio2"):
+    with pytest.raises(OpeningError, match="apt install libportaudio2"):
         library()
     with pytest.raises(DeviceError, match="apt install libportaudio2"):
         input_devices()
@@ -319,7 +319,7 @@ def play(
     """Deliver (n, channels) samples of which the first was converted `age_s` ago, as PortAudio does."""
     times = SimpleNamespace(inputBufferAdcTime=origin_s - age_s, currentTime=origin_s)
     data = noise() if samples is None else samples
-    receiver.receive(memoryview(data).cast("B"), len(data), times, SimpleNamespace(input_overflow=overflow))
+    receiver.receive(data.tobytes(), len(data), times, SimpleNamespace(input_overflow=overflow))
 
 
 def received(reader: RingReader) -> list[tuple[int, int, bool]]:
@@ -425,9 +425,7 @@ def ran(monkeypatch: pytest.MonkeyPatch, ring: Ends, at: Any) -> list[Report]:
     return reports.all
 
 
-def test_process_opens_a_device_when_it_appears(
-    sd: FakePortAudio, ring: Ends, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_process_opens_a_device_when_it_appears(sd: FakePortAudio, ring: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     umc = sd.plugged[-1]
     sd.plug()
 
@@ -455,9 +453,7 @@ def test_process_ends_when_its_stream_stops(
     assert [report.state for report in ran(monkeypatch, ring, at)] == [DeviceState.OPEN, DeviceState.STOPPED]
 
 
-def test_process_tries_to_start_portaudio_again(
-    sd: FakePortAudio, ring: Ends, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_process_tries_to_start_portaudio_again(sd: FakePortAudio, ring: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     umc = sd.plugged[-1]
     sd.plug()
     sd.broken = True
@@ -470,5 +466,3 @@ def test_process_tries_to_start_portaudio_again(
     _, second, third = ran(monkeypatch, ring, at)
     assert second.message == "PortAudio cannot be started: no host API; trying again"
     assert third.state is DeviceState.OPEN
-
-

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -31,17 +30,18 @@ run = int(sys.argv[1])
 wanted = Wanted.from_json(sys.argv[3])
 memory_fd, published_fd, report_fd = map(int, sys.argv[4].split(","))
 ring = RingWriter(memory_fd, published_fd, wanted.ring)
-index = 0
+index, lost = 0, False
 
 def report(state, message=""):
     os.write(report_fd, (Report(DeviceState(state), message, True).to_json() + "\\n").encode())
 
 def deliver(count, seconds=0.0):
-    global index
+    global index, lost
     for _ in range(count):
         values = struct.pack(f"{wanted.channels}f", *(index + k / 16 for k in range(wanted.channels)))
         ring.beat()
-        ring.write(index, values * wanted.block_samples, wanted.block_samples, time.time_ns(), lost=False)
+        block = values * wanted.block_samples
+        lost = not ring.write(index, block, wanted.block_samples, time.time_ns(), lost=lost)
         index += wanted.block_samples
         time.sleep(seconds)
 
@@ -138,7 +138,9 @@ def test_loss_of_processor_time_is_told_so() -> None:
     slow = "[(ring.beat(), time.sleep(0.8)) for _ in range(3)]"
     with device(f"report('open'); deliver(4); {slow}; deliver(10**6, 0.02)") as (entered, runs):
         _, problems = blocks_until(entered, lambda blocks: len(blocks) == 8)
-        assert any("this machine lags: the process that reads device 'UMC' ran" in str(problem) for problem in problems)
+        assert any(
+            "this machine lags: the process that reads device 'UMC' got only" in str(problem) for problem in problems
+        )
         assert problems[-1] is None
         assert len(runs.started) == 1
 
@@ -201,11 +203,11 @@ def test_output_of_native_libraries_is_logged_once_per_message(caplog: pytest.Lo
     assert messages == ["sound library: ALSA lib pcm.c:0: bad", "sound library, 499 times more: ALSA lib pcm.c:#: bad"]
 
 
-def test_nothing_is_left_open(tmp_path: Path) -> None:
-    before = sorted(os.listdir("/proc/self/fd"))
+def test_nothing_is_left_open() -> None:
+    before = sorted(Path("/proc/self/fd").iterdir())
     with device("report('open'); deliver(2); os._exit(0)", DELIVER) as (entered, runs):
         blocks_until(entered, lambda _: len(runs.started) == 2)
-    assert sorted(os.listdir("/proc/self/fd")) == before
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
 
 
 def test_iterator_ends_with_the_context() -> None:

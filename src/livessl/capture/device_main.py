@@ -18,7 +18,7 @@ import threading
 from types import TracebackType
 from typing import Any, Final
 
-from livessl.capture.device_report import DeviceState, DeviceTrouble, Report, Wanted
+from livessl.capture.device_report import DeviceState, OpeningError, Report, Wanted
 from livessl.capture.portaudio import is_active, library, open_stream, rescan
 from livessl.capture.ring import RingWriter
 from livessl.clock import Clock, SystemClock
@@ -112,7 +112,7 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
             else:
                 rescan(sd)
             stream, is_hardware = open_stream(sd, wanted, receiver)
-        except DeviceTrouble as trouble:
+        except OpeningError as trouble:
             reporter.report(Report(trouble.state, str(trouble)))
             for _ in range(round(REOPEN_S / BEAT_S)):
                 if ended.wait(BEAT_S):

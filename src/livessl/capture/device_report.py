@@ -104,7 +104,7 @@ class Report:
         return cls(DeviceState(data["state"]), str(data["message"]), bool(data["hardware"]))
 
 
-class DeviceTrouble(Exception):
+class OpeningError(Exception):
     """Why a device cannot be opened now.
 
     Parameters

@@ -140,8 +140,8 @@ def _judge_stream(name: str, block_s: float, seen: Seen, *, is_hardware: bool) -
     if seen.silent_s >= HUNG_S:
         return Verdict(f"the sound library of device {name!r} hangs; it was started again", over=True)
     return Verdict(
-        f"this machine lags: the process that reads device {name!r} ran for a tenth of a second only {seen.beats} times "
-        f"in {seen.idle_s:.1f} s; stop other programs",
+        f"this machine lags: the process that reads device {name!r} got only {seen.beats} of "
+        f"{BEATS_PER_S * seen.idle_s:.0f} turns in {seen.idle_s:.1f} s; stop other programs",
         over=seen.idle_s >= LAGGING_S,
     )
 

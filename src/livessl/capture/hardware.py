@@ -53,7 +53,9 @@ class HardwareInput:
 
 def hardware_inputs() -> list[HardwareInput]:
     """Return the capture devices that the kernel lists; none on a system that is not Linux."""
-    cards = {int(number): (name, _PORT.search(place)) for number, name, place in _CARD.findall(_read(_ASOUND / "cards"))}
+    cards = {
+        int(number): (name, _PORT.search(place)) for number, name, place in _CARD.findall(_read(_ASOUND / "cards"))
+    }
     found = []
     for card_text, device_text, pcm, directions in _PCM.findall(_read(_ASOUND / "pcm")):
         card, device = int(card_text), int(device_text)

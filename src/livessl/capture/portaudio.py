@@ -1,7 +1,6 @@
-"""Audio inputs through PortAudio: their list, the search by name, and the opening of one. Only this module imports
-`sounddevice`.
+"""Audio inputs through PortAudio: their list, the search by name, and the opening of one.
 
-The library is imported where it is used, so that everything else works on a machine without PortAudio. It runs in a
+Only this module imports `sounddevice`. The library is imported where it is used, so that everything else works on a machine without PortAudio. It runs in a
 process of its own (see `device_main`), and without numpy there.
 """
 
@@ -12,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-from livessl.capture.device_report import DeviceState, DeviceTrouble, Wanted
+from livessl.capture.device_report import DeviceState, OpeningError, Wanted
 from livessl.capture.hardware import HardwareInput, hardware_inputs
 from livessl.errors import DeviceError
 
@@ -68,13 +67,13 @@ def library() -> Any:
 
     Raises
     ------
-    DeviceTrouble
+    OpeningError
         If PortAudio is not installed.
     """
     try:
         import sounddevice
     except OSError as error:
-        raise DeviceTrouble(
+        raise OpeningError(
             DeviceState.UNSUITABLE,
             "sound devices need the PortAudio library, which is not on this machine; "
             "install PortAudio: apt install libportaudio2",
@@ -92,7 +91,7 @@ def input_devices() -> list[InputDevice]:
     """
     try:
         sd = library()
-    except DeviceTrouble as trouble:
+    except OpeningError as trouble:
         raise DeviceError(str(trouble)) from trouble
     try:
         return [device for _, device in _inputs(sd)]
@@ -105,7 +104,7 @@ def rescan(sd: Any) -> None:
 
     Raises
     ------
-    DeviceTrouble
+    OpeningError
         If it does not start again.
     """
     with suppress(sd.PortAudioError):  # PortAudio is not running if the last start failed
@@ -113,7 +112,7 @@ def rescan(sd: Any) -> None:
     try:
         sd._initialize()
     except sd.PortAudioError as error:
-        raise DeviceTrouble(
+        raise OpeningError(
             DeviceState.FAILED, f"PortAudio cannot be started: {_reason(error)}; trying again"
         ) from error
 
@@ -139,7 +138,7 @@ def open_stream(sd: Any, wanted: Wanted, callback: Callable[[InputDevice], Calla
 
     Raises
     ------
-    DeviceTrouble
+    OpeningError
         If that is not possible now.
     """
     stream: Any = None
@@ -171,25 +170,23 @@ def is_active(sd: Any, stream: Any) -> bool:
         return False
 
 
-def _trouble(sd: Any, wanted: Wanted, index: int, error: Exception) -> DeviceTrouble:
+def _trouble(sd: Any, wanted: Wanted, index: int, error: Exception) -> OpeningError:
     """Return why a device that was found does not open."""
     code = error.args[1] if len(error.args) > 1 else None
     if code in (_INVALID_SAMPLE_RATE, _INVALID_CHANNEL_COUNT):
         offered = [rate for rate in RATES_HZ if _offers(sd, index, wanted.channels, rate)]
         rates = ", ".join(map(str, offered))
         cure = f"set device.sample_rate_hz to a rate that it has: {rates}" if offered else "use another device"
-        return DeviceTrouble(
+        return OpeningError(
             DeviceState.UNSUITABLE,
             f"device {wanted.name!r} does not offer {wanted.channels} channels at {wanted.sample_rate_hz:g} Hz; {cure}",
         )
     if code == _DEVICE_UNAVAILABLE:
-        return DeviceTrouble(
+        return OpeningError(
             DeviceState.BUSY,
             f"device {wanted.name!r} is busy: another program holds it; end that program; trying again",
         )
-    return DeviceTrouble(
-        DeviceState.FAILED, f"device {wanted.name!r} cannot be opened: {_reason(error)}; trying again"
-    )
+    return OpeningError(DeviceState.FAILED, f"device {wanted.name!r} cannot be opened: {_reason(error)}; trying again")
 
 
 def _offers(sd: Any, index: int, channels: int, rate_hz: float) -> bool:
@@ -225,7 +222,7 @@ def _find(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> tuple[i
 
     Raises
     ------
-    DeviceTrouble
+    OpeningError
         If no device matches, or several do, or the device has too few channels.
     """
     found = [(index, device) for index, device in devices if device.matches(wanted.name)]
@@ -243,14 +240,14 @@ def _find(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> tuple[i
         raise _missing(devices, wanted)
     if len(found) > 1:
         candidates = "; ".join(device.label for _, device in found)
-        raise DeviceTrouble(
+        raise OpeningError(
             DeviceState.UNSUITABLE,
             f"device {wanted.name!r}: expected a name that matches one input device, got {len(found)}: {candidates}; "
             "give more of the name in device.name, or device.serial or device.usb_port, as `livessl devices` prints it",
         )
     index, device = found[0]
     if device.channels < wanted.channels:
-        raise DeviceTrouble(
+        raise OpeningError(
             DeviceState.UNSUITABLE,
             f"device {wanted.name!r}: expected at least {wanted.channels} input channels, got {device.channels}; "
             "correct the channels under arrays of this node, or use an interface with more inputs",
@@ -262,18 +259,18 @@ def _is_at(entry: HardwareInput, wanted: Wanted) -> bool:
     return wanted.serial in (None, entry.serial) and wanted.usb_port in (None, entry.usb_port)
 
 
-def _missing(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> DeviceTrouble:
+def _missing(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> OpeningError:
     """Return why PortAudio does not list a device: it is held by another program, or not there."""
     for entry in hardware_inputs():
         listed = InputDevice(entry.name, "ALSA", 0, 0.0)
         if listed.matches(wanted.name) and _is_at(entry, wanted):
             holder = entry.holder
             if holder is not None:
-                return DeviceTrouble(
+                return OpeningError(
                     DeviceState.BUSY,
                     f"device {wanted.name!r} is busy: {holder} records from it; end that program; trying again",
                 )
-            return DeviceTrouble(
+            return OpeningError(
                 DeviceState.FAILED,
                 f"device {wanted.name!r} is connected but does not open; make sure that no other program uses it and "
                 "that this user is in the group `audio`; trying again",
@@ -281,7 +278,7 @@ def _missing(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> Devi
     others = "; ".join(device.label for _, device in devices) or "none"
     where = f" with serial {wanted.serial}" if wanted.serial else ""
     where += f" at {wanted.usb_port}" if wanted.usb_port else ""
-    return DeviceTrouble(
+    return OpeningError(
         DeviceState.ABSENT,
         f"device {wanted.name!r}{where} is not connected; connect it, or correct device.name (inputs here: {others})",
     )

@@ -106,7 +106,7 @@ class RingWriter(_Ring):
         super().__init__(memory_fd, published_fd, shape)
         self._written = 0
 
-    def write(self, first_index: int, samples: memoryview, count: int, time_ns: int, *, lost: bool) -> bool:
+    def write(self, first_index: int, samples: bytes | memoryview, count: int, time_ns: int, *, lost: bool) -> bool:
         """Publish a block of (count, channels) float32; return False, and count that, if the ring is full."""
         if (self._written - self._words[_READ]) % _WORD >= self._shape.slots - 1:
             self._words[_OVERRUNS] += 1

@@ -16,7 +16,7 @@ import numpy as np
 
 from livessl.capture.device_process import DeviceProcess
 from livessl.capture.device_report import DeviceState, Report, Wanted
-from livessl.capture.device_watch import Seen, Verdict, judge
+from livessl.capture.device_watch import Seen, judge
 from livessl.capture.native_output import NativeOutput
 from livessl.clock import Clock
 from livessl.core.types import Block
@@ -200,8 +200,8 @@ class SoundDevice:
         if self._lag_ns is None or now_ns - self._lag_ns > LAG_SHOWN_NS:
             return None
         return (
-            f"this machine lags: {self.overruns} blocks of device {self.name!r} were lost because the node did not read "
-            "them in time; stop other programs"
+            f"this machine lags: {self.overruns} blocks of device {self.name!r} were lost because the node did not "
+            "read them in time; stop other programs"
         )
 
     def _give_up(self, run: _Run) -> None:

@@ -23,8 +23,8 @@ Channel = Annotated[int, AfterValidator(_from_one)]
 class SoundDeviceConfig(Model):
     """An audio interface, by name, and by serial number or USB port where several have one name.
 
-    `latency_s` is the latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so how
-    long the machine may be busy before samples are lost; blocks still arrive every `block_s`.
+    `latency_s` is the latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so
+    how long the machine may be busy before samples are lost; blocks still arrive every `block_s`.
     """
 
     type: Literal["sound"] = "sound"
