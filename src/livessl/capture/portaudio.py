@@ -1,7 +1,7 @@
 """Audio inputs through PortAudio: their list, the search by name, and the opening of one.
 
-Only this module imports `sounddevice`. The library is imported where it is used, so that everything else works on a machine without PortAudio. It runs in a
-process of its own (see `device_main`), and without numpy there.
+Only this module imports `sounddevice`. The library is imported where it is used, so that everything else works on a
+machine without PortAudio. It runs in a process of its own (see `device_main`), without numpy.
 """
 
 from __future__ import annotations
