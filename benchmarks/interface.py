@@ -185,11 +185,16 @@ def endings(repeats: int) -> dict[str, list[float]]:
         with tempfile.TemporaryDirectory() as folder:
             node = Node(Path(folder))
             with node.running() as process:
-                [child] = _children(process.pid)
-                os.kill(process.pid, signal.SIGKILL)
-                gone = node.wait(lambda: not _is_alive(child), "the end")
+                gone = _killed(node, process.pid)
                 times["device's process gone after SIGKILL of the node"].append(gone)
     return times
+
+
+def _killed(node: Node, pid: int) -> float:
+    """Kill a node; return the seconds after which its device's process is gone."""
+    [child] = _children(pid)
+    os.kill(pid, signal.SIGKILL)
+    return node.wait(lambda: not _is_alive(child), "the end")
 
 
 def refusals(repeats: int) -> dict[str, tuple[list[float], str]]:
@@ -246,8 +251,8 @@ def losses(minutes: float, channels: int, rate_hz: int, spinning: int) -> None:
                 break
         print(
             f"{samples} samples of {channels} channels at {rate_hz} Hz, {spinning} processes spinning: "
-            f"{flagged} lost in {gaps} gaps that are flagged, {unflagged} lost without a flag, {device.overruns} blocks lost between the "
-            f"processes, {device.starts - 1} restarts"
+            f"{flagged} lost in {gaps} gaps that are flagged, {unflagged} lost without a flag, "
+            f"{device.overruns} blocks lost between the processes, {device.starts - 1} restarts"
         )
         if unflagged:
             raise SystemExit(1)

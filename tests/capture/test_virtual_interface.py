@@ -113,6 +113,18 @@ def test_overrun_of_the_driver_is_flagged_where_samples_are_missing(interfaces: 
     assert losses(blocks)[-1] == 0
 
 
+@pytest.mark.parametrize("milliseconds", [8, 150])
+def test_gap_that_no_driver_flags_is_found_by_the_time(interfaces: Interfaces, milliseconds: float) -> None:
+    umc = interfaces.add(ppm=-150.0)
+    with opened(interfaces) as device:
+        blocks_until(device, lambda blocks: len(blocks) == 30)
+        umc.skip(milliseconds)
+        blocks = blocks_until(device, lambda blocks: any(block.overflow for block in blocks))
+        assert device.unflagged_gaps == 1
+    within = [int(((np.diff(counts_of(block.samples)[0]) - 1) % COUNTED).sum()) for block in blocks]
+    assert sum(within) == pytest.approx(48 * milliseconds, abs=2)
+
+
 def test_busy_interface_is_named_with_the_program_that_holds_it(interfaces: Interfaces) -> None:
     umc = interfaces.add()
     with ExitStack() as stack:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from livessl.capture.device_report import DeviceState, OpeningError, Wanted
@@ -38,12 +38,18 @@ class InputDevice:
         Number of input channels.
     default_sample_rate_hz : float
         The driver's default sampling rate, Hz.
+    serial : str or None
+        Serial number of the USB device; None if it has none.
+    usb_port : str or None
+        USB port, such as `usb-0000:00:14.0-2`; None if it is not on USB.
     """
 
     name: str
     host_api: str
     channels: int
     default_sample_rate_hz: float
+    serial: str | None = None
+    usb_port: str | None = None
 
     @property
     def label(self) -> str:
@@ -93,8 +99,14 @@ def input_devices() -> list[InputDevice]:
         sd = library()
     except OpeningError as trouble:
         raise DeviceError(str(trouble)) from trouble
+    places = {entry.name: entry for entry in hardware_inputs()}
     try:
-        return [device for _, device in _inputs(sd)]
+        return [
+            replace(device, serial=places[device.name].serial, usb_port=places[device.name].usb_port)
+            if device.name in places
+            else device
+            for _, device in _inputs(sd)
+        ]
     except sd.PortAudioError as error:
         raise DeviceError(f"PortAudio cannot list the devices: {_reason(error)}; is a sound driver running?") from error
 

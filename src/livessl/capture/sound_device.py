@@ -17,6 +17,7 @@ import numpy as np
 from livessl.capture.device_process import DeviceProcess
 from livessl.capture.device_report import DeviceState, Report, Wanted
 from livessl.capture.device_watch import Seen, judge
+from livessl.capture.gap_watch import HARDWARE_GAP_NS, SERVER_GAP_NS, GapWatch
 from livessl.capture.native_output import NativeOutput
 from livessl.clock import Clock
 from livessl.core.types import Block
@@ -83,6 +84,8 @@ class SoundDevice:
         Blocks that were lost because this process did not read them in time.
     starts : int
         Number of times that the process was started.
+    unflagged_gaps : int
+        Gaps that no driver flagged.
     """
 
     def __init__(
@@ -98,11 +101,13 @@ class SoundDevice:
         self.problem: str | None = None
         self.overruns = 0
         self.starts = 0
+        self.unflagged_gaps = 0
         self._block_s = config.block_s
         self._wanted = _wanted(config, channels)
         self._clock = clock
         self._start = start
         self._output = NativeOutput()
+        self._gaps = GapWatch(config.sample_rate_hz, config.block_s)
         self._run: _Run | None = None
         self._failures = 0
         self._start_ns = clock.monotonic_ns()
@@ -161,14 +166,27 @@ class SoundDevice:
             block = run.block()
             self._look_after(run)
             if block is not None:
-                return self._handed(block)
+                return self._handed(block, run)
         nothing = np.empty((self.channels, 0), dtype=np.float32)
         return Block(self._handed_index, nothing, self._clock.now_ns())
 
-    def _handed(self, block: Block) -> Block:
-        """Return a block of the process as one of the device, whose indices continue after a restart."""
+    def _handed(self, block: Block, run: _Run) -> Block:
+        """Return a block of the process as one of the device: indices continue after a restart, gaps are marked."""
         first_index = self._base_index + block.first_index
         overflow = block.overflow or self._lost
+        if overflow:
+            self._gaps.restart()
+        least_gap_ns = HARDWARE_GAP_NS if run.is_hardware else SERVER_GAP_NS
+        gap_ns = self._gaps.push(first_index, block.stamp_ns, least_gap_ns)
+        if gap_ns:
+            overflow = True
+            self.unflagged_gaps += 1
+            _log.warning(
+                "%.0f ms of sound of device %r are missing without a flag of its driver; %d such gaps so far",
+                gap_ns / 1e6,
+                self.name,
+                self.unflagged_gaps,
+            )
         self._lost, self._delivered, self._failures = False, True, 0
         self._handed_index = first_index + block.samples.shape[1]
         return Block(first_index, block.samples, block.stamp_ns, overflow)
@@ -248,6 +266,11 @@ class _Run:
         self._overruns = 0
         self._floods = 0
         self._output_ns = clock.monotonic_ns()
+
+    @property
+    def is_hardware(self) -> bool:
+        """True if samples come directly from the device."""
+        return self.report is not None and self.report.hardware
 
     def wait(self) -> None:
         """Wait for something new. Time in which this process did not run is not counted as the other's."""
