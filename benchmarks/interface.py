@@ -1,8 +1,9 @@
 """Faults of an audio interface, made on a virtual one through the installed PortAudio, and what a node costs.
 
 `python benchmarks/interface.py faults --repeats 5` measures how soon a node reports each fault and has sound again,
-`losses --minutes 60 --spinning 2` counts lost samples, `resources` measures memory and processor time of a node. The
-virtual interface is in tests/interface; it needs gcc and libasound2-dev. The results are in docs/reliability.md.
+`losses --minutes 60 --spinning 2` counts lost samples, `resources` measures memory and processor time of a node, and
+`stamps` how even the stamps are. The virtual interface is in tests/interface; it needs gcc and libasound2-dev. The
+results are in docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
 
 from livessl.capture.device_process import DeviceProcess
+from livessl.capture.gap_watch import BEFORE_S, RECENT_S
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS, Frame, Mark
 from livessl.server.receiver import Receiver
 from livessl.site.node_models import SoundDeviceConfig
 from small_site import Changes, site_of, started, write_site
+from sound_server import VirtualCard
 from virtual_interface import COUNTED, Interface, Interfaces, counts_of
 
 PATIENCE_S: Final = 60.0
@@ -278,6 +281,36 @@ def resources(seconds: float) -> None:
                     print(f"| {channels} | {name} | {_own_mb(pid):.1f} MB | {100 * share:.1f} % |")
 
 
+def stamps(seconds: float, spinning: int) -> None:
+    """Print by how much the earliest stamps of two windows differ, with gaps in neither: see `capture/gap_watch.py`."""
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        for _ in range(spinning):
+            stack.enter_context(started(sys.executable, "-c", "while True: pass"))
+        interfaces = Interfaces(Path(folder))
+        interfaces.add(ppm=100.0)
+        with tempfile.TemporaryDirectory() as home:
+            card = VirtualCard(Path(home))
+            stack.callback(card.close)
+            card.plug_in()
+            for name, environment in {"UMC1820": interfaces.environment, "virtual": card.environment}.items():
+                rises = _rises(name, environment, seconds)
+                print(f"{name}: {max(rises) / 1e6:.2f} ms at most, 99 % below {np.percentile(rises, 99) / 1e6:.2f} ms")
+
+
+def _rises(name: str, environment: dict[str, str], seconds: float) -> list[int]:
+    """Return, for each block, the difference of the earliest stamps in ns."""
+    config = SoundDeviceConfig(name=name)
+    recent, before = round(RECENT_S / config.block_s), round(BEFORE_S / config.block_s)
+    late: list[int] = []
+    with SoundDevice(config, 4, SystemClock(), lambda wanted: DeviceProcess(wanted, environment=environment)) as device:
+        for block in device:
+            if block.samples.shape[1]:
+                late.append(block.stamp_ns - round(block.first_index / config.sample_rate_hz * 1e9))
+            if len(late) * config.block_s >= seconds:
+                break
+    return [min(late[k : k + recent]) - min(late[k - before : k]) for k in range(before, len(late) - recent)]
+
+
 def _children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
@@ -314,11 +347,16 @@ def main() -> None:
     lost.add_argument("--sample-rate", type=int, default=48000)
     lost.add_argument("--spinning", type=int, default=2)
     commands.add_parser("resources").add_argument("--seconds", type=float, default=20.0)
+    jitter = commands.add_parser("stamps")
+    jitter.add_argument("--seconds", type=float, default=20.0)
+    jitter.add_argument("--spinning", type=int, default=2)
     given = parser.parse_args()
     if given.command == "faults":
         faults(given.repeats)
     elif given.command == "losses":
         losses(given.minutes, given.channels, given.sample_rate, given.spinning)
+    elif given.command == "stamps":
+        stamps(given.seconds, given.spinning)
     else:
         resources(given.seconds)
 
