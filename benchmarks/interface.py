@@ -26,7 +26,7 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
 
 from livessl.capture.device_process import DeviceProcess
-from livessl.capture.gap_watch import BEFORE_S, RECENT_S
+from livessl.capture.gap_watch import HARDWARE, SOUND_SERVER, GapRule
 from livessl.capture.sound_device import SoundDevice
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS, Frame, Mark
@@ -292,15 +292,21 @@ def stamps(seconds: float, spinning: int) -> None:
             card = VirtualCard(Path(home))
             stack.callback(card.close)
             card.plug_in()
-            for name, environment in {"UMC1820": interfaces.environment, "virtual": card.environment}.items():
-                rises = _rises(name, environment, seconds)
+            card.play(
+                np.random.default_rng(0).normal(0.0, 0.1, (round(2 * seconds + 60) * 48000, 4)).astype(np.float32)
+            )
+            for name, environment, rule in (
+                ("UMC1820", interfaces.environment, HARDWARE),
+                ("virtual", card.environment, SOUND_SERVER),
+            ):
+                rises = _rises(name, environment, seconds, rule)
                 print(f"{name}: {max(rises) / 1e6:.2f} ms at most, 99 % below {np.percentile(rises, 99) / 1e6:.2f} ms")
 
 
-def _rises(name: str, environment: dict[str, str], seconds: float) -> list[int]:
+def _rises(name: str, environment: dict[str, str], seconds: float, rule: GapRule) -> list[int]:
     """Return, for each block, the difference of the earliest stamps in ns."""
     config = SoundDeviceConfig(name=name)
-    recent, before = round(RECENT_S / config.block_s), round(BEFORE_S / config.block_s)
+    recent, before = round(rule.recent_s / config.block_s), round(rule.before_s / config.block_s)
     late: list[int] = []
     with SoundDevice(config, 4, SystemClock(), lambda wanted: DeviceProcess(wanted, environment=environment)) as device:
         for block in device:

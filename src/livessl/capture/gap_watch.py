@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Final
 
-RECENT_S: Final = 0.2
-"""Length of the recent window, in seconds. A gap delays every block in it, a busy machine hardly ever does."""
 
-BEFORE_S: Final = 1.0
-"""Length of the window before it, in seconds: so short that a crystal off by 500 ppm moves by 0.6 ms in both."""
+@dataclass(frozen=True, slots=True)
+class GapRule:
+    """What counts as a gap.
+
+    Parameters
+    ----------
+    recent_s : float
+        Length of the recent window, in seconds: longer than a busy machine delays blocks.
+    before_s : float
+        Length of the window before it, in seconds: so short that a crystal off by 500 ppm moves by much less than
+        `least_gap_ns` in both.
+    least_gap_ns : int
+        Shortest gap that is found, in ns.
+    """
+
+    recent_s: float
+    before_s: float
+    least_gap_ns: int
+
+
+HARDWARE: Final = GapRule(0.2, 1.0, 4_000_000)
+"""The rule where conversion times come from the device. They include how long blocks waited, so the earliest stamps of
+two windows differ by less than 0.2 ms, also on a busy machine."""
+
+SOUND_SERVER: Final = GapRule(2.0, 6.0, 100_000_000)
+"""The rule for a sound server. It delivers several blocks at once, in numbers that change, and only the time of their
+arrival is known."""
 
 LEAST_BLOCKS: Final = 5
 """Least number of blocks in each window."""
-
-HARDWARE_GAP_NS: Final = 4_000_000
-"""Shortest gap that is found where conversion times come from the device, in ns. There the earliest stamps of two
-windows differ by less than 0.2 ms, also on a busy machine."""
-
-SERVER_GAP_NS: Final = 12_000_000
-"""The same for a sound server, whose earliest stamps differ by up to 4 ms on a busy machine."""
 
 
 class GapWatch:
@@ -31,20 +48,24 @@ class GapWatch:
         Nominal rate.
     block_s : float
         Length of a block, in seconds.
+    rule : GapRule
     """
 
-    def __init__(self, sample_rate_hz: float, block_s: float) -> None:
+    def __init__(self, sample_rate_hz: float, block_s: float, rule: GapRule) -> None:
         self._rate_hz = sample_rate_hz
-        self._recent: deque[int] = deque(maxlen=max(LEAST_BLOCKS, round(RECENT_S / block_s)))
-        self._before: deque[int] = deque(maxlen=max(LEAST_BLOCKS, round(BEFORE_S / block_s)))
+        self._rule = rule
+        self._recent: deque[int] = deque(maxlen=max(LEAST_BLOCKS, round(rule.recent_s / block_s)))
+        self._before: deque[int] = deque(maxlen=max(LEAST_BLOCKS, round(rule.before_s / block_s)))
 
     def restart(self) -> None:
         """Forget the stamps, after a gap that is known."""
         self._recent.clear()
         self._before.clear()
 
-    def push(self, first_index: int, time_ns: int, least_gap_ns: int) -> int:
+    def push(self, first_index: int, time_ns: int) -> int:
         """Take in a block; return the length of a gap in ns that began within the recent window, 0 if there is none.
+
+        The length is short by as much as the blocks before the gap were late.
 
         Parameters
         ----------
@@ -52,8 +73,6 @@ class GapWatch:
             Index of the block's first sample.
         time_ns : int
             Its stamp.
-        least_gap_ns : int
-            Shortest gap that is to be found.
         """
         if len(self._recent) == self._recent.maxlen:
             self._before.append(self._recent.popleft())
@@ -61,7 +80,7 @@ class GapWatch:
         if len(self._before) < LEAST_BLOCKS:
             return 0
         gap_ns = min(self._recent) - min(self._before)
-        if gap_ns < least_gap_ns:
+        if gap_ns < self._rule.least_gap_ns:
             return 0
         self.restart()
         return gap_ns

@@ -17,7 +17,7 @@ import numpy as np
 from livessl.capture.device_process import DeviceProcess
 from livessl.capture.device_report import DeviceState, Report, Wanted
 from livessl.capture.device_watch import Seen, judge
-from livessl.capture.gap_watch import HARDWARE_GAP_NS, SERVER_GAP_NS, GapWatch
+from livessl.capture.gap_watch import HARDWARE, SOUND_SERVER, GapWatch
 from livessl.capture.native_output import NativeOutput
 from livessl.clock import Clock
 from livessl.core.types import Block
@@ -107,7 +107,7 @@ class SoundDevice:
         self._clock = clock
         self._start = start
         self._output = NativeOutput()
-        self._gaps = GapWatch(config.sample_rate_hz, config.block_s)
+        self._gaps = GapWatch(config.sample_rate_hz, config.block_s, SOUND_SERVER)
         self._run: _Run | None = None
         self._failures = 0
         self._start_ns = clock.monotonic_ns()
@@ -166,18 +166,17 @@ class SoundDevice:
             block = run.block()
             self._look_after(run)
             if block is not None:
-                return self._handed(block, run)
+                return self._handed(block)
         nothing = np.empty((self.channels, 0), dtype=np.float32)
         return Block(self._handed_index, nothing, self._clock.now_ns())
 
-    def _handed(self, block: Block, run: _Run) -> Block:
+    def _handed(self, block: Block) -> Block:
         """Return a block of the process as one of the device: indices continue after a restart, gaps are marked."""
         first_index = self._base_index + block.first_index
         overflow = block.overflow or self._lost
         if overflow:
             self._gaps.restart()
-        least_gap_ns = HARDWARE_GAP_NS if run.is_hardware else SERVER_GAP_NS
-        gap_ns = self._gaps.push(first_index, block.stamp_ns, least_gap_ns)
+        gap_ns = self._gaps.push(first_index, block.stamp_ns)
         if gap_ns:
             overflow = True
             self.unflagged_gaps += 1
@@ -198,6 +197,9 @@ class SoundDevice:
                 self._leave()
                 raise DeviceError(report.message)
             self._reported = True
+            if report.state is DeviceState.OPEN:
+                rule = HARDWARE if report.hardware else SOUND_SERVER
+                self._gaps = GapWatch(self.sample_rate_hz, self._block_s, rule)
         run.read_output(self._output)
         verdict = judge(self.name, self._block_s, run.seen(delivered_before=self._delivered))
         if verdict is not None:
@@ -266,11 +268,6 @@ class _Run:
         self._overruns = 0
         self._floods = 0
         self._output_ns = clock.monotonic_ns()
-
-    @property
-    def is_hardware(self) -> bool:
-        """True if samples come directly from the device."""
-        return self.report is not None and self.report.hardware
 
     def wait(self) -> None:
         """Wait for something new. Time in which this process did not run is not counted as the other's."""
