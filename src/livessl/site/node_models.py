@@ -12,12 +12,19 @@ from livessl.site.slips import counted_from_0
 
 
 class SoundDeviceConfig(Model):
-    """An audio interface, by name."""
+    """An audio interface, by name, and by serial number or USB port where several have one name.
+
+    `latency_s` is the latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so
+    how long the machine may be busy before samples are lost; blocks still arrive every `block_s`.
+    """
 
     type: Literal["sound"] = "sound"
     name: str
+    serial: str | None = None
+    usb_port: str | None = None
     sample_rate_hz: Positive = 48000.0
     block_s: Annotated[float, Field(gt=0, le=1)] = 0.02
+    latency_s: Annotated[float, Field(gt=0, le=2)] = 0.1
 
 
 class WavDeviceConfig(Model):
