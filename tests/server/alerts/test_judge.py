@@ -239,7 +239,7 @@ def test_finding_alerts_by_severity() -> None:
         "all": {"findings": {"severity": "warning"}, "hold_off_s": 0},
         "swaps": {"findings": {"severity": "info", "faults": ["turned"]}},
     }
-    with running_desk(site(**rules)) as desk:
+    with running_desk(site(None, **rules)) as desk:
         desk.findings.findings, desk.findings.sounds = tuple(faults), 3
         wait_until(lambda: len(desk.published) == 3, "the alerts")
     found = sorted((alert["rule"], alert["finding"]["fault"]) for alert in desk.published)
