@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from livessl.clock import check_time_zone
 from livessl.core.commission.finding import Severity
@@ -19,6 +19,16 @@ DAYS: Final[tuple[Day, ...]] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 """A span of time that may be zero, in seconds."""
+
+
+T = TypeVar("T")
+
+
+def _not_empty(items: tuple[T, ...]) -> tuple[T, ...]:
+    """Return items of which there is one at least; pydantic's own check also complains where an item is wrong."""
+    if not items:
+        raise ValueError("expected at least 1 item, got none; leave the key out for the default")
+    return items
 
 
 def _minutes(value: Any) -> int:
@@ -42,7 +52,7 @@ TimeOfDay = Annotated[int, BeforeValidator(_minutes)]
 class ScheduleSpan(Model):
     """A span of the week; one that ends before it begins lasts over midnight."""
 
-    days: Annotated[tuple[Day, ...], Field(min_length=1)] = DAYS
+    days: Annotated[tuple[Day, ...], AfterValidator(_not_empty)] = DAYS
     begin: TimeOfDay = 0
     end: TimeOfDay = MINUTES_OF_DAY
 
@@ -58,7 +68,7 @@ class EventCondition(Model):
 
     zones: tuple[str, ...] = ()
     probability: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    statuses: Annotated[tuple[Literal["located", "direction-only"], ...], Field(min_length=1)] = ("located",)
+    statuses: Annotated[tuple[Literal["located", "direction-only"], ...], AfterValidator(_not_empty)] = ("located",)
     min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
     min_level_dbfs: Annotated[float, Field(ge=-300, le=20)] | None = None
     min_duration_s: Seconds = 0.0
@@ -87,7 +97,7 @@ class ArrayCondition(Model):
     """Which conditions of which arrays alert; no names stand for all arrays."""
 
     names: tuple[str, ...] = ()
-    states: Annotated[tuple[Literal["starting", "quiet", "degraded", "lost"], ...], Field(min_length=1)] = (
+    states: Annotated[tuple[Literal["starting", "quiet", "degraded", "lost"], ...], AfterValidator(_not_empty)] = (
         "degraded",
         "lost",
     )

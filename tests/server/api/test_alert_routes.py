@@ -78,11 +78,13 @@ def test_alerts_come_by_websocket_and_are_listed_with_their_deliveries(tmp_path:
 
 def test_subscriber_to_a_zone_or_with_a_least_confidence_gets_its_alerts(tmp_path: Path) -> None:
     url = "/api/v1/live?kinds=alert&zone=door&min_confidence=0.99"
-    with alerting(tmp_path) as server:
-        with connect(f"ws{server.url.removeprefix('http')}{url}", open_timeout=HANG_S) as live:
-            live.recv(timeout=HANG_S)
-            finish(server, sound(1))
-            assert json.loads(live.recv(timeout=HANG_S))["zones"] == ["door"]
+    with (
+        alerting(tmp_path) as server,
+        connect(f"ws{server.url.removeprefix('http')}{url}", open_timeout=HANG_S) as live,
+    ):
+        live.recv(timeout=HANG_S)
+        finish(server, sound(1))
+        assert json.loads(live.recv(timeout=HANG_S))["zones"] == ["door"]
 
 
 def test_rules_are_listed_with_their_states(tmp_path: Path) -> None:
@@ -154,11 +156,13 @@ def test_dead_letters_are_listed_degrade_health_and_are_sent_again(tmp_path: Pat
 @pytest.mark.parametrize("method_and_path", ["PUT rules/door/armed", "POST dead-letters/1/resend"])
 def test_viewer_may_look_and_not_change(tmp_path: Path, method_and_path: str) -> None:
     method, path = method_and_path.split()
-    tokens = {role: add_token(tmp_path / "tokens.yaml", role, role) for role in ("viewer", "operator")}  # type: ignore[arg-type]
+    tokens = {role: add_token(tmp_path / "tokens.yaml", role, role) for role in ("viewer", "operator")}
     with alerting(tmp_path, changes={"server.http.tokens": "tokens.yaml"}) as server:
         headers = {role: {"Authorization": f"Bearer {token}"} for role, token in tokens.items()}
         url = f"{server.url}/api/v1/alerts"
-        found = [httpx.request(method, f"{url}/{path}", headers=each, json={"armed": False}) for each in headers.values()]
+        found = [
+            httpx.request(method, f"{url}/{path}", headers=each, json={"armed": False}) for each in headers.values()
+        ]
         assert httpx.get(f"{url}/rules", headers=headers["viewer"]).status_code == 200
     assert [answer.status_code for answer in found] == [403, 200 if method == "PUT" else 404]
 
