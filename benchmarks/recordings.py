@@ -84,12 +84,13 @@ def field_errors_m(method: str | None = None) -> dict[str, list[float]]:
     return errors
 
 
-def measured_room_errors_deg(method: str | None = None) -> tuple[list[float], int]:
+def measured_room_errors_deg(method: str | None = None, *, every: int = 4) -> tuple[list[float], int]:
     """Return the azimuth error of every event in the measured rooms, and the number of sounds that were played.
 
-    Every fourth sound is played in each of seven measured rooms, to each of two interleaved squares of microphones.
+    One sound out of `every` is played in each of seven measured rooms, to each of two interleaved squares of
+    microphones.
     """
-    sounds = [sound for _, sound in read_sounds(DATA / "dcase2016_task2", 48000.0)[::4]]
+    sounds = [sound for _, sound in read_sounds(DATA / "dcase2016_task2", 48000.0)[::every]]
     errors: list[float] = []
     played = 0
     for room in sorted((DATA / "inhouse_rirs_uca8").glob("*.mat")):

@@ -6,11 +6,14 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, Request, sync_playwright
 
 from conftest import require
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+INTERFACES_CHANGED = "ERR_NETWORK_CHANGED"
+"""Chromium's error of requests under way when a network interface comes or goes, as it does in tests of cables."""
 
 
 @contextmanager
@@ -37,3 +40,23 @@ def faultless_page(browser: Browser) -> Iterator[Page]:
         error.add_note(f"errors of the page: {faults}; requests that failed: {failed}")
         raise
     assert faults == []
+
+
+def visit(page: Page, url: str) -> None:
+    """Open a page; again if a network interface of this machine came or went meanwhile."""
+    broken = True
+    while broken:
+        broken = False
+
+        def note(request: Request) -> None:
+            nonlocal broken
+            broken = broken or INTERFACES_CHANGED in (request.failure or "")
+
+        page.on("requestfailed", note)
+        try:
+            page.goto(url)
+        except Error as error:
+            if INTERFACES_CHANGED not in str(error):
+                raise
+            broken = True
+        page.remove_listener("requestfailed", note)

@@ -24,6 +24,7 @@ from playwright.sync_api import Page, sync_playwright
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from browser import visit
 from conftest import require
 from livessl.clock import utc_text
 from livessl.lab import demo
@@ -164,7 +165,7 @@ def browser_page(session: Session, seen: LiveRun) -> Iterator[Page]:
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.on("console", lambda message: seen.problems.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: seen.problems.append(str(error)))
-        page.goto(session.url)
+        visit(page, session.url)
         start_javascript_client(page, session)
         yield page
         browser.close()

@@ -49,8 +49,8 @@ def test_pulses_in_a_field_of_five_microphones_are_located(tmp_path: Path, capsy
 def test_directions_in_measured_rooms_are_right_to_two_degrees() -> None:
     need("inhouse_rirs_uca8")
     need("dcase2016_task2")
-    errors_deg, played = r.measured_room_errors_deg()
-    assert played == 7 * 2 * 20
+    errors_deg, played = r.measured_room_errors_deg(every=12)  # a third of those in docs/accuracy.md
+    assert played == 7 * 2 * 7
     assert played <= len(errors_deg) <= 1.05 * played
     assert np.median(errors_deg) <= 2.0
     assert np.percentile(errors_deg, 90) <= 5.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
+from livessl.core.commission.clocks import find_clock_faults
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.commission.observe import observe
 from livessl.core.types import Event
@@ -73,8 +74,13 @@ def examine_parts(
         If recordings of arrays that the site joins do not belong together.
     """
     outputs = offline.run(site, parts, UnpacedClock(), progress=progress)
-    sounds = [observe(output.received) for output in outputs if isinstance(output, Event) and output.received]
-    findings = [finding for part in parts for finding in _of_samples(part)] + find_set_up_faults(site, sounds)
+    events = [output for output in outputs if isinstance(output, Event)]
+    sounds = [observe(event.received) for event in events if event.received]
+    findings = [
+        *(finding for part in parts for finding in _of_samples(part)),
+        *_of_clocks(site, events),
+        *find_set_up_faults(site, sounds),
+    ]
     order = list(Severity)
     told = sorted(with_inputs(site, _without_consequences(findings)), key=lambda one: order.index(one.severity))
     return Examination(tuple(told), len(sounds))
@@ -91,6 +97,15 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
         if "dead" not in (others := faults[one.array, one.channel] - {one.fault})
         and not (one.fault == "noisy" and others & {"level", "clipping"})
     ]
+
+
+def _of_clocks(site: Site, events: Sequence[Event]) -> Iterator[Finding]:
+    """Compare when the clocks of the nodes, or of arrays without a node, show the sounds."""
+    starts_s: dict[str, list[float]] = {}
+    for event in events:
+        for clock in {site.node_of(array) or array for array in event.heard_by}:
+            starts_s.setdefault(clock, []).append(event.start_ns / 1e9)
+    return find_clock_faults(starts_s)
 
 
 def _of_samples(part: AssignedRecording) -> list[Finding]:

@@ -15,6 +15,7 @@ from livessl.core.types import FRAME_NS
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import REPORT_NS, WATCH_NS, ArrayStates
 from livessl.server.ingest import Ingest
+from livessl.server.node_clocks import WINDOW_NS
 from livessl.server.overload import Overload
 from livessl.server.run import live_run
 from livessl.server.set_up_watch import SetUpWatch
@@ -137,3 +138,21 @@ def test_array_whose_node_greets_without_sound_is_quiet_and_not_lost() -> None:
     desk.greet()
     north = desk.array("north")
     assert (north["state"], north["reason"]) == ("quiet", "its node is there, but no sound comes from its device")
+
+
+def test_a_clock_that_is_behind_is_named_and_only_then() -> None:
+    desk = Desk()
+    desk.greet()
+    for behind_s, named in ((0.0, False), (2.0, True), (0.0, False)):
+        for _ in range(WINDOW_NS // FRAME_NS * 2 + 2):
+            desk.quiet("north", "south")
+            now_ns = desk.clock.now_ns()
+            desk.ingest.node_clocks.note("north", now_ns - round(behind_s * 1e9) - 3_000_000, now_ns)
+            desk.ingest.node_clocks.note("south", now_ns - 3_000_000, now_ns)
+        north, south = desk.array("north"), desk.array("south")
+        assert south["state"] == "healthy"
+        assert north["state"] == ("degraded" if named else "healthy")
+        assert (north["reason"] is not None) is named
+        if named:
+            assert "clock is 2.0 s behind the server's" in north["reason"]
+            assert "NTP" in north["reason"]

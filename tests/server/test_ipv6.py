@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from browser import faultless_page, running_browser
+from browser import faultless_page, running_browser, visit
 from conftest import require
 from livessl import wire
 from livessl.capture.link import Link
@@ -216,7 +216,7 @@ def test_session_is_replayed_to_a_server(tmp_path: Path, capsys: pytest.CaptureF
 @pytest.mark.browser
 def test_dashboard_works() -> None:
     with running_server(site_of(on("::1"))) as server, running_browser() as browser, faultless_page(browser) as page:
-        page.goto(server.url)
+        visit(page, server.url)
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("array-north")).to_be_visible()
 

@@ -16,6 +16,7 @@ from livessl.core.stream.array_health import ArrayState, ArrayStatus, NodeReport
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.ingest import Ingest
+from livessl.server.node_clocks import clock_is_behind
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
@@ -155,8 +156,15 @@ class ArrayStates:
             problem=self._ingest.problem_of(array),
             is_live=self._ingest.is_live(array, self._clock.monotonic_ns()),
             is_disabled=array in self._disabled,
-            finding=self._set_up_watch.finding_of(array),
+            finding=self._clock_fault(array) or self._set_up_watch.finding_of(array),
         )
+
+    def _clock_fault(self, array: str) -> str | None:
+        """Return in words that an array's clock is behind; delays of a replay or of an overload say nothing."""
+        if self._site_time.mode != "live" or self._overload.message is not None:
+            return None
+        behind_s = self._ingest.node_clocks.behind_s(array)
+        return None if behind_s is None else clock_is_behind(behind_s)
 
     def _counters(self, status: ArrayStatus, fusion: TwoPassFusion) -> dict[str, int]:
         name = status.name

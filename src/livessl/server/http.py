@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import socket
 import ssl
 from contextlib import ExitStack
@@ -10,6 +12,7 @@ from typing import Any, Final
 
 import uvicorn
 from fastapi import FastAPI
+from starlette.types import Receive, Scope, Send
 from uvicorn._types import ASGISendEvent
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import InvalidState
@@ -39,6 +42,8 @@ MAX_UNREAD_BYTES: Final = 131_072
 CIPHERS: Final = "ECDHE+AESGCM:ECDHE+CHACHA20"
 """Ciphers for TLS 1.2: forward secret and authenticated, as all of TLS 1.3 are."""
 
+_log = logging.getLogger(__name__)
+
 
 class _WebSocket(WebSocketsSansIOProtocol):
     """uvicorn's WebSocket without two of its faults.
@@ -57,6 +62,21 @@ class _WebSocket(WebSocketsSansIOProtocol):
             super().shutdown()
         except InvalidState:
             self.transport.close()
+
+
+class _Ended:
+    """An application whose open connections end without an error when the server stops before their clients do."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except asyncio.CancelledError:  # `SHUTDOWN_S` is over; uvicorn would log a traceback
+            if scope["type"] == "lifespan":
+                raise
+            _log.info("a connection of %s was still open at the end", scope.get("client"))
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -122,7 +142,7 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
     key = site.server.http.private_key
     return uvicorn.Server(
         uvicorn.Config(
-            app,
+            _Ended(app),
             ws=_WebSocket,  # sends many small messages faster than uvicorn's other implementations
             log_level="warning",
             http="h11",  # the implementation that limits the head of a request

@@ -9,6 +9,7 @@ from typing import Final
 
 from livessl import wire
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
+from livessl.server.node_clocks import NodeClocks
 from livessl.site.models import Site
 
 ACK_NS: Final = 250_000_000
@@ -93,6 +94,7 @@ class Ingest:
         self._peers: dict[bytes, Peer] = {}
         self._final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
         self._notice_ns = -NOTICE_NS
+        self.node_clocks = NodeClocks()
         self.malformed = 0
         """Malformed messages since the start."""
         self._kept: frozenset[str] | None = None  # replaced as a whole, never changed

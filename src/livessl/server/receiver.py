@@ -263,7 +263,9 @@ class Receiver:
             read.append((0, Left(received.left)))
         message = received.message
         if message is not None:
-            self.arrivals.note(message.frame_index, Arrival(wire.sent_ns(data), self._clock.now_ns()))
+            arrival = Arrival(wire.sent_ns(data), self._clock.now_ns())
+            self.arrivals.note(message.frame_index, arrival)
+            self.ingest.node_clocks.note(message.array, *arrival)
             read.append((message.samples.nbytes if isinstance(message, Frame) else 0, message))
         if received.offer is not None:
             self._reply(routing_id, received.offer)

@@ -80,17 +80,24 @@ def test_a_killed_and_resumed_campaign_gives_the_same_bytes(tmp_path: Path) -> N
 
 
 @pytest.mark.processes
-@pytest.mark.timeout(600)
-def test_an_interrupted_campaign_ends_soon(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiling", [False, True])
+def test_an_interrupted_campaign_ends_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiling: bool) -> None:
+    """Thousands of positions are minutes, and so is the compilation of the kernels where there is no cache of them."""
     sounds, out = write_sounds(tmp_path / "sounds"), tmp_path / "out"
-    compiling = [sys.executable, "-m", "livessl", *arguments(sounds, tmp_path / "first"), "--positions", "1"]
-    subprocess.run(compiling, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    if compiling:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
     command = [sys.executable, "-m", "livessl", *arguments(sounds, out), "--positions", "5000"]
     with started(*command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        wait_until(lambda: finished(out) or process.poll() is not None, "a position")
+
+        def begun() -> bool:
+            return len(children(process.pid)) > 1 if compiling else bool(finished(out))
+
+        wait_until(lambda: begun() or process.poll() is not None, "the first work")
+        workers = children(process.pid)
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=HANG_S) == 130  # thousands of positions are minutes
-    assert len(list((out / "parts").glob("*.parquet"))) < 1000
+        assert process.wait(timeout=HANG_S) == 130
+        wait_until(lambda: not any(map(alive, workers)), f"the end of the workers {workers}")
+    assert len(finished(out)) < 1000
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed", "ignore::ResourceWarning")

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
-from browser import faultless_page, running_browser
+from browser import faultless_page, running_browser, visit
 from livessl.site.tokens import RoleName, add_token
 from small_site import HANG_S, Changes, running_server, site_of
 
@@ -31,7 +31,7 @@ def browser() -> Iterator[Browser]:
 def test_dashboard_asks_once_for_the_token(browser: Browser, tmp_path: Path) -> None:
     token = add_token(tmp_path / "tokens.yaml", "wall", "viewer")
     with running_server(site_of(SECURED, tmp_path)) as server, faultless_page(browser) as page:
-        page.goto(server.url)
+        visit(page, server.url)
         dialog, connection = page.get_by_test_id("token-dialog"), page.get_by_test_id("connection")
         field = page.get_by_role("textbox", name="Access token")
 
@@ -55,13 +55,13 @@ def test_dashboard_asks_once_for_the_token(browser: Browser, tmp_path: Path) -> 
         expect(dialog).to_be_hidden()
 
         with faultless_page(browser) as other_tab:  # each tab needs the token itself
-            other_tab.goto(server.url)
+            visit(other_tab, server.url)
             expect(other_tab.get_by_test_id("token-dialog")).to_be_visible()
 
 
 def test_dashboard_of_an_open_server_asks_for_no_token(browser: Browser) -> None:
     with running_server(site_of()) as server, faultless_page(browser) as page:
-        page.goto(server.url)
+        visit(page, server.url)
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         expect(page.get_by_test_id("token-dialog")).to_be_hidden()
         expect(page.get_by_test_id("privacy")).to_be_hidden()
@@ -71,7 +71,7 @@ def test_dashboard_of_an_open_server_asks_for_no_token(browser: Browser) -> None
 def test_only_operators_can_disable_an_array(browser: Browser, tmp_path: Path, role: RoleName) -> None:
     token = add_token(tmp_path / "tokens.yaml", "desk", role)
     with running_server(site_of(SECURED, tmp_path)) as server, faultless_page(browser) as page:
-        page.goto(server.url)
+        visit(page, server.url)
         page.get_by_role("textbox", name="Access token").fill(token)
         page.keyboard.press("Enter")
         card, switch = page.get_by_test_id("array-north"), page.get_by_test_id("switch-north")

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import expect
 
-from browser import running_browser
+from browser import running_browser, visit
 from livessl.server.api import documentation
 from livessl.site.tokens import add_token
 from small_site import HANG_S, Changes, running_server, site_of
@@ -28,7 +28,7 @@ def test_page_shows_the_api_and_asks_no_other_server(tmp_path: Path, tokens: boo
         page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
         if tokens:
             page.add_init_script(f"sessionStorage.setItem('livessl-token', '{token}')")
-        page.goto(f"{server.url}/docs")
+        visit(page, f"{server.url}/docs")
         expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=1000 * HANG_S)
         page.locator("#operations-estimates-get_tracks_api_v1_tracks_get .opblock-summary-control").click()
         page.get_by_role("button", name="Try it out").click()

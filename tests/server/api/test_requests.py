@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from typing import Any
 
@@ -156,3 +157,14 @@ def test_every_field_is_described(described: dict[str, Any]) -> None:
         for field, found in schema.get("properties", {}).items():
             reference = found.get("$ref", found.get("items", {}).get("$ref"))
             assert found.get("description") or reference or field in ("kind", "detail"), f"{name}.{field}"
+
+
+def test_server_ends_without_a_traceback_though_a_client_does_not_read(capfd: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with running_server(site_of()) as server:
+            address = httpx.URL(server.url)
+            client.connect((address.host, address.port))
+            client.sendall(f"GET {API}/openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 20)
+            assert client.recv(12) == b"HTTP/1.1 200"
+    assert "Traceback" not in capfd.readouterr().err

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from browser import faultless_page, running_browser
+from browser import faultless_page, running_browser, visit
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from nginx import example, running_nginx
@@ -67,7 +67,7 @@ def test_documented_nginx_serves_the_dashboard(
     with proxied(tmp_path, changes, location) as (_, url), faultless_page(browser) as page:
         opened: list[str] = []
         page.on("websocket", lambda socket: opened.append(socket.url.partition("?")[0]))
-        page.goto(f"{url}/")
+        visit(page, f"{url}/")
         page.get_by_role("textbox", name="Access token").fill(token)
         with page.expect_websocket(lambda socket: "/api/v1/map" in socket.url):  # opened after the greeting
             page.keyboard.press("Enter")
@@ -75,7 +75,7 @@ def test_documented_nginx_serves_the_dashboard(
         expect(page.get_by_test_id("array-north")).to_be_visible()
         expect(page.get_by_test_id("banner")).to_be_hidden()
         assert set(opened) == {f"ws{url.removeprefix('http')}/api/v1/{name}" for name in ("live", "map")}
-        page.goto(f"{url}/docs")
+        visit(page, f"{url}/docs")
         expect(page.locator("#operations-estimates-get_events_api_v1_events_get")).to_be_visible(timeout=1000 * HANG_S)
         page.locator("#operations-estimates-get_tracks_api_v1_tracks_get .opblock-summary-control").click()
         page.get_by_role("button", name="Try it out").click()
@@ -244,7 +244,7 @@ def test_forwarded_host_opens_no_door(tmp_path: Path) -> None:
 @pytest.mark.browser
 def test_page_names_the_cause_when_its_origin_is_refused(browser: Browser, tmp_path: Path) -> None:
     with proxied(tmp_path, host="Host $proxy_host") as (_, url), faultless_page(browser) as page:
-        page.goto(f"{url}/")
+        visit(page, f"{url}/")
         banner = page.get_by_test_id("banner")
         expect(banner).to_contain_text(f"No connection: origin: {url.removeprefix('http://')}", timeout=1000 * HANG_S)
         expect(banner).to_contain_text("is not this server; add it to server.http.trusted_hosts")
@@ -256,7 +256,7 @@ def test_page_names_the_cause_when_the_proxy_passes_no_websocket(browser: Browse
         block = example("/").replace("http://127.0.0.1:8000", server.url).replace(HOST, "Host $proxy_host")
         block = "\n".join(line for line in block.splitlines() if "pgrade" not in line)
         with running_nginx(tmp_path, block) as url:
-            page.goto(f"{url}/")
+            visit(page, f"{url}/")
             expected = "No connection: requests are answered, but the WebSocket is not; a reverse proxy must pass on"
             expect(page.get_by_test_id("banner")).to_contain_text(expected, timeout=1000 * HANG_S)
 
@@ -265,7 +265,7 @@ def test_page_names_the_cause_when_the_proxy_passes_no_websocket(browser: Browse
 def test_page_names_the_cause_when_the_host_is_refused_later(browser: Browser, tmp_path: Path) -> None:
     """The proxy is changed while the page is open, so that the server no longer knows its name."""
     with faultless_page(browser) as page, running_server(site_of()) as server:
-        page.goto(server.url)
+        visit(page, server.url)
         expect(page.get_by_test_id("connection")).to_have_attribute("data-state", "live", timeout=1000 * HANG_S)
         refusal = "host: expected a name of this server, got 'site.example'; add it to server.http.trusted_hosts"
         page.route("**/api/v1/site", lambda route: route.fulfill(status=400, content_type="text/plain", body=refusal))

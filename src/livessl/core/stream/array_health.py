@@ -67,7 +67,7 @@ class NodeReport:
     is_disabled : bool
         Whether an operator has disabled the array.
     finding : str or None
-        What past sounds say is wrong with its channels or its pose.
+        What is wrong with its clock, or what past sounds say is wrong with its channels or its pose.
     """
 
     problem: str | None = None

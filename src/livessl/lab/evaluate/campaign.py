@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import as_completed as completed
 from dataclasses import dataclass
 from io import BytesIO
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -125,12 +125,17 @@ def _worker(job: Job) -> Unit:
 
 
 def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
+    others = set(active_children())
     pool = ProcessPoolExecutor(
         min(jobs, len(wanted)), mp_context=get_context("spawn"), initializer=_begin, initargs=(job,)
     )
     try:  # a `with` would wait, on Ctrl-C, for every position not yet computed
         for future in completed([pool.submit(_compute_sent, number) for number in wanted]):
             yield future.result()
+    except BaseException:
+        for worker in set(active_children()) - others:
+            worker.kill()  # it may be compiling for a minute, and has nothing to lose
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from base64 import b64encode
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,7 +31,19 @@ from livessl.server.parts import Parts
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""
 
-_CSP: Final = "default-src 'self'; img-src 'self' data:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
+
+def _content_security_policy(page: str) -> str:
+    """Return the policy of all pages; of scripts inside pages it admits that of the dashboard."""
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    digests = (b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
+    admitted = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
+    return (
+        f"default-src 'self'; script-src {admitted}; img-src 'self' data:; connect-src 'self' ws: wss:; "
+        "frame-ancestors 'self'"
+    )
+
+
+_CSP: Final = _content_security_policy((STATIC / "index.html").read_text(encoding="utf-8"))
 
 _DESCRIPTION: Final = """\
 Where in the room a sound happened: events, live estimates, tracks, arrays and power maps.
