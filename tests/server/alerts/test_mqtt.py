@@ -138,6 +138,21 @@ def test_discovery_describes_each_rule_by_home_assistants_schema(tmp_path: Path,
         assert payload["origin"]["name"] == "livessl"
 
 
+def test_rule_that_was_taken_out_of_the_site_file_is_forgotten(tmp_path: Path, port: int) -> None:
+    def shown(listener: Listener) -> list[str]:
+        return [topic.split("/")[3] for topic, text in listener.messages if topic.endswith("/config") and text]
+
+    for rules in (("door", "hall"), ("hall",)):
+        with (
+            running_desk(mqtt_site(tmp_path, port, kept=True, rules=dict.fromkeys(rules, RULE))),
+            Listener(port) as seen,
+        ):
+            wait_until(lambda seen=seen: seen.of("livessl/small/availability")[-1:] == [b"online"], "the presence")  # type: ignore[misc]
+    with Listener(port) as later:
+        wait_until(lambda: later.of("livessl/small/availability"), "the kept messages")
+        assert shown(later) == ["hall"]
+
+
 def test_discovery_can_be_switched_off_and_the_topic_chosen(tmp_path: Path, port: int) -> None:
     with Listener(port) as listener, running_desk(mqtt_site(tmp_path, port, topic="yard/ears", discovery="")) as desk:
         desk.finish(sound(1))

@@ -10,6 +10,7 @@ from typing import Any
 
 import httpx
 import pytest
+from scene_server import capture_scene, replay_scene
 from websockets.sync.client import connect
 
 from alert_desk import ELSEWHERE, PATIENT, after, alert_site, encoded, key_of, refused, sound
@@ -192,3 +193,18 @@ def test_site_without_rules_has_empty_answers_and_no_thread(tmp_path: Path) -> N
         assert get(server, "alerts/dead-letters")["dead_letters"] == []
         assert "livessl_alert" not in httpx.get(f"{server.url}/metrics").text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sounds_of_a_node_alert_and_their_replay_does_not(tmp_path: Path) -> None:
+    """From microphones to the alert: real sound, sockets, fusion, final pass."""
+    rules = {"door": {"events": {"min_confidence": 0.5}, "hold_off_s": 0}}
+    with running_server(alert_site(tmp_path, {"server.events_db": "events.sqlite"}, rules=rules)) as server:
+        capture_scene(server)
+        wait_until(lambda: rule(server, "door")["alerts"] == 2, "an alert about each sound")
+        alerts, events = get(server, "alerts")["alerts"], get(server, "events")["events"]
+        replay_scene(server)
+        wait_until(lambda: server.parts.event_log.published == 4, "the replayed events")
+        capture_scene(server, 4 + len(events))
+        wait_until(lambda: rule(server, "door")["alerts"] == 4, "alerts about live sound again")
+    assert [alert["event"] for alert in alerts] == events
+    assert len({alert["key"] for alert in alerts}) == 2

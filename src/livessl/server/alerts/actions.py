@@ -77,6 +77,8 @@ class ActionSetting:
     clock : Clock
     rules : sequence of str
         Names of the rules that take it.
+    other_rules : sequence of str
+        Names of rules that do not, or no longer, take it, those included that the site file no longer has.
     url : str
         Address of the server for people.
     """
@@ -86,6 +88,7 @@ class ActionSetting:
     site: Site
     clock: Clock
     rules: Sequence[str]
+    other_rules: Sequence[str]
     url: str
 
     @property

@@ -168,10 +168,15 @@ class Mqtt:
         )
 
     async def _introduce(self, client: aiomqtt.Client) -> None:
-        """Publish that the server is there, and for each rule how Home Assistant shows it; the broker keeps both."""
-        for rule in self._setting.rules if self._discovery else ():
-            topic = f"{self._discovery}/event/livessl_{_slug(self._setting.site.site)}/{_slug(rule)}/config"
-            await client.publish(topic, orjson.dumps(self.discovery_payload(rule)), qos=1, retain=True)
+        """Publish that the server is there, and for each rule how Home Assistant shows it; the broker keeps both.
+
+        An empty message makes Home Assistant forget a rule that is no longer published here.
+        """
+        shown = {rule: orjson.dumps(self.discovery_payload(rule)) for rule in self._setting.rules}
+        if self._discovery:
+            for rule, payload in {**dict.fromkeys(self._setting.other_rules, b""), **shown}.items():
+                topic = f"{self._discovery}/event/livessl_{_slug(self._setting.site.site)}/{_slug(rule)}/config"
+                await client.publish(topic, payload, qos=1, retain=True)
         await client.publish(self.availability_topic, ONLINE, qos=1, retain=True)
 
     async def _until_disconnected(self, client: aiomqtt.Client, ready: Callable[[], None]) -> None:

@@ -134,7 +134,8 @@ class Alerts:
     def _courier(self, name: str, url: str) -> Courier:
         config = self._config.actions[name]
         rules = [rule for rule, each in self._config.rules.items() if name in each.actions]
-        action = make_action(ActionSetting(name, config, self._site, self._clock, rules, url))
+        others = sorted((self._config.rules.keys() | self.outbox.states().keys()) - set(rules))
+        action = make_action(ActionSetting(name, config, self._site, self._clock, rules, others, url))
         return Courier(name, config, action, self.outbox, self._clock)
 
     # --- for the fusion thread
