@@ -47,7 +47,7 @@ Answer = tuple[int, dict[str, str]]
 
 @dataclass
 class Receiver:
-    """What came, and the answer to the next request: a status and further headers."""
+    """Requests that came, and the answer to the next one: a status and further headers."""
 
     url: str
     answer: Callable[[], Answer] = lambda: (204, {})

@@ -1,4 +1,4 @@
-"""Models of the site file's `alerts`: the rules, and the actions that tell people and machines."""
+"""Models of the site file's `alerts`: the rules, and the actions that deliver what the rules raise."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class AlertRule(Model):
 
     @property
     def kind(self) -> Literal["events", "arrays", "findings"]:
-        """What the rule watches."""
+        """Key of what the rule watches."""
         if self.events is not None:
             return "events"
         return "arrays" if self.arrays is not None else "findings"
@@ -199,7 +199,7 @@ class AlertAction(Model):
 
     @property
     def kind(self) -> str:
-        """What the action is: one of `livessl.server.alerts.actions.ACTIONS`."""
+        """Type of the action: a key of `livessl.server.alerts.actions.ACTIONS`."""
         return next(name for name in ("webhook", "mqtt", "command", "apprise") if getattr(self, name) is not None)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Dialog, Page, expect
 
 from alert_desk import after, alert_site, sound
 from browser import faultless_page, running_browser, visit
@@ -63,7 +63,12 @@ def test_page_lists_rules_and_alerts_and_asks_before_it_disarms(browser: Browser
         expect(panel).to_contain_text("in zone 'door' with probability 1.00", timeout=1000 * HANG_S)
         expect(panel).to_contain_text("not delivered by run", timeout=1000 * HANG_S)
         asked: list[str] = []
-        page.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+
+        def refuse(dialog: Dialog) -> None:
+            asked.append(dialog.message)
+            dialog.dismiss()
+
+        page.once("dialog", refuse)
         page.get_by_role("button", name="Disarm door").click()
         assert asked == ['Disarm "door"? It alerts nobody until it is armed again.']
         assert server.parts.alerts.states["door"].armed

@@ -59,14 +59,14 @@ class Action(Protocol):
         Raises
         ------
         DeliveryError
-            If it did not arrive, or nobody confirmed it.
+            If it did not arrive, or was not confirmed.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ActionSetting:
-    """What an action is made from.
+    """Settings from which an action is made.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class ActionSetting:
 
     @property
     def place(self) -> str:
-        """Where its settings are in the site file."""
+        """Place of its settings in the site file."""
         return f"alerts.actions.{self.name}.{self.config.kind}"
 
 

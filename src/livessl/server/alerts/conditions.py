@@ -17,7 +17,7 @@ _WEIGHT: Final = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 
 
 class Observed(NamedTuple):
-    """What can be seen now of the conditions that a rule watches.
+    """Present state of the conditions that a rule watches.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Observed(NamedTuple):
         The conditions that hold, by subject; each makes the alert about itself from the site time since which it holds
         and the time now.
     unknown : frozenset of str
-        Subjects of which nothing is known now: what was said of them before stands.
+        Subjects of which nothing is known now: whether they have alerted stays as it was.
     """
 
     bad: Mapping[str, Callable[[int, int], JsonObject]]

@@ -12,7 +12,7 @@ from livessl.server.store import Query, Store
 from livessl.site.alert_models import AlertRule
 
 PAGE: Final = 500
-"""Events that are read from the store at a time, so that nobody waits for the store for long."""
+"""Events that are read from the store at a time, so that other threads do not wait for the store for long."""
 
 MAX_TRIED: Final = 100_000
 """Most events that a dry run looks at, the newest ones: about half a minute beside a busy server."""
@@ -23,7 +23,7 @@ EXAMPLES: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What a rule would have done.
+    """Result of a dry run.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 ONLINE: Final = "online"
 OFFLINE: Final = "offline"
-"""Payloads of the availability topic: those that Home Assistant expects unless told otherwise."""
+"""Payloads of the availability topic: the ones that Home Assistant expects by default."""
 
 EVENT_TYPE: Final = "alert"
 """The only type of event of each entity."""
@@ -34,7 +34,7 @@ LONGEST_WAIT_S: Final = 30.0
 """Shortest and longest wait, in seconds, between two attempts to reach the broker."""
 
 GOODBYE_S: Final = 1.0
-"""Longest time, in seconds, in which a server that stops says so to the broker."""
+"""Longest time, in seconds, that the last message of a server that stops may take."""
 
 _log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ NS_PER_S: Final = 1_000_000_000
 
 
 class Verdict(StrEnum):
-    """What becomes of something that a rule looks at; all but the first two are counted as suppressed."""
+    """Decision of a rule about an event or a condition; all but the first two are counted as suppressed."""
 
     ALERT = "alert"
     NO_MATCH = "no-match"
@@ -32,12 +32,12 @@ class Verdict(StrEnum):
 
 
 SUPPRESSED: Final = (Verdict.DISARMED, Verdict.OFF_SCHEDULE, Verdict.COUNTING, Verdict.HELD_OFF)
-"""Verdicts on what matched and did not alert."""
+"""Verdicts on matches that did not alert."""
 
 
 @dataclass(frozen=True, slots=True)
 class RuleState:
-    """What a rule must remember across restarts.
+    """State of a rule that survives restarts.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ class Alerts:
     array_states : ArrayStates
     set_up_watch : SetUpWatch
     site_time : SiteTime
-        Knows whether a replay runs, about which nobody is alerted.
+        Knows whether a replay runs; its events never alert.
     publish : callable
         Gets each alert for subscribers, on the thread of the alerts.
     url : str
@@ -167,7 +167,7 @@ class Alerts:
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong, in sentences for `health`."""
+        """Sentences for the reasons of `health`."""
         found = []
         if self._is_failing:
             found.append(f"alerts.outbox: cannot be used, so that alerts wait: {len(self._queue)} batches of events")

@@ -109,7 +109,7 @@ def alert_routes(parts: Parts) -> APIRouter:
     def get_dry_run(
         name: str, days: Annotated[float, Query(gt=0, le=3660, description="length of the span that ends now")] = 7.0
     ) -> Response:
-        """How often a rule would have alerted, by the stored events."""
+        """Try a rule on the stored events: how often it would have alerted."""
         _check_rule(parts, name)
         if parts.site.alerts.rules[name].events is None:
             raise HTTPException(404, f"rule {name!r} is not on events, and only events are stored")

@@ -51,7 +51,7 @@ class AlertedFinding(BaseModel):
 
 
 class Alert(BaseModel):
-    """What a rule has raised: about an event, an array or a finding; the other two are null."""
+    """An alert of a rule about an event, an array or a finding; the other two are null."""
 
     kind: Literal["alert"]
     key: str = Field(
@@ -121,7 +121,7 @@ class DeadLetterPage(_Versioned):
 
 
 class RuleKind(StrEnum):
-    """What a rule watches."""
+    """Kinds of things that a rule can watch."""
 
     EVENTS = "events"
     ARRAYS = "arrays"
@@ -188,7 +188,7 @@ class TriedAlert(BaseModel):
 
 
 class Tried(_Versioned):
-    """What a rule would have done, had it been armed."""
+    """Result of a dry run: the alerts that an armed rule would have raised."""
 
     name: RuleName
     since_utc: UtcTime

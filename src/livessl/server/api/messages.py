@@ -99,7 +99,7 @@ class ArraysMessage(_Numbered):
 
 
 class AlertMessage(_Numbered, Alert):
-    """What a rule has raised; it is delivered by the rule's actions as well."""
+    """An alert of a rule; the rule's actions deliver it as well."""
 
 
 class Gap(BaseModel):
