@@ -19,8 +19,8 @@ from small_site import started, wait_until, write_site
 from webhook_receiver import running_receiver
 
 LIVES = Path(__file__).parents[2] / "alert_lives.py"
-KILLS = 8
-SOUNDS = 240
+KILLS = 6
+SOUNDS = 180
 
 
 @pytest.mark.processes

@@ -25,7 +25,7 @@ def raised(number: int = 0, actions: Sequence[str] = ("guard",), rule: str = "do
 
 def test_everything_survives_a_restart(tmp_path: Path) -> None:
     first = Outbox(tmp_path / "alerts.sqlite")
-    state = RuleState(armed=False, last_ns=3)
+    state = RuleState(armed=False, alerted_ns=(3,))
     first.commit([raised()], {"door": state}, 10, ("small", 99))
     first.close()
     again = Outbox(tmp_path / "alerts.sqlite")

@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alert_desk import ELSEWHERE, alert_site, encoded, refused, sound
@@ -61,6 +61,7 @@ def test_conditions(condition: dict[str, Any], event: Event, expected: bool) -> 
     assert matches(condition, event) is expected
 
 
+@settings(max_examples=40)
 @given(std_m=st.floats(0.01, 2.0), threshold=st.floats(0.05, 0.95))
 def test_uncertain_position_is_in_the_zone_only_with_enough_probability(std_m: float, threshold: float) -> None:
     """The door's walls are at 0, its free sides at 1 m: within them is the square of one axis, and z hardly counts."""
@@ -90,6 +91,12 @@ def test_hold_off_suppresses_until_it_has_passed_since_the_last_alert() -> None:
     assert verdicts(held, *events) == ["alert", "held-off", "alert", "held-off", "alert"]
 
 
+def test_sound_that_was_held_off_stays_so_when_its_final_result_comes_after_a_later_alert() -> None:
+    held = rule({}, hold_off_s=60)
+    events = [sound(number, at_s=at_s) for number, at_s in enumerate((0, 50, 120))]
+    assert verdicts(held, *events, events[1]) == ["alert", "held-off", "alert", "held-off"]
+
+
 def test_nothing_alerts_that_began_before_the_rule_was_armed() -> None:
     events = [sound(number) for number in range(3)]
     state = RuleState(armed_since_ns=events[1].start_ns)
@@ -109,6 +116,7 @@ def test_count_in_a_span_alerts_at_the_last_one_and_then_counts_anew() -> None:
     assert found == ["counting", "counting", "counting", "alert", "counting", "counting", "alert"]
 
 
+@settings(max_examples=25)
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=12), st.integers(1, 4))
 def test_an_event_judged_again_counts_once(numbers: list[int], count: int) -> None:
     counting = rule({"count": count, "within_s": 1000} if count > 1 else {}, **EAGER)
@@ -133,7 +141,7 @@ def test_a_final_event_takes_the_place_of_the_early_one_that_it_replaces() -> No
 
 
 def test_state_survives_its_text() -> None:
-    state = RuleState(armed=False, armed_since_ns=5, last_ns=7, recent=((1, "a"),), ongoing=("north",), alerts=3)
+    state = RuleState(armed=False, armed_since_ns=5, alerted_ns=(7,), recent=((1, "a"),), ongoing=("north",), alerts=3)
     state = state.noting(Verdict.HELD_OFF, 9)
     assert RuleState.restored(state.as_json()) == state
 

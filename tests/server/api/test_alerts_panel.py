@@ -80,17 +80,17 @@ def test_page_lists_rules_and_alerts_and_asks_before_it_disarms(browser: Browser
         expect(page.get_by_role("button", name="Disarm door")).to_be_focused()
 
 
-@pytest.mark.parametrize("width", [1440, 1280, 820, 390])
-def test_no_text_of_the_panel_is_clipped(browser: Browser, server: Server, width: int) -> None:
+def test_no_text_of_the_panel_is_clipped_at_any_width(browser: Browser, server: Server) -> None:
     finish(server, sound(1), sound(2))
     with faultless_page(browser) as page:
-        page.set_viewport_size({"width": width, "height": 900})
         visit(page, server.url)
         state(page, "door", "armed")
         expect(page.locator(".alert")).to_have_count(2, timeout=1000 * HANG_S)
-        page.get_by_test_id("alerts").scroll_into_view_if_needed()
-        assert page.evaluate(CLIPPED) == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for width in (1440, 1280, 820, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate("document.documentElement.clientWidth") <= width
+            assert page.evaluate(CLIPPED) == [], width
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 def test_site_without_rules_has_no_panel(browser: Browser) -> None:

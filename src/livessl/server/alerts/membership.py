@@ -13,7 +13,8 @@ NODES: Final = 48
 """Nodes of the quadrature on each of its two axes; for covariances of events it is right to within 0.002."""
 
 LEAST_STD_M: Final = 1e-3
-"""Standard deviation, in metres, that is added in all directions: covariances are singular in a flat search volume."""
+"""Least standard deviation in any direction, in metres: covariances are singular in a flat search volume, and published
+ones are rounded, which can make them slightly indefinite."""
 
 LEAST_INSIDE: Final = 1e-3
 """Least probability of the search volume; below it the position is outside, and in none of its parts."""
@@ -42,6 +43,7 @@ def probability_in(position_m: FloatArray, covariance_m2: FloatArray, box_m: Flo
         return 0.0
     anywhere = position_m[:, None] + np.array([-1.0, 1.0])
     volume_m, box_m = np.where(flat[:, None], anywhere, volume_m), np.where(flat[:, None], anywhere, box_m)
+    covariance_m2 = _positive_definite(covariance_m2)
     inside = _in_box(position_m, covariance_m2, volume_m)
     if inside < LEAST_INSIDE:
         return 0.0
@@ -59,7 +61,6 @@ def _in_box(mean_m: FloatArray, covariance_m2: FloatArray, box_m: FloatArray) ->
     Cholesky factor, which makes the integrand smooth; here with a Gauss-Legendre rule. The axis on which the box
     excludes most comes first.
     """
-    covariance_m2 = covariance_m2 + LEAST_STD_M**2 * np.eye(3)
     edges = box_m - mean_m[:, None]
     widths = np.diff(ndtr(edges / np.sqrt(np.diag(covariance_m2))[:, None]), axis=1)[:, 0]
     order = np.argsort(widths)
@@ -74,6 +75,13 @@ def _in_box(mean_m: FloatArray, covariance_m2: FloatArray, box_m: FloatArray) ->
     shift = factor[2, 0] * y0[:, None] + factor[2, 1] * y1
     width = ndtr((high[2] - shift) / factor[2, 2]) - ndtr((low[2] - shift) / factor[2, 2])
     return float((e0 - d0) * (weights @ ((e1 - d1) * (width @ weights))))
+
+
+def _positive_definite(covariance_m2: FloatArray) -> FloatArray:
+    """Return the covariance with a standard deviation of at least `LEAST_STD_M` in every direction."""
+    variances_m2, axes = np.linalg.eigh((covariance_m2 + covariance_m2.T) / 2.0)
+    definite: FloatArray = (axes * np.maximum(variances_m2, LEAST_STD_M**2)) @ axes.T
+    return definite
 
 
 def _quantile(probability: FloatArray) -> FloatArray:

@@ -19,6 +19,10 @@ from livessl.site.models import Site
 
 NS_PER_S: Final = 1_000_000_000
 
+MAX_ALERTED: Final = 16
+"""Past alerts of a rule whose hold-off is remembered; a final result comes less than so many alerts after its early
+one."""
+
 
 class Verdict(StrEnum):
     """Decision of a rule about an event or a condition; all but the first two are counted as suppressed."""
@@ -46,8 +50,8 @@ class RuleState:
         What the site file said when `armed` was set; once the file says something else, it decides.
     armed_since_ns : int
         Site time from which it is armed; nothing that began earlier alerts.
-    last_ns : int or None
-        Site time of what alerted last.
+    alerted_ns : tuple of int
+        Site times of what alerted last, oldest first: several, because a sound may be judged out of turn.
     recent : tuple of (int, str)
         Site time and id of the events that count towards the next alert.
     ongoing : tuple of str
@@ -61,7 +65,7 @@ class RuleState:
     armed: bool = True
     file_armed: bool = True
     armed_since_ns: int = 0
-    last_ns: int | None = None
+    alerted_ns: tuple[int, ...] = ()
     recent: tuple[tuple[int, str], ...] = ()
     ongoing: tuple[str, ...] = ()
     alerts: int = 0
@@ -73,7 +77,7 @@ class RuleState:
             "armed": self.armed,
             "file_armed": self.file_armed,
             "armed_since_ns": self.armed_since_ns,
-            "last_ns": self.last_ns,
+            "alerted_ns": list(self.alerted_ns),
             "recent": [list(each) for each in self.recent],
             "ongoing": list(self.ongoing),
             "alerts": self.alerts,
@@ -84,12 +88,19 @@ class RuleState:
     def restored(cls, stored: Mapping[str, Any]) -> Self:
         """Return the state that `as_json` gave."""
         recent = tuple((int(time_ns), str(event_id)) for time_ns, event_id in stored["recent"])
-        return cls(**{**stored, "recent": recent, "ongoing": tuple(stored["ongoing"])})
+        tuples = {"alerted_ns": tuple(stored["alerted_ns"]), "recent": recent, "ongoing": tuple(stored["ongoing"])}
+        return cls(**{**stored, **tuples})
+
+    @property
+    def last_ns(self) -> int | None:
+        """Site time of the latest thing that alerted; None if nothing has."""
+        return max(self.alerted_ns, default=None)
 
     def noting(self, verdict: Verdict, time_ns: int) -> Self:
         """Return the state after a verdict."""
         if verdict is Verdict.ALERT:
-            return replace(self, last_ns=time_ns, alerts=self.alerts + 1)
+            alerted_ns = tuple(sorted((*self.alerted_ns, time_ns))[-MAX_ALERTED:])
+            return replace(self, alerted_ns=alerted_ns, alerts=self.alerts + 1)
         if verdict in SUPPRESSED:
             return replace(self, suppressed={**self.suppressed, verdict: self.suppressed.get(verdict, 0) + 1})
         return self
@@ -186,6 +197,6 @@ def judge(rule: AlertRule, state: RuleState, time_ns: int, zone: str | None) -> 
         return Verdict.DISARMED
     if not is_open(rule.schedule, time_ns, zone):
         return Verdict.OFF_SCHEDULE
-    if state.last_ns is not None and abs(time_ns - state.last_ns) < rule.hold_off_s * NS_PER_S:
+    if any(abs(time_ns - alerted_ns) < rule.hold_off_s * NS_PER_S for alerted_ns in state.alerted_ns):
         return Verdict.HELD_OFF
     return Verdict.ALERT

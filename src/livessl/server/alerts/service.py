@@ -118,8 +118,8 @@ class Alerts:
             self.outbox.close()
             raise
         self._queue: deque[_Batch] = deque()
-        self._missed_from_ns: int | None = None
-        self._missed = threading.Lock()
+        self._missed: tuple[int, int] | None = None  # site time from and before which events did not fit into the queue
+        self._missing = threading.Lock()
         self.unqueued = 0
         """Events that did not fit into the queue; final ones are judged from the store instead."""
         self._expired_ns = 0
@@ -154,13 +154,14 @@ class Alerts:
         """Take in final events, each with its start, and the frame index before which all events are final."""
         if not self._judges_events:
             return
-        if len(self._queue) < MAX_QUEUE:
-            self._queue.append(_Batch(events, until * FRAME_NS))
-        else:
-            self.unqueued += len(events)
-            first_ns = min(time_ns for _, time_ns in events)
-            with self._missed:
-                self._missed_from_ns = min(first_ns, self._missed_from_ns or first_ns)
+        until_ns = until * FRAME_NS
+        with self._missing:
+            if self._missed is None and len(self._queue) < MAX_QUEUE:
+                self._queue.append(_Batch(events, until_ns))
+            else:  # and so on until the missed ones are judged, so that all are judged in order
+                self.unqueued += len(events)
+                first_ns = min(time_ns for _, time_ns in events)
+                self._missed = (first_ns if self._missed is None else self._missed[0], until_ns)
         self._wake()
 
     # --- for the API
@@ -285,15 +286,12 @@ class Alerts:
             batch = self._queue[0]
             self._announce(self._judge.judge_events(batch.events, batch.until_ns, early=batch.until_ns is None))
             self._queue.popleft()
-        with self._missed:
-            missed_from_ns = self._missed_from_ns
-        if missed_from_ns is not None:
-            until = self._store.finalized(self._site.site).until
-            before_ns = self._clock.now_ns() if until is None else until * FRAME_NS
-            self._announce(self._judge.judge_events(past_events(self._store, missed_from_ns, before_ns), before_ns))
-            with self._missed:
-                if self._missed_from_ns == missed_from_ns:
-                    self._missed_from_ns = None
+        while (missed := self._missed) is not None:
+            since_ns, before_ns = missed
+            self._announce(self._judge.judge_events(past_events(self._store, since_ns, before_ns), before_ns))
+            with self._missing:
+                newest = before_ns if self._missed is None else self._missed[1]
+                self._missed = None if newest == before_ns else (before_ns, newest)
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
             watch = self._set_up_watch
