@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cli.command_runs import Run
-from livessl.capture.sound_device import InputDevice
+from livessl.capture.portaudio import InputDevice
 from livessl.errors import DeviceError
 from livessl.lab.frame_drawing import PAGE_MM, drawing
 from livessl.site.draft import proposed_pose, searchable, shape_m, site_text
@@ -35,7 +35,7 @@ def connected(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """A function that sets the interfaces that are connected to the machine."""
 
     def connect(*devices: InputDevice) -> None:
-        monkeypatch.setattr("livessl.capture.sound_device.input_devices", lambda: list(devices))
+        monkeypatch.setattr("livessl.capture.portaudio.input_devices", lambda: list(devices))
 
     connect()
     return connect
@@ -138,17 +138,18 @@ def test_arrays_are_dealt_to_the_inputs_of_known_interfaces(
 
 def test_connected_interface_is_proposed(run: Run, tmp_path: Path, connected: Callable[..., None]) -> None:
     connected(
-        InputDevice("HDA Intel: (hw:0,0)", "ALSA", 2, 44100.0), InputDevice("Zoom F8: (hw:1,0)", "ALSA", 8, 48000.0)
+        InputDevice("HDA Intel: ALC892 (hw:0,0)", "ALSA", 2, 44100.0),
+        InputDevice("Zoom F8: USB Audio (hw:1,0)", "ALSA", 8, 48000.0),
     )
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
-    assert load_site(tmp_path / "site.yaml").nodes["lab-pc"].device.name == "Zoom F8"  # type: ignore[union-attr]
+    assert load_site(tmp_path / "site.yaml").nodes["lab-pc"].device.name == "Zoom F8: USB Audio"  # type: ignore[union-attr]
 
 
 def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> list[InputDevice]:
         raise DeviceError("no PortAudio")
 
-    monkeypatch.setattr("livessl.capture.sound_device.input_devices", missing)
+    monkeypatch.setattr("livessl.capture.portaudio.input_devices", missing)
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
     assert load_site(tmp_path / "site.yaml").warnings == ()
 

@@ -237,7 +237,7 @@ def _free_names(taken: Sequence[str], count: int) -> list[str]:
 
 def _connected() -> dict[str, int]:
     """Return the interfaces that are connected, with their number of inputs; none without PortAudio."""
-    from livessl.capture.sound_device import input_devices
+    from livessl.capture.portaudio import input_devices
 
     try:
         return {device.name: device.channels for device in input_devices() if device.is_hardware}
@@ -249,7 +249,7 @@ def _interface(questions: Questions, connected: Mapping[str, int]) -> str:
     """Return the interface to use: by default the connected one with most inputs."""
     best = max(connected, key=lambda name: connected[name], default=INTERFACE)
     known = known_interface(best)
-    default = best.partition(":")[0] if known is None else known.name
+    default = best.partition(" (hw:")[0] if known is None else known.name
     for name, inputs in connected.items():
         questions.say(f"  connected: {name}, {inputs} inputs")
     questions.say(f"  known: {', '.join(one.name for one in INTERFACES)}; others work, too")
