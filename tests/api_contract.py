@@ -22,7 +22,7 @@ from livessl.server.api.answers import Error, HTTPValidationError
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.live import LIVE
-from livessl.server.api.schema import Message
+from livessl.server.api.messages import Message
 from livessl.server.fanout import Fanout
 from livessl.server.parts import Parts
 

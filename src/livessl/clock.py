@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime, timedelta
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 LONGEST_SLEEP_S: Final = 0.1
 """Longest single sleep, in seconds, so that waiting code can keep its connection alive and notice a stop request."""
@@ -108,6 +109,34 @@ def utc_ns(text: str) -> int:
     if instant is None or instant.tzinfo is None:
         raise ValueError(f"time: expected RFC 3339 with an offset such as 2026-01-31T12:00:00Z, got {text!r}")
     return (instant - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+class LocalTime(NamedTuple):
+    """A moment of the week in some time zone: the day, 0 for Monday, and the minutes since its midnight."""
+
+    weekday: int
+    minute: int
+
+
+def local_time(time_ns: int, zone: str | None) -> LocalTime:
+    """Return what wall clocks show at an instant; without a zone, those of this machine's zone."""
+    instant = _EPOCH + timedelta(microseconds=time_ns // 1000)
+    local = instant.astimezone(None if zone is None else ZoneInfo(zone))
+    return LocalTime(local.weekday(), 60 * local.hour + local.minute)
+
+
+def check_time_zone(name: str) -> None:
+    """Check that this machine knows a time zone.
+
+    Raises
+    ------
+    ValueError
+        If it does not.
+    """
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise ValueError(f"expected a time zone such as Europe/Berlin or UTC, got {name!r}") from error
 
 
 def _sleep(seconds: float) -> bool:

@@ -20,6 +20,7 @@ from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.recordings.assign import AssignedRecording, assign_sessions, span_ns
 from livessl.recordings.session import read_session
 from livessl.server.app import Server
+from livessl.site.alert_models import AlertsConfig
 from livessl.site.load import load_site
 from livessl.site.models import Site
 from livessl.site.server_models import HttpConfig, StoreConfig
@@ -98,14 +99,14 @@ def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Assig
 
 
 def _private(site: Site, *, own_http: bool) -> Site:
-    """Return the site for a server that binds to this machine only, without keys, and stores nothing.
+    """Return the site for a server that binds to this machine only, without keys, stores nothing, and alerts nobody.
 
     Keys and history belong to the site's real server. Unless the user named the site file (`own_http`), the HTTP
     settings of the session's own copy are dropped, too, because they were meant for another machine.
     """
     http = site.server.http if own_http else HttpConfig(port=site.server.http.port)
     here = site.server.model_copy(update={"bind": "tcp://127.0.0.1:*", "http": http, "events_db": None, "sinks": ()})
-    return site.model_copy(update={"server": here, "keys": None, "store": StoreConfig()})
+    return site.model_copy(update={"server": here, "keys": None, "store": StoreConfig(), "alerts": AlertsConfig()})
 
 
 def _send(site: Site, endpoint: str, parts: Sequence[AssignedRecording], speed: float, stop: threading.Event) -> None:

@@ -14,6 +14,7 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.core.locate.peak_search import warm_up
 from livessl.errors import ConfigError
+from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -59,6 +60,7 @@ def assemble(
     publish: Callable[[JsonObject], None],
     receiver: Inbox | None = None,
     on_event: Callable[[JsonObject], None] | None = None,
+    url: str = "",
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -70,11 +72,13 @@ def assemble(
         Stands in for the nodes' socket.
     on_event : callable or None
         Gets every event after the sinks and before `publish`; called on the fusion thread.
+    url : str
+        Address of the server, for the links in alerts.
 
     Raises
     ------
     BindError, ConfigError
-        See `Receiver`.
+        See `Receiver` and `Alerts`.
     """
 
     def publish_event(event: JsonObject) -> None:
@@ -92,7 +96,9 @@ def assemble(
         overload = Overload(clock)
         set_up_watch = SetUpWatch(site, overload)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        event_log = EventLog(site.site, clock, store, latency, publish_event)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url)
+        undo.callback(alerts.stop)
+        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch
         )
@@ -107,6 +113,7 @@ def assemble(
         site_time=site_time,
         array_states=array_states,
         event_log=event_log,
+        alerts=alerts,
         tracks=tracks,
         maps=maps,
         latency=latency,
@@ -140,8 +147,8 @@ class Server:
         If an address is taken.
     ConfigError
         If the server would be open to the network, or keys, tokens or certificate cannot be used.
-    StoreError, SinkError
-        If the event database or a sink cannot be used.
+    StoreError, SinkError, OutboxError
+        If the event database, a sink or the outbox of the alerts cannot be used.
     """
 
     def __init__(
@@ -177,13 +184,14 @@ class Server:
             store = Store(site.file(site.server.events_db) if site.server.events_db else None)
             undo.callback(store.close)
             _compile_kernels()
-            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event)
+            url = url_of(self._listener, tls=certificate is not None)
+            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
         """The HTTP server."""
         self.endpoint = self.parts.receiver.endpoint
         """The address that nodes connect to."""
-        self.url = url_of(self._listener, tls=certificate is not None)
+        self.url = url
         """The address of API and dashboard."""
 
     def run(self) -> None:
@@ -199,6 +207,7 @@ class Server:
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
+            self.parts.alerts.stop()
             self.parts.receiver.stop()
             self.parts.store.close()
             self.parts.sinks.close()
@@ -219,6 +228,7 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
+        self.parts.alerts.start()
         if not self._stepped:
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)

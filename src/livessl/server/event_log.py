@@ -10,7 +10,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple, Protocol, Self
 
 from livessl.clock import Clock
 from livessl.core.stream.final_pass import FinalResults
@@ -26,6 +26,18 @@ MAX_UNSAVED: Final = 10_000
 """Most final events that wait for the store, about 10 MB; beyond it the oldest are given up, and counted."""
 
 _log = logging.getLogger(__name__)
+
+
+class Watcher(Protocol):
+    """Sees the events of live runs, on the fusion thread, after the store."""
+
+    def take_early(self, event: JsonObject, time_ns: int) -> None:
+        """Take in an event that may still be replaced, and its start in nanoseconds of site time."""
+        ...
+
+    def take_final(self, events: Sequence[tuple[JsonObject, int]], until: int) -> None:
+        """Take in final events with their starts, and the frame index before which all events are final."""
+        ...
 
 
 class Answer(NamedTuple):
@@ -115,16 +127,25 @@ class EventLog:
         Measures how long events took.
     publish : callable
         Gets the message of every event.
+    watcher : Watcher or None
+        Sees the events of live runs, those included that are not published again.
     """
 
     def __init__(
-        self, site: str, clock: Clock, store: Store, latency: Latency, publish: Callable[[JsonObject], None]
+        self,
+        site: str,
+        clock: Clock,
+        store: Store,
+        latency: Latency,
+        publish: Callable[[JsonObject], None],
+        watcher: Watcher | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
         self._store = store
         self._latency = latency
         self._publish = publish
+        self._watcher = watcher
         self._is_replay = False
         self._early: list[EarlyEvent] = []
         self._waiting: deque[_Unsaved] = deque()
@@ -166,6 +187,8 @@ class EventLog:
         else:
             if not self._is_replay:
                 self._remember(EarlyEvent.of(event, message))
+        if self._watcher is not None and not self._is_replay:
+            self._watcher.take_early(message, event.start_ns)
         self._publish_event(message)
 
     def add_final(self, results: FinalResults, messages: Messages, clocks: JsonObject) -> None:
@@ -201,6 +224,8 @@ class EventLog:
         self._early = [early for early in self._early if early.id not in done]
         self._waiting.append(_Unsaved(rows, replaced, results.until, clocks))
         self._save()
+        if self._watcher is not None:
+            self._watcher.take_final(rows, results.until)
         for message in news:
             self._publish_event(message)
 

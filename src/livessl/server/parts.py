@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from livessl.clock import Clock
+from livessl.server.alerts.service import Alerts
 from livessl.server.array_states import ArrayStates
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
@@ -34,6 +35,7 @@ class Parts:
     site_time: SiteTime
     array_states: ArrayStates
     event_log: EventLog
+    alerts: Alerts
     tracks: Tracks
     maps: Maps
     latency: Latency
@@ -46,4 +48,5 @@ class Parts:
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        return self.engine.failure or self.receiver.failure or self.maps.failure or self.set_up_watch.failure
+        threads = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts)
+        return next((thread.failure for thread in threads if thread.failure is not None), None)

@@ -17,6 +17,7 @@ from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.errors import Fault
 from livessl.site.addresses import is_loopback
+from livessl.site.alert_checks import alert_faults, alert_warnings
 from livessl.site.build.grid import search_grid
 from livessl.site.fields import Bounds
 from livessl.site.findings import unknown_array
@@ -60,11 +61,19 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         here: Place = ("arrays", other.name) if joint is None else ("joint", joint)
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
+    yield from alert_faults(site)
 
 
 def warnings_of(site: Site) -> tuple[str, ...]:
     """Return warnings about settings that are valid but unlikely to work as expected."""
-    return (*unlikely(site), *_near_arrays(site), *_wide_arrays(site), *_look_alikes(site), *_privacy_gaps(site))
+    return (
+        *unlikely(site),
+        *_near_arrays(site),
+        *_wide_arrays(site),
+        *_look_alikes(site),
+        *_privacy_gaps(site),
+        *alert_warnings(site),
+    )
 
 
 def unprotected_addresses(site: Site) -> list[Fault]:

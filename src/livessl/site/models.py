@@ -17,6 +17,7 @@ from livessl.core.methods import ONSET
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, Uncertainty
+from livessl.site.alert_models import AlertsConfig
 from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
@@ -245,6 +246,7 @@ class SiteFile(Model):
     activity: ActivityConfig = ActivityConfig()
     fusion: FusionConfig = FusionConfig()
     zones: dict[str, Zone] = Field(default_factory=dict)
+    alerts: AlertsConfig = AlertsConfig()
 
     @field_validator("*", mode="wrap")
     @classmethod

@@ -29,12 +29,12 @@ def located_scene() -> Iterator[Server]:
         yield server
 
 
-def capture_scene(server: Server) -> None:
-    """Send the scene to the server as a live node does, and wait for both events."""
+def capture_scene(server: Server, published: int = 2) -> None:
+    """Send the scene to the server as a live node does, and wait until so many events are published in all."""
     node_site = site_of({"nodes.lab-pc.server": server.endpoint})
     start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # in the future: old sound would not be published as live
-    capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, "run-1", lambda: False)
-    wait_until(lambda: server.parts.event_log.published == 2, "both events")
+    capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, f"run-{next(_RUNS)}", lambda: False)
+    wait_until(lambda: server.parts.event_log.published == published, "both events")
 
 
 def replay_scene(server: Server) -> None:

@@ -143,7 +143,7 @@ def test_page_loads_again_if_a_file_of_it_did_not_arrive(browser: Browser, repla
             page.wait_for_timeout(100)
         expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
         expect(page.get_by_test_id("incomplete")).to_be_hidden()
-        assert page.evaluate("document.styleSheets.length") == 7
+        assert page.evaluate("document.styleSheets.length") == len(page.locator("link[rel=stylesheet]").all()) > 5
 
 
 @pytest.mark.parametrize(

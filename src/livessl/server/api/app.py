@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
 from livessl.server.api import documentation, routes
+from livessl.server.api.alert_routes import alert_routes
 from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
@@ -78,6 +79,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.access_route(parts, access),
         routes.event_routes(parts),
         routes.map_route(parts),
+        alert_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))

@@ -13,9 +13,9 @@ from livessl.server.api.auth import PROTOCOL, TOKEN_PROTOCOL, Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.hosts import public_host
 from livessl.server.api.live import LIVE, MAP
+from livessl.server.api.messages import MESSAGES
 from livessl.server.api.queries import LiveParameters, MapParameters
 from livessl.server.api.routes import as_json
-from livessl.server.api.schema import MESSAGES
 from livessl.server.maps import HEADER
 from livessl.site.models import Site
 

@@ -17,7 +17,7 @@ from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
 from livessl.site.models import Site
 
-KINDS: Final = frozenset({"update", "event", "track", "arrays"})
+KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert"})
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
 
 
@@ -26,14 +26,16 @@ class LiveParameters(BaseModel):
 
     kinds: str | None = Field(
         default=None,
-        description="Message kinds, separated by commas: arrays, event, track, update. All if absent.",
+        description="Message kinds, separated by commas: alert, arrays, event, track, update. All if absent.",
         examples=["event,track"],
     )
     min_confidence: float = Field(
         default=0.0, ge=0, le=1, description="Events and updates with a lower confidence are not sent.", examples=[0.8]
     )
     zone: str | None = Field(
-        default=None, description="Only events, updates and tracks inside this zone are sent.", examples=["door"]
+        default=None,
+        description="Only events, updates, tracks and alerts inside this zone are sent.",
+        examples=["door"],
     )
     since_seq: int | None = Field(
         default=None,

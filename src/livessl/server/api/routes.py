@@ -163,6 +163,10 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
+    problems = parts.alerts.problems
+    if problems and status == "ok":
+        status = "degraded"
+    reasons += problems
     overload = parts.overload.message
     if overload is not None:
         status, reasons = "overloaded", [overload, *reasons]

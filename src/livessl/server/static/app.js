@@ -1,6 +1,7 @@
 // The page's start: connects the messages of the server to the model, and the model to the panels and plans.
 
 import { get, onTokenNeeded, put, useToken } from "./access.js";
+import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
 import { find, write } from "./dom.js";
 import { Readout } from "./estimate.js";
@@ -16,6 +17,10 @@ import { readColours } from "./theme.js";
 const API = new URL("api/v1/", document.baseURI);
 /** Events that are loaded from the store when the page connects. */
 const FIRST_EVENTS = 50;
+/** Alerts that the panel lists. */
+const LAST_ALERTS = 5;
+/** How often, in milliseconds, the alerts are loaded again, for changes that no message reports. */
+const ALERTS_MS = 10000;
 /** Attempts to load a resource, and the wait between them in milliseconds. */
 const ATTEMPTS = 6;
 const RETRY_MS = 1500;
@@ -46,6 +51,15 @@ const eventList = new EventList(find("events"), {
     redraw();
   },
 });
+const alertsPanel = new AlertsPanel(find("alerts-panel"), {
+  rules: find("alert-rules"),
+  latest: find("alerts"),
+  count: find("alerts-count"),
+  onArm: (name, armed) => {
+    const address = new URL(`alerts/rules/${encodeURIComponent(name)}/armed`, API);
+    put(address, { armed }).catch((error) => console.warn(`livessl: rule ${name}:`, error.message)).finally(loadAlerts);
+  },
+});
 const mapPanel = new MapPanel(API, plans, redraw);
 const light = matchMedia("(prefers-color-scheme: light)");
 
@@ -65,9 +79,11 @@ const HANDLERS = {
     model.greet(message);
     header.showSite(message.site, message.mode);
     arraysPanel.mayChange = message.role !== "viewer";
+    alertsPanel.mayChange = message.role !== "viewer";
     HANDLERS.arrays(message);
     loadSite();
     loadEvents();
+    loadAlerts();
     mapPanel.watch();
   },
   arrays(message) {
@@ -91,8 +107,12 @@ const HANDLERS = {
   track(message) {
     model.takeTrack(message);
   },
+  alert() {
+    loadAlerts();
+  },
   gap(message) {
     header.showGap(message);
+    loadAlerts();
     loadEvents();
   },
 };
@@ -107,7 +127,7 @@ const live = new Live(liveUrl(), {
 });
 
 function liveUrl() {
-  const url = new URL("live?kinds=update,event,track,arrays", API);
+  const url = new URL("live?kinds=update,event,track,arrays,alert", API);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   return url;
 }
@@ -174,6 +194,16 @@ function loadEvents() {
     eventList.load(events, arrivedIds, model.serverNow());
     model.takeStored(events);
     header.showLatency(model.latencies);
+  });
+}
+
+function loadAlerts() {
+  retrying(async () => {
+    const { rules } = await getJson("alerts/rules");
+    alertsPanel.showRules(rules);
+    if (rules.length === 0) return;
+    const { alerts } = await getJson(`alerts?limit=${LAST_ALERTS}`);
+    alertsPanel.showLatest(alerts, model.serverNow());
   });
 }
 
@@ -271,4 +301,7 @@ find("token-form").addEventListener("submit", () => {
   live.reconnectNow();
 });
 setInterval(requestTick, TICK_MS);
+setInterval(() => {
+  if (!find("alerts-panel").hidden && model.link === "live" && !document.hidden) loadAlerts();
+}, ALERTS_MS);
 live.start();

@@ -1,0 +1,135 @@
+"""Actions: the ways to deliver alerts. `ACTIONS` names the type of each; a type is imported when a site uses it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import Final, Protocol, TypeVar, cast
+
+from livessl.clock import Clock
+from livessl.server.api.encode import JsonObject
+from livessl.site.alert_models import AlertAction
+from livessl.site.models import Site
+
+ACTIONS: Final[dict[str, str | Callable[..., object]]] = {
+    "webhook": "livessl.server.alerts.webhook:Webhook",
+    "mqtt": "livessl.server.alerts.mqtt:Mqtt",
+    "command": "livessl.server.alerts.command:Command",
+    "apprise": "livessl.server.alerts.notification:Notification",
+}
+"""Registry of the actions: from the key in a site file to the factory, which gets an `ActionSetting` and returns an
+`Action`. A factory is a callable, or the text "module:attribute" of one that is imported when a server needs it."""
+
+T = TypeVar("T")
+
+
+class DeliveryError(Exception):
+    """An attempt that failed.
+
+    Parameters
+    ----------
+    reason : str
+        What happened, for people.
+    retry_after_s : float or None
+        Shortest wait that the receiver asks for, in seconds.
+    hopeless : bool
+        Whether no further attempt can succeed.
+    """
+
+    def __init__(self, reason: str, *, retry_after_s: float | None = None, hopeless: bool = False) -> None:
+        super().__init__(reason)
+        self.retry_after_s = retry_after_s
+        self.hopeless = hopeless
+
+
+class Action(Protocol):
+    """Delivers alerts, one at a time, on the event loop of the alerts."""
+
+    def connected(self, ready: Callable[[], None]) -> AbstractAsyncContextManager[None]:
+        """Return a context in which it keeps a connection, if it needs one; it calls `ready` when it has made one."""
+        ...
+
+    async def deliver(self, alert: JsonObject) -> None:
+        """Deliver an alert, within the action's `timeout_s` or soon after it.
+
+        Raises
+        ------
+        DeliveryError
+            If it did not arrive, or was not confirmed.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ActionSetting:
+    """Settings from which an action is made.
+
+    Parameters
+    ----------
+    name : str
+        Its name in the site file.
+    config : AlertAction
+    site : Site
+    clock : Clock
+    rules : sequence of str
+        Names of the rules that take it.
+    other_rules : sequence of str
+        Names of rules that do not, or no longer, take it, those included that the site file no longer has.
+    url : str
+        Address of the server for people.
+    """
+
+    name: str
+    config: AlertAction
+    site: Site
+    clock: Clock
+    rules: Sequence[str]
+    other_rules: Sequence[str]
+    url: str
+
+    @property
+    def place(self) -> str:
+        """Place of its settings in the site file."""
+        return f"alerts.actions.{self.name}.{self.config.kind}"
+
+
+def make_action(setting: ActionSetting) -> Action:
+    """Return an action of the type that its configuration names.
+
+    Raises
+    ------
+    ConfigError
+        If a file that it names, or a library that it needs, cannot be used.
+    """
+    factory = ACTIONS[setting.config.kind]
+    make = resolve_name(factory) if isinstance(factory, str) else factory
+    return cast(Action, make(setting))
+
+
+async def in_daemon_thread(work: Callable[[], T]) -> T:
+    """Run work that blocks in a thread of its own, which the end of the process does not wait for."""
+    loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
+
+    def settle(result: T | None, error: Exception | None) -> None:
+        if done.cancelled():
+            return
+        if error is None:
+            done.set_result(result)
+        else:
+            done.set_exception(error)
+
+    def run() -> None:
+        result, error = None, None
+        try:
+            result = work()
+        except Exception as caught:  # noqa: BLE001 - raised where the work is awaited
+            error = caught
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(settle, result, error)
+
+    threading.Thread(target=run, name="alert", daemon=True).start()
+    return cast(T, await done)

@@ -1,0 +1,123 @@
+"""A courier takes the alerts of one action out of the outbox, and tries again until they are delivered or hopeless."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import zlib
+from typing import Final
+
+from livessl.clock import Clock
+from livessl.server.alerts.actions import Action, DeliveryError
+from livessl.server.alerts.outbox import Due, Outbox, OutboxError
+from livessl.site.alert_models import AlertAction
+
+NS_PER_S: Final = 1_000_000_000
+
+REST_S: Final = 1.0
+"""Wait, in seconds, after the outbox could not be read or written."""
+
+LOOK_S: Final = 30.0
+"""Longest wait, in seconds, before the outbox is looked at again although nothing is due: clocks can be set."""
+
+JITTER: Final = 0.1
+"""Largest share by which a wait is lengthened, so that alerts of one moment do not return in one moment."""
+
+_log = logging.getLogger(__name__)
+
+
+class Courier:
+    """Delivers what waits for one action, one alert at a time, the one that is due first.
+
+    Parameters
+    ----------
+    name : str
+        Name of the action.
+    config : AlertAction
+    action : Action
+    outbox : Outbox
+    clock : Clock
+    """
+
+    def __init__(self, name: str, config: AlertAction, action: Action, outbox: Outbox, clock: Clock) -> None:
+        self.name = name
+        self._config = config
+        self._action = action
+        self._outbox = outbox
+        self._clock = clock
+        self._news = asyncio.Event()
+        self.delivered = 0
+        """Alerts that arrived since the start."""
+        self.failed = 0
+        """Attempts that failed since the start."""
+
+    def wake(self) -> None:
+        """Look at the outbox again; on the event loop's thread."""
+        self._news.set()
+
+    async def run(self) -> None:
+        """Deliver until cancelled."""
+        async with self._action.connected(self._reachable):
+            while True:
+                self._news.clear()
+                try:
+                    due = self._outbox.due(self.name, self._clock.now_ns(), self._longest_wait_ns)
+                    if due is not None:
+                        await self._attempt(due)
+                        continue
+                    wait_s = self._wait_s()
+                except OutboxError as error:
+                    _log.error("%s", error)
+                    wait_s = REST_S
+                try:
+                    async with asyncio.timeout(wait_s):
+                        await self._news.wait()
+                except TimeoutError:
+                    pass
+
+    @property
+    def _longest_wait_ns(self) -> int:
+        return round(max(self._config.longest_wait_s, self._config.first_wait_s) * NS_PER_S)
+
+    def _reachable(self) -> None:
+        try:
+            self._outbox.hasten(self.name, self._clock.now_ns())
+        except OutboxError as error:  # it is delivered at the time that was set before
+            _log.error("%s", error)
+        self.wake()
+
+    def _wait_s(self) -> float:
+        next_ns = self._outbox.next_due_ns(self.name)
+        if next_ns is None:
+            return LOOK_S
+        return min(LOOK_S, max(0.0, (next_ns - self._clock.now_ns()) / NS_PER_S))
+
+    async def _attempt(self, due: Due) -> None:
+        key, rule = due.alert["key"], due.alert["rule"]
+        try:
+            await self._action.deliver(due.alert)
+        except DeliveryError as error:
+            self.failed += 1
+            attempts = due.attempts + 1
+            if error.hopeless or attempts >= self._config.attempts:
+                self._outbox.failed(due.number, str(error), None)
+                _log.error(
+                    "alerts.actions.%s: alert %s of rule %r was given up after %d attempts: %s; it can be sent again",
+                    *(self.name, key, rule, attempts, error),
+                )
+                return
+            asked_s = min(error.retry_after_s or 0.0, self._longest_wait_ns / NS_PER_S)
+            wait_s = max(backoff_s(self._config, attempts, key), asked_s)
+            self._outbox.failed(due.number, str(error), self._clock.now_ns() + round(wait_s * NS_PER_S))
+            level = logging.WARNING if attempts == 1 else logging.INFO
+            _log.log(level, "alerts.actions.%s: %s; next attempt in %.0f s", self.name, error, wait_s)
+        else:
+            self.delivered += 1
+            self._outbox.delivered(due.number)
+
+
+def backoff_s(config: AlertAction, attempts: int, key: str) -> float:
+    """Return the wait after so many failed attempts, in seconds: doubled each time, and a little longer by the key."""
+    doubled = config.first_wait_s * 2.0 ** min(attempts - 1, 60)
+    spread = zlib.crc32(f"{key} {attempts}".encode()) / 2**32
+    return min(doubled, max(config.longest_wait_s, config.first_wait_s)) * (1.0 + JITTER * spread)

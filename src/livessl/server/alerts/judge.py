@@ -1,0 +1,169 @@
+"""Judges what has happened by the rules of a site, and puts what they raise into the outbox. It starts no thread."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+
+from livessl.clock import Clock
+from livessl.core.commission.finding import Finding
+from livessl.server.alerts.conditions import ConditionWatch, Observed, observe_arrays, observe_findings
+from livessl.server.alerts.message import AlertMessages
+from livessl.server.alerts.outbox import Outbox, Raised
+from livessl.server.alerts.rules import RuleState, Verdict, Zones, judge_event, match
+from livessl.server.api.encode import JsonObject
+from livessl.site.models import Site
+
+
+class Judge:
+    """The rules of a site with their states; every thread may call it.
+
+    Parameters
+    ----------
+    site : Site
+    clock : Clock
+    outbox : Outbox
+        Has the states of before, and takes the new ones with what is raised.
+    messages : AlertMessages
+
+    Raises
+    ------
+    OutboxError
+        If the states cannot be read or kept.
+    """
+
+    def __init__(self, site: Site, clock: Clock, outbox: Outbox, messages: AlertMessages) -> None:
+        self._site = site.site
+        self._rules = site.alerts.rules
+        self._zone = site.alerts.timezone
+        self._clock = clock
+        self._outbox = outbox
+        self._messages = messages
+        self._zones = Zones(site)
+        self._lock = threading.Lock()
+        self._watches = {
+            name: ConditionWatch(rule, self._zone) for name, rule in self._rules.items() if rule.kind != "events"
+        }
+        stored = outbox.states()
+        self._states = {name: _restored(stored.get(name), armed=rule.armed) for name, rule in self._rules.items()}
+        changed = {name: state for name, state in self._states.items() if stored.get(name) != state}
+        if changed:
+            outbox.commit([], changed, clock.now_ns())
+
+    @property
+    def states(self) -> dict[str, RuleState]:
+        """The state of each rule."""
+        with self._lock:
+            return dict(self._states)
+
+    def arm(self, name: str, armed: bool) -> None:
+        """Arm or disarm a rule, for now and after a restart; what began before it was armed does not alert.
+
+        Raises
+        ------
+        OutboxError
+            If that cannot be kept.
+        """
+        with self._lock:
+            before = self._states[name]
+            since_ns = self._clock.now_ns() if armed and not before.armed else before.armed_since_ns
+            state = replace(before, armed=armed, file_armed=self._rules[name].armed, armed_since_ns=since_ns)
+            self._commit([], {name: state})
+
+    def judge_events(
+        self, events: Sequence[tuple[JsonObject, int]], until_ns: int | None, *, early: bool = False
+    ) -> list[JsonObject]:
+        """Judge events in order of time; return the new alerts.
+
+        Parameters
+        ----------
+        events : sequence of (JsonObject, int)
+            Each with its start in nanoseconds of site time.
+        until_ns : int or None
+            Site time before which all final events have then been judged.
+        early : bool
+            Whether they may still be replaced: only rules that ask for such events look at them.
+
+        Raises
+        ------
+        OutboxError
+            If nothing could be kept; then nothing has happened, and the events can be judged again.
+        """
+        with self._lock:
+            states: dict[str, RuleState] = {}
+            raised: dict[str, Raised] = {}
+            for event, time_ns in events:
+                for name, rule in self._rules.items():
+                    if rule.events is None or (early and not rule.events.early):
+                        continue
+                    found = match(rule.events, event, self._zones)
+                    if found is None:
+                        continue
+                    key, *older = (self._messages.key(name, each) for each in (event["id"], *event["replaces"]))
+                    if not raised.keys().isdisjoint((key, *older)) or self._outbox.has((key, *older)):
+                        continue  # this sound has alerted already, as an early event or before a restart
+                    state = states.get(name, self._states[name])
+                    verdict, states[name] = judge_event(rule, state, event, time_ns, self._zone)
+                    if verdict is Verdict.ALERT:
+                        now_ns = self._clock.now_ns()
+                        alert = self._messages.of_event(name, event, found, rule.events.count, now_ns)
+                        raised[key] = Raised(alert, time_ns, rule.actions)
+            return self._commit(list(raised.values()), states, until_ns)
+
+    def judge_conditions(
+        self, arrays: Sequence[JsonObject], findings: Sequence[Finding] | None, now_ns: int
+    ) -> list[JsonObject]:
+        """Judge the states of the arrays, and the findings if they are known; return the new alerts.
+
+        Raises
+        ------
+        OutboxError
+            If nothing could be kept.
+        """
+        with self._lock:
+            states: dict[str, RuleState] = {}
+            raised: list[Raised] = []
+            for name, watch in self._watches.items():
+                observed = self._observed(name, arrays, findings)
+                if observed is None:
+                    continue
+                alerts, state = watch.look(observed, self._states[name], now_ns)
+                if state != self._states[name]:
+                    states[name] = state
+                raised += [Raised(alert, since_ns, self._rules[name].actions) for alert, since_ns in alerts]
+            return self._commit(raised, states) if states else []
+
+    def skip(self, until_ns: int) -> None:
+        """Take everything before a site time as judged: the history of before there were alerts.
+
+        Raises
+        ------
+        OutboxError
+            If that cannot be kept.
+        """
+        with self._lock:
+            self._commit([], {}, until_ns)
+
+    def _observed(self, name: str, arrays: Sequence[JsonObject], findings: Sequence[Finding] | None) -> Observed | None:
+        rule = self._rules[name]
+        if rule.arrays is not None:
+            return observe_arrays(name, rule, arrays, self._messages)
+        return None if findings is None else observe_findings(name, rule, findings, self._messages)
+
+    def _commit(
+        self, raised: Sequence[Raised], states: dict[str, RuleState], until_ns: int | None = None
+    ) -> list[JsonObject]:
+        judged = None if until_ns is None else (self._site, until_ns)
+        if not raised and not states and judged is None:
+            return []
+        new = self._outbox.commit(raised, states, self._clock.now_ns(), judged)
+        self._states.update(states)
+        return new
+
+
+def _restored(stored: RuleState | None, *, armed: bool) -> RuleState:
+    """Return the state of a rule at the start, `armed` as the site file says unless an operator decided otherwise."""
+    if stored is None:
+        return RuleState(armed=armed, file_armed=armed)
+    return stored if stored.file_armed == armed else replace(stored, armed=armed, file_armed=armed)

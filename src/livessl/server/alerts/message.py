@@ -1,0 +1,126 @@
+"""Alerts as JSON objects, with a key that names each for ever and a sentence for people."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, Final
+
+from livessl.clock import utc_text
+from livessl.core.commission.finding import Finding
+from livessl.server.alerts.rules import Match
+from livessl.server.api.encode import JsonObject
+from livessl.site.models import Site
+
+KEY_PREFIX: Final = "alert_"
+KEY_DIGITS: Final = 32
+"""Hexadecimal digits of a key: 128 bits of SHA-256, which no two alerts share by chance."""
+
+
+class AlertMessages:
+    """Makes the alerts of a site.
+
+    Parameters
+    ----------
+    site : Site
+    url : str
+        Address of the server for people, without a slash at its end.
+    """
+
+    def __init__(self, site: Site, url: str) -> None:
+        self._site = site.site
+        self._url = url
+
+    def key(self, rule: str, subject: str) -> str:
+        """Return the key of a rule's alert about an event, or about something else that a text names.
+
+        It follows from its arguments alone: what is alerted again after a crash has the same key.
+        """
+        digest = hashlib.sha256("\0".join((self._site, rule, subject)).encode()).hexdigest()
+        return KEY_PREFIX + digest[:KEY_DIGITS]
+
+    def of_event(self, rule: str, event: JsonObject, match: Match, count: int, raised_ns: int) -> JsonObject:
+        """Return the alert about an event, the last of `count` that the rule asks for."""
+        zones = [{"name": name, "probability": round(value, 4)} for name, value in match.zones.items()]
+        return {
+            **self._head(rule, event["id"], raised_ns),
+            "time_utc": event["time_utc"],
+            "text": _event_text(event, match.zones, count),
+            "link": f"{self._url}/api/v1/events/{event['id']}",
+            "zones": [zone["name"] for zone in zones],
+            "membership": zones,
+            "count": count,
+            "event": event,
+            "array": None,
+            "finding": None,
+        }
+
+    def of_array(self, rule: str, array: JsonObject, since_ns: int, raised_ns: int) -> JsonObject:
+        """Return the alert about an array that has been in a bad state since some site time."""
+        name, state, reason = array["name"], array["state"], array["reason"]
+        text = f"array {name!r} is {state}" + (f": {reason}" if reason else "")
+        subject = f"array {name} {state} {since_ns}"
+        seen = {"name": name, "state": state, "reason": reason}
+        return self._of_condition(rule, subject, since_ns, raised_ns, text, array=seen)
+
+    def of_finding(self, rule: str, finding: Finding, since_ns: int, raised_ns: int) -> JsonObject:
+        """Return the alert about a fault of the set-up that has shown since some site time."""
+        subject = f"finding {finding.fault} {finding.array} {finding.channel} {since_ns}"
+        text = f"{finding.message}; {finding.cure}"
+        seen = {"kind": "finding", **asdict(finding)}
+        return self._of_condition(rule, subject, since_ns, raised_ns, text, finding=seen)
+
+    def _of_condition(
+        self, rule: str, subject: str, since_ns: int, raised_ns: int, text: str, **seen: JsonObject
+    ) -> JsonObject:
+        return {
+            **self._head(rule, subject, raised_ns),
+            "time_utc": utc_text(since_ns),
+            "text": text,
+            "link": f"{self._url}/",
+            "zones": [],
+            "membership": [],
+            "count": 1,
+            "event": None,
+            "array": seen.get("array"),
+            "finding": seen.get("finding"),
+        }
+
+    def _head(self, rule: str, subject: str, raised_ns: int) -> JsonObject:
+        return {
+            "kind": "alert",
+            "key": self.key(rule, subject),
+            "rule": rule,
+            "site": self._site,
+            "raised_utc": utc_text(raised_ns),
+        }
+
+
+def title(alert: JsonObject) -> str:
+    """Return a short heading for mails and chats."""
+    return f"livessl {alert['site']}: {alert['rule']}"
+
+
+def body(alert: JsonObject) -> str:
+    """Return the text of a mail or chat message: what, when, and the link."""
+    return f"{alert['text']}\n{alert['time_utc'] or 'at an unknown time'}\n{alert['link']}"
+
+
+def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> str:
+    """Return what was located, where, and how sure that is, in one line."""
+    x, y, z = event["position_m"]
+    std_m = _total_std_m(event["covariance_m2"])
+    what = "sound" if count == 1 else f"{count} sounds, the last"
+    if event["status"] != "located":
+        what += " (direction only)"
+    where = f" at ({x:.2f}, {y:.2f}, {z:.2f}) m, uncertain by {std_m:.2f} m"
+    inside = "".join(f", in zone {name!r} with probability {value:.2f}" for name, value in zones.items())
+    level = "" if event["level_dbfs"] is None else f", {event['level_dbfs']:.1f} dBFS"
+    return f"{what}{where}{inside}, confidence {event['confidence']:.2f}{level}, {event['duration_s']:.2f} s long"
+
+
+def _total_std_m(covariance_m2: Any) -> float:
+    """Return the square root of the trace: the standard deviation over all three axes together, in metres."""
+    return math.sqrt(sum(covariance_m2[axis][axis] for axis in range(3)))

@@ -1,0 +1,70 @@
+"""Notifications by Apprise: e-mail, and a hundred chat and push services."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from livessl.errors import ConfigError, Fault
+from livessl.server.alerts.actions import ActionSetting, DeliveryError, in_daemon_thread
+from livessl.server.alerts.message import body, title
+from livessl.server.api.encode import JsonObject
+from livessl.site.secret_files import fault, read_secret
+
+
+class Notification:
+    """Sends alerts to one service.
+
+    Parameters
+    ----------
+    setting : ActionSetting
+
+    Raises
+    ------
+    ConfigError
+        If Apprise is not installed, or the file does not hold a URL that it knows.
+    """
+
+    def __init__(self, setting: ActionSetting) -> None:
+        config = setting.config.apprise
+        assert config is not None
+        try:
+            import apprise
+        except ImportError as error:
+            what = "needs the package apprise; pip install 'livessl[alerts]'"
+            raise ConfigError([Fault(setting.place, what)]) from error
+        path = setting.site.file(config.url)
+        lines = read_secret(path, "write one URL of Apprise into it").split()
+        service = apprise.Apprise.instantiate(lines[0]) if len(lines) == 1 else None
+        if service is None:  # the text may hold a password, and is not repeated
+            raise fault(path, "expected one URL of a service that Apprise knows; see docs/alerts.md")
+        self._service = service
+        self._timeout_s = setting.config.timeout_s
+
+    @asynccontextmanager
+    async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:  # noqa: ARG002
+        """Keep nothing open."""
+        yield
+
+    async def deliver(self, alert: JsonObject) -> None:
+        """Send an alert.
+
+        Raises
+        ------
+        DeliveryError
+            If the service does not accept it in time.
+        """
+
+        def send() -> bool:
+            return bool(self._service.notify(title=title(alert), body=body(alert)))
+
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                accepted = await in_daemon_thread(send)
+        except TimeoutError as error:
+            raise DeliveryError(f"no answer within {self._timeout_s:g} s") from error
+        except Exception as error:
+            raise DeliveryError(f"{type(error).__name__}: {error}") from error
+        if not accepted:
+            raise DeliveryError("the service did not accept it; the log of Apprise says why")

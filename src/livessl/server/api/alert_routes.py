@@ -1,0 +1,182 @@
+"""REST routes of the alerts: rules, alerts, dead letters, and the dry run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Final
+
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
+
+from livessl.clock import utc_text
+from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
+from livessl.server.alerts.rules import SUPPRESSED, RuleState
+from livessl.server.alerts.schedule import is_open
+from livessl.server.api import alert_schema
+from livessl.server.api.answers import errors
+from livessl.server.api.encode import API_VERSION, JsonObject
+from livessl.server.api.routes import as_json
+from livessl.server.parts import Parts
+
+DAY_NS: Final = 86_400_000_000_000
+
+_NO_RULE: Final = "There is no rule of that name."
+_OUTBOX: Final = "The outbox cannot be read or written."
+_log = logging.getLogger(__name__)
+
+
+def alert_routes(parts: Parts) -> APIRouter:
+    """Rules, alerts and dead letters."""
+    alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
+
+    @router.get(
+        "", response_model=alert_schema.AlertPage, responses=errors(404, 503, texts={404: _NO_RULE, 503: _OUTBOX})
+    )
+    def get_alerts(
+        rule: Annotated[str | None, Query(description="only alerts of this rule")] = None,
+        limit: Annotated[int, Query(ge=1, le=1000, description="most alerts on a page")] = 50,
+        before: Annotated[
+            int | None, Query(ge=0, le=2**63 - 1, description="`next_before` of the previous page")
+        ] = None,
+    ) -> Response:
+        """Alerts with their deliveries, newest first."""
+        if rule is not None:
+            _check_rule(parts, rule)
+        with _outbox_errors():
+            rows = alerts.outbox.recent(limit + 1, before, rule)
+            deliveries = alerts.outbox.deliveries([alert["key"] for _, alert in rows[:limit]])
+        found = [
+            {**alert, "deliveries": [_delivery(each) for each in deliveries[alert["key"]]]} for _, alert in rows[:limit]
+        ]
+        next_before = rows[limit - 1][0] if len(rows) > limit else None
+        return as_json({"v": API_VERSION, "alerts": found, "next_before": next_before})
+
+    @router.get(
+        "/dead-letters", response_model=alert_schema.DeadLetterPage, responses=errors(503, texts={503: _OUTBOX})
+    )
+    def get_dead_letters(
+        limit: Annotated[int, Query(ge=1, le=1000, description="most dead letters on a page")] = 50,
+        before: Annotated[
+            int | None, Query(ge=0, le=2**63 - 1, description="`next_before` of the previous page")
+        ] = None,
+    ) -> Response:
+        """Alerts that an action has given up, newest first."""
+        with _outbox_errors():
+            rows = alerts.outbox.dead(limit + 1, before)
+        found = [{**_delivery(delivery), "alert": alert} for delivery, alert in rows[:limit]]
+        next_before = rows[limit - 1][0].number if len(rows) > limit else None
+        return as_json({"v": API_VERSION, "dead_letters": found, "next_before": next_before})
+
+    @router.post(
+        "/dead-letters/{number}/resend",
+        response_model=alert_schema.Resent,
+        responses=errors(404, 411, 413, 503, texts={404: "There is no dead letter of that number.", 503: _OUTBOX}),
+    )
+    def post_resend(number: Annotated[int, Path(ge=1, le=2**63 - 1)], request: Request) -> Response:
+        """Deliver a dead letter again; for operators."""
+        with _outbox_errors():
+            found = alerts.resend(number)
+        if not found:
+            raise HTTPException(404, f"no dead letter {number}; GET alerts/dead-letters lists them")
+        _log.info("%r has sent dead letter %d again", request.scope["client_name"], number)
+        return as_json({"v": API_VERSION, "number": number})
+
+    @router.get("/rules", response_model=alert_schema.Rules)
+    def get_rules() -> Response:
+        """The site's rules and their states."""
+        states = alerts.states
+        return as_json({"v": API_VERSION, "rules": [_rule(parts, name, state) for name, state in states.items()]})
+
+    @router.put(
+        "/rules/{name}/armed",
+        response_model=alert_schema.Armed,
+        responses=errors(400, 404, 411, 413, 503, texts={404: _NO_RULE, 503: _OUTBOX}),
+    )
+    def put_armed(name: str, switch: alert_schema.ArmSwitch, request: Request) -> Response:
+        """Arm or disarm a rule; for operators."""
+        _check_rule(parts, name)
+        with _outbox_errors():
+            alerts.arm(name, switch.armed)
+        _log.info("%r has %s rule %r", request.scope["client_name"], "armed" if switch.armed else "disarmed", name)
+        return as_json({"v": API_VERSION, "name": name, "armed": switch.armed})
+
+    @router.get(
+        "/rules/{name}/dry-run",
+        response_model=alert_schema.Tried,
+        responses=errors(404, texts={404: "There is no rule of that name on events: only events are stored."}),
+    )
+    def get_dry_run(
+        name: str, days: Annotated[float, Query(gt=0, le=3660, description="length of the span that ends now")] = 7.0
+    ) -> Response:
+        """Try a rule on the stored events: how often it would have alerted."""
+        _check_rule(parts, name)
+        if parts.site.alerts.rules[name].events is None:
+            raise HTTPException(404, f"rule {name!r} is not on events, and only events are stored")
+        now_ns = parts.clock.now_ns()
+        since_ns = now_ns - round(days * DAY_NS)
+        tried = alerts.dry_run(name, since_ns, now_ns)
+        times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
+        span = "day" if days == 1 else f"{days:g} days"
+        found = {
+            "v": API_VERSION,
+            "name": name,
+            "since_utc": utc_text(since_ns),
+            "until_utc": utc_text(now_ns),
+            "events": tried.events,
+            "matched": tried.matched,
+            "alerts": tried.alerts,
+            "suppressed": _suppressed(tried.suppressed),
+            "latest": [{"event_id": event["id"], "time_utc": event["time_utc"]} for event in tried.latest],
+            "complete": tried.complete,
+            "text": f"rule {name!r} would have alerted {times} in the last {span}",
+        }
+        return as_json(found)
+
+    return router
+
+
+def _check_rule(parts: Parts, name: str) -> None:
+    rules = parts.site.alerts.rules
+    if name not in rules:
+        raise HTTPException(404, f"no rule {name!r}; rules are {', '.join(rules) or 'none'}")
+
+
+@contextmanager
+def _outbox_errors() -> Iterator[None]:
+    """Answer 503 where the outbox does not work."""
+    try:
+        yield
+    except OutboxError as error:
+        raise HTTPException(503, str(error)) from error
+
+
+def _delivery(delivery: Delivery) -> JsonObject:
+    waits = delivery.state is DeliveryState.WAITING
+    return {
+        "number": delivery.number,
+        "action": delivery.action,
+        "state": str(delivery.state),
+        "attempts": delivery.attempts,
+        "next_utc": utc_text(delivery.next_ns) if waits else None,
+        "error": delivery.error,
+    }
+
+
+def _rule(parts: Parts, name: str, state: RuleState) -> JsonObject:
+    rule, config = parts.site.alerts.rules[name], parts.site.alerts
+    return {
+        "name": name,
+        "watches": rule.kind,
+        "armed": state.armed,
+        "open_now": is_open(rule.schedule, parts.clock.now_ns(), config.timezone),
+        "actions": list(rule.actions),
+        "alerts": state.alerts,
+        "last_utc": None if state.last_ns is None else utc_text(state.last_ns),
+        "suppressed": _suppressed(state.suppressed),
+        "ongoing": list(state.ongoing),
+    }
+
+
+def _suppressed(counts: Mapping[str, int]) -> JsonObject:
+    return {str(verdict).replace("-", "_"): counts.get(verdict, 0) for verdict in SUPPRESSED}

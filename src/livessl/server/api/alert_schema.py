@@ -1,0 +1,204 @@
+"""The contract of the API for alerts: a model of every value, answer and request. See `schema.py`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from livessl.core.commission.finding import Severity
+from livessl.server.alerts.outbox import DeliveryState
+from livessl.server.api.schema import ArrayCondition, Event, UtcTime, Version
+
+RuleName = Annotated[str, Field(description="Name of the rule in the site file.", examples=["door"])]
+ActionName = Annotated[str, Field(description="Name of the action in the site file.", examples=["guard"])]
+Count = Annotated[int, Field(ge=0)]
+
+
+class Membership(BaseModel):
+    """A zone of a rule, and the probability that the sound came from it."""
+
+    name: str = Field(description="Name of the zone.", examples=["door"])
+    probability: float = Field(
+        ge=0,
+        le=1,
+        description="Probability by the event's covariance, given that the sound came from the search volume.",
+        examples=[0.97],
+    )
+
+
+class AlertedArray(BaseModel):
+    """An array that an alert is about, in its state at that time."""
+
+    name: str = Field(description="Name of the array.", examples=["north"])
+    state: ArrayCondition
+    reason: str | None = Field(description="Why it is in that state.", examples=["nothing received for 1.5 s"])
+
+
+class AlertedFinding(BaseModel):
+    """A fault of the set-up that an alert is about."""
+
+    kind: Literal["finding"]
+    fault: str = Field(description="Code of the fault.", examples=["swapped"])
+    array: str | None = Field(description="The array; null for the whole site.", examples=["south"])
+    channel: int | None = Field(ge=1, description="Channel of the array, from 1; null for all.", examples=[3])
+    severity: Severity
+    confidence: float = Field(ge=0, le=1, description="How sure it is.", examples=[0.99])
+    message: str = Field(description="What is wrong.", examples=["channels 2 and 3 of 'south' are swapped"])
+    cure: str = Field(description="What to do.", examples=["exchange the plugs"])
+    input: int | None = Field(ge=1, description="Input of the device that carries the channel, if known.", examples=[7])
+
+
+class Alert(BaseModel):
+    """An alert of a rule about an event, an array or a finding; the other two are null."""
+
+    kind: Literal["alert"]
+    key: str = Field(
+        description="Name of the alert for ever. Deliveries of one alert have the same key, however often they come.",
+        examples=["alert_0f3c5b9d7e8a41c6a2b4d6e8f0a1b2c3"],
+    )
+    rule: RuleName
+    site: str = Field(description="Name of the site.", examples=["lab"])
+    raised_utc: UtcTime = Field(description="When the rule decided.")
+    time_utc: UtcTime | None = Field(description="When the sound began, or since when the condition holds.")
+    text: str = Field(
+        description="What, where, and how sure, for people.",
+        examples=["sound at (0.52, 0.61, 1.20) m, uncertain by 0.09 m, confidence 0.93"],
+    )
+    link: str = Field(description="Address of the event, or of the dashboard.", examples=["http://127.0.0.1:8000/"])
+    zones: list[str] = Field(description="Zones of the rule that it came from.", examples=[["door"]])
+    membership: list[Membership] = Field(description="The same zones with their probabilities.")
+    count: int = Field(ge=1, description="Events that the rule asks for within its span.", examples=[1])
+    event: Event | None = Field(description="The event, the last one of several.")
+    array: AlertedArray | None
+    finding: AlertedFinding | None
+
+
+class Delivery(BaseModel):
+    """Progress of one alert to one action."""
+
+    number: int = Field(ge=1, description="Number of the delivery.", examples=[17])
+    action: ActionName
+    state: DeliveryState
+    attempts: Count = Field(description="Attempts so far; they start anew when a dead letter is sent again.")
+    next_utc: UtcTime | None = Field(description="Time of the next attempt; null unless it waits.")
+    error: str | None = Field(description="Why the last attempt failed.", examples=["answered 503, expected 2xx"])
+
+
+class KeptAlert(Alert):
+    """An alert with its deliveries."""
+
+    deliveries: list[Delivery] = Field(description="One for each action of the rule.")
+
+
+class DeadLetter(Delivery):
+    """An alert that was given up for one action."""
+
+    alert: Alert
+
+
+class _Versioned(BaseModel):
+    v: Version
+
+
+class AlertPage(_Versioned):
+    """A page of alerts, the latest first."""
+
+    alerts: list[KeptAlert]
+    next_before: int | None = Field(
+        description="Pass it as `before` for the next page; null at the end.", examples=[1234]
+    )
+
+
+class DeadLetterPage(_Versioned):
+    """A page of dead letters, the latest first."""
+
+    dead_letters: list[DeadLetter]
+    next_before: int | None = Field(
+        description="Pass it as `before` for the next page; null at the end.", examples=[1234]
+    )
+
+
+class RuleKind(StrEnum):
+    """Kinds of things that a rule can watch."""
+
+    EVENTS = "events"
+    ARRAYS = "arrays"
+    FINDINGS = "findings"
+
+
+class Suppressed(BaseModel):
+    """Matches that did not alert, by the reason."""
+
+    disarmed: Count = Field(description="The rule was disarmed.")
+    off_schedule: Count = Field(description="Outside the rule's schedule.")
+    counting: Count = Field(description="Too few events within the rule's span so far.")
+    held_off: Count = Field(description="Too soon after the alert before.")
+
+
+class Rule(BaseModel):
+    """A rule and its state."""
+
+    name: RuleName
+    watches: RuleKind
+    armed: bool = Field(description="Whether it can alert; an operator can arm and disarm it.")
+    open_now: bool = Field(description="Whether its schedule holds now.")
+    actions: list[ActionName] = Field(description="Actions that deliver its alerts.")
+    alerts: Count = Field(description="Alerts so far.", examples=[3])
+    last_utc: UtcTime | None = Field(description="Time of what alerted last; null before the first alert.")
+    suppressed: Suppressed
+    ongoing: list[str] = Field(
+        description="Conditions that have alerted and still last: names of arrays, or findings.", examples=[["north"]]
+    )
+
+
+class Rules(_Versioned):
+    """All rules of the site."""
+
+    rules: list[Rule]
+
+
+class ArmSwitch(BaseModel):
+    """Request to arm or disarm a rule."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    armed: bool = Field(description="`false` disarms the rule, `true` arms it.", examples=[True])
+
+
+class Armed(_Versioned):
+    """Confirmation that a rule was armed or disarmed."""
+
+    name: RuleName
+    armed: bool = Field(description="Whether it can alert from now on.", examples=[True])
+
+
+class Resent(_Versioned):
+    """Confirmation that a dead letter waits for delivery again."""
+
+    number: int = Field(ge=1, description="Number of the delivery.", examples=[17])
+
+
+class TriedAlert(BaseModel):
+    """An event about which a rule would have alerted."""
+
+    event_id: str = Field(examples=["small-1767225600000-1"])
+    time_utc: UtcTime | None
+
+
+class Tried(_Versioned):
+    """Result of a dry run: the alerts that an armed rule would have raised."""
+
+    name: RuleName
+    since_utc: UtcTime
+    until_utc: UtcTime
+    events: Count = Field(description="Stored events of that time that were tried.", examples=[512])
+    matched: Count = Field(description="Events that meet the rule's condition.", examples=[20])
+    alerts: Count = Field(description="Alerts that it would have raised.", examples=[14])
+    suppressed: Suppressed
+    latest: list[TriedAlert] = Field(description="The latest of these alerts, newest first.")
+    complete: bool = Field(description="Whether all events of that time were tried; only the newest are if not.")
+    text: str = Field(
+        description="The same in words.", examples=["rule 'door' would have alerted 14 times in the last 7 days"]
+    )

@@ -1,0 +1,70 @@
+"""Checks of the site file's `alerts` against the rest of the file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from livessl.site.findings import unknown_array
+from livessl.site.models import Site
+from livessl.site.place import Finding, Place
+
+OUTBOX: Final = "alerts.sqlite"
+"""Name of the outbox where the site file does not give one; it lies beside `server.events_db`."""
+
+_NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+def outbox_file(site: Site) -> Path | None:
+    """Return the file of what alerts must not forget; None keeps it in memory."""
+    if site.alerts.outbox is not None:
+        return site.file(site.alerts.outbox)
+    return None if site.server.events_db is None else site.file(site.server.events_db).with_name(OUTBOX)
+
+
+def alert_faults(site: Site) -> Iterator[Finding]:
+    """Yield names in rules that nothing in the file has, and names that cannot be part of an address."""
+    for section, names in (("rules", site.alerts.rules), ("actions", site.alerts.actions)):
+        for name in names:
+            if not _NAME.fullmatch(name):
+                yield (
+                    ("alerts", section, name),
+                    "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it",
+                )
+    processed = [spec.name for spec in site.processed]
+    for name, rule in site.alerts.rules.items():
+        here: Place = ("alerts", "rules", name)
+        for zone in () if rule.events is None else rule.events.zones:
+            if zone not in site.zones:
+                yield (
+                    (*here, "events", "zones"),
+                    f"expected one of the zones {', '.join(site.zones) or '(there are none)'}, got {zone!r}; correct "
+                    "the name or add the zone",
+                )
+        for array in () if rule.arrays is None else rule.arrays.names:
+            if array not in processed:
+                yield (*here, "arrays", "names"), unknown_array(array, processed)
+        for action in rule.actions:
+            if action not in site.alerts.actions:
+                yield (
+                    (*here, "actions"),
+                    f"expected one of alerts.actions, {', '.join(site.alerts.actions) or '(there are none)'}, got "
+                    f"{action!r}; correct the name or add the action",
+                )
+
+
+def alert_warnings(site: Site) -> Iterator[str]:
+    """Yield settings with which alerts can be lost, or never come."""
+    if site.alerts.rules and site.server.events_db is None:
+        yield (
+            "alerts: without server.events_db, alerts about events of the moment at which a server is killed are lost, "
+            "and rules can be tried on few events only; set it"
+        )
+    if site.alerts.rules and outbox_file(site) is None:
+        yield "alerts: a restart forgets what is not delivered, and what is armed; set alerts.outbox"
+    used = {action for rule in site.alerts.rules.values() for action in rule.actions}
+    for name in site.alerts.actions:
+        if name not in used:
+            yield f"alerts.actions.{name}: no rule takes this action; name it in the actions of a rule"

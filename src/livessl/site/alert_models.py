@@ -1,0 +1,251 @@
+"""Models of the site file's `alerts`: the rules, and the actions that deliver what the rules raise."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Final, Literal, TypeVar
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+
+from livessl.clock import check_time_zone
+from livessl.core.commission.finding import Severity
+from livessl.site.fields import FileName, Model, Positive
+
+MINUTES_OF_DAY: Final = 1440
+
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+DAYS: Final[tuple[Day, ...]] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+
+Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+"""A span of time that may be zero, in seconds."""
+
+
+T = TypeVar("T")
+
+
+def _not_empty(items: tuple[T, ...]) -> tuple[T, ...]:
+    """Return items of which there is one at least; pydantic's own check also complains where an item is wrong."""
+    if not items:
+        raise ValueError("expected at least 1 item, got none; leave the key out for the default")
+    return items
+
+
+def _minutes(value: Any) -> int:
+    """Return the minutes since midnight of a time of day.
+
+    YAML reads 22:00 without quotes as the number 1320, which is the same time in minutes.
+    """
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MINUTES_OF_DAY:
+        return value
+    match = re.fullmatch(r"(\d{1,2}):(\d\d)", value) if isinstance(value, str) else None
+    minutes = None if match is None else 60 * int(match[1]) + int(match[2])
+    if match is None or minutes is None or int(match[2]) > 59 or minutes > MINUTES_OF_DAY:
+        raise ValueError(f'expected a time of day from "00:00" to "24:00", got {value!r}')
+    return minutes
+
+
+TimeOfDay = Annotated[int, BeforeValidator(_minutes)]
+"""Minutes since midnight, written as "22:30" in the site file."""
+
+
+class ScheduleSpan(Model):
+    """A span of the week; one that ends before it begins lasts over midnight."""
+
+    days: Annotated[tuple[Day, ...], AfterValidator(_not_empty)] = DAYS
+    begin: TimeOfDay = 0
+    end: TimeOfDay = MINUTES_OF_DAY
+
+    @model_validator(mode="after")
+    def _lasts(self) -> ScheduleSpan:
+        if self.begin == self.end:
+            raise ValueError("expected begin and end to differ; leave both out for the whole day")
+        return self
+
+
+class EventCondition(Model):
+    """Which events alert."""
+
+    zones: tuple[str, ...] = ()
+    probability: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    statuses: Annotated[tuple[Literal["located", "direction-only"], ...], AfterValidator(_not_empty)] = ("located",)
+    min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
+    min_level_dbfs: Annotated[float, Field(ge=-300, le=20)] | None = None
+    min_duration_s: Seconds = 0.0
+    early: bool = False
+    count: Annotated[int, Field(ge=1, le=1000)] = 1
+    within_s: Positive | None = None
+
+    @field_validator("statuses", mode="before")
+    @classmethod
+    def _not_refused(cls, statuses: Any) -> Any:
+        if isinstance(statuses, list | tuple) and "refused" in statuses:
+            raise ValueError("expected located or direction-only: refused events never alert; remove refused")
+        return statuses
+
+    @model_validator(mode="after")
+    def _span(self) -> EventCondition:
+        if (self.count > 1) != (self.within_s is not None):
+            raise ValueError(
+                f"expected count above 1 and within_s together, got {'count' if self.count > 1 else 'within_s'} alone; "
+                "add the other one"
+            )
+        return self
+
+
+class ArrayCondition(Model):
+    """Which conditions of which arrays alert; no names stand for all arrays."""
+
+    names: tuple[str, ...] = ()
+    states: Annotated[tuple[Literal["starting", "quiet", "degraded", "lost"], ...], AfterValidator(_not_empty)] = (
+        "degraded",
+        "lost",
+    )
+    lasts_s: Seconds = 5.0
+
+
+class FindingCondition(Model):
+    """Which findings about the set-up alert: those of at least a severity; no faults stand for all codes."""
+
+    severity: Severity = Severity.ERROR
+    faults: tuple[str, ...] = ()
+
+
+class AlertRule(Model):
+    """When to alert, and which actions to take."""
+
+    events: EventCondition | None = None
+    arrays: ArrayCondition | None = None
+    findings: FindingCondition | None = None
+    schedule: tuple[ScheduleSpan, ...] = ()
+    hold_off_s: Seconds = 60.0
+    armed: bool = True
+    actions: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _one(self) -> AlertRule:
+        _exactly_one(self, ("events", "arrays", "findings"))
+        return self
+
+    @property
+    def kind(self) -> Literal["events", "arrays", "findings"]:
+        """Key of what the rule watches."""
+        if self.events is not None:
+            return "events"
+        return "arrays" if self.arrays is not None else "findings"
+
+
+class WebhookConfig(Model):
+    """An address that gets each alert as a signed HTTP request."""
+
+    url: str
+    secret: FileName | None = None
+    ca: FileName | None = None
+
+    @field_validator("url")
+    @classmethod
+    def _url(cls, url: str) -> str:
+        return _http_url(url)
+
+
+class MqttConfig(Model):
+    """An MQTT broker, with discovery by Home Assistant unless `discovery` is empty."""
+
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    tls: bool = False
+    ca: FileName | None = None
+    username: str | None = None
+    password: FileName | None = None
+    topic: str | None = None
+    discovery: str = "homeassistant"
+
+    @field_validator("topic", "discovery")
+    @classmethod
+    def _topic(cls, topic: str | None) -> str | None:
+        if topic is not None and (re.search(r"[#+\0]", topic) or topic.startswith("$") or topic.strip("/") != topic):
+            raise ValueError(f"expected a topic without '#', '+', a leading '$' or slashes at its ends, got {topic!r}")
+        return topic
+
+    @model_validator(mode="after")
+    def _user(self) -> MqttConfig:
+        if self.password is not None and self.username is None:
+            raise ValueError("password needs username; add it")
+        return self
+
+
+class AppriseConfig(Model):
+    """One service of those that Apprise knows; its URL holds secrets and stands in a file of its own."""
+
+    url: FileName
+
+
+class AlertAction(Model):
+    """One way to deliver alerts, and how patiently."""
+
+    webhook: WebhookConfig | None = None
+    mqtt: MqttConfig | None = None
+    command: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)] | None = None
+    apprise: AppriseConfig | None = None
+    timeout_s: Annotated[Positive, Field(le=600)] = 10.0
+    attempts: Annotated[int, Field(ge=1, le=1000)] = 16
+    first_wait_s: Positive = 1.0
+    longest_wait_s: Positive = 3600.0
+
+    @model_validator(mode="after")
+    def _one(self) -> AlertAction:
+        _exactly_one(self, ("webhook", "mqtt", "command", "apprise"))
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Type of the action: a key of `livessl.server.alerts.actions.ACTIONS`."""
+        return next(name for name in ("webhook", "mqtt", "command", "apprise") if getattr(self, name) is not None)
+
+
+class AlertsConfig(Model):
+    """All rules and actions of a site."""
+
+    rules: dict[str, AlertRule] = Field(default_factory=dict)
+    actions: dict[str, AlertAction] = Field(default_factory=dict)
+    outbox: FileName | None = None
+    timezone: str | None = None
+    url: str | None = None
+
+    @field_validator("timezone")
+    @classmethod
+    def _zone(cls, name: str | None) -> str | None:
+        if name is not None:
+            check_time_zone(name)
+        return name
+
+    @field_validator("url")
+    @classmethod
+    def _url(cls, url: str | None) -> str | None:
+        return None if url is None else _http_url(url).rstrip("/")
+
+
+def _exactly_one(model: Model, names: tuple[str, ...]) -> None:
+    given = [name for name in names if getattr(model, name) is not None]
+    if len(given) != 1:
+        raise ValueError(f"expected exactly one of {', '.join(names)}; got {', '.join(given) or 'none'}")
+
+
+def _http_url(url: str) -> str:
+    """Return an address of HTTP or HTTPS.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, or holds a password, which would be in every log.
+    """
+    try:
+        parts = urlsplit(url)
+        is_url = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        is_url = False
+    if not is_url or not re.fullmatch(r"[\x21-\x7e]+", url):
+        raise ValueError(f"expected http://HOST/PATH or https://HOST/PATH, got {url!r}")
+    if parts.username is not None:
+        raise ValueError("expected an address without user and password; the signature proves who sends: set secret")
+    return url

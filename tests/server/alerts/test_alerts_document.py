@@ -1,0 +1,64 @@
+"""The examples of docs/alerts.md work as they stand."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from alert_desk import PATIENT, alert_site, running_desk, sound
+from livessl.lab.processes import free_port
+from livessl.site.alert_models import AlertAction
+from small_site import started, wait_until
+
+PAGE = (Path(__file__).parents[3] / "docs" / "alerts.md").read_text(encoding="utf-8")
+RULE = {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["guard"]}
+
+
+def block(language: str) -> str:
+    [found] = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    return str(found)
+
+
+def test_example_of_a_site_file_is_valid_and_uses_every_action() -> None:
+    alerts: dict[str, Any] = yaml.safe_load(block("yaml"))["alerts"]
+    site = alert_site(None, {"server.events_db": "events.sqlite"}, **alerts)
+    assert site.warnings == ()
+    assert {action.kind for action in site.alerts.actions.values()} == {"webhook", "mqtt", "apprise", "command"}
+    assert {rule.kind for rule in site.alerts.rules.values()} == {"events", "arrays", "findings"}
+
+
+def test_documented_receiver_checks_the_secret_that_the_documented_command_makes(tmp_path: Path) -> None:
+    port = free_port()
+    subprocess.run(["sh", "-c", block("sh")], cwd=tmp_path, check=True, timeout=60)
+    assert (tmp_path / "hook.secret").stat().st_mode & 0o777 == 0o600
+    receiver = block("python").replace("9000", str(port))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    hook = {"url": f"http://127.0.0.1:{port}/", "secret": "hook.secret"}
+    actions = {"guard": {**PATIENT, "webhook": hook}}
+    with (
+        started(sys.executable, "-c", receiver, **pipes) as process,
+        running_desk(alert_site(tmp_path, actions=actions, rules={"door": RULE})) as desk,
+    ):
+        desk.finish(sound(1))
+        wait_until(lambda: desk.alerts.counts() == {("guard", "delivered"): 1}, "the delivery")
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == desk.published[0]["text"]
+        (tmp_path / "hook.secret").write_text("whsec_" + "A" * 40 + "\n", encoding="utf-8")
+        with running_desk(alert_site(tmp_path, actions=actions, rules={"door": RULE})) as stranger:
+            stranger.finish(sound(2))
+            wait_until(lambda: stranger.alerts.couriers["guard"].failed, "the refusal")
+            [(_, alert)] = stranger.alerts.outbox.recent(1)
+            [delivery] = stranger.alerts.outbox.deliveries([alert["key"]])[alert["key"]]
+    assert delivery.error == "answered 401, expected 2xx"
+
+
+def test_default_patience_lasts_as_long_as_documented() -> None:
+    config = AlertAction.model_validate({"command": ["true"]})
+    waits_s = [min(config.first_wait_s * 2**n, config.longest_wait_s) for n in range(config.attempts - 1)]
+    assert "over about four hours" in PAGE
+    assert 4.0 <= sum(waits_s) / 3600 < 4.6

@@ -1,0 +1,103 @@
+"""Notifications by Apprise: to a chat service's address, and as a mail to a real SMTP socket."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from email import message_from_string
+from email.policy import default
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+
+from alert_desk import PATIENT, Desk, alert_site, running_desk, sound
+from livessl.errors import ConfigError
+from livessl.site.models import Site
+from small_site import HANG_S, wait_until
+from webhook_receiver import running_receiver
+
+pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated")  # Apprise imports it
+
+RULE = {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["tell"]}
+
+
+def notify_site(directory: Path, url: str, **action: Any) -> Site:
+    path = directory / "notify.url"
+    path.write_text(url + "\n", encoding="utf-8")
+    path.chmod(0o600)
+    settings = {**PATIENT, **action, "apprise": {"url": path.name}}
+    return alert_site(directory, actions={"tell": settings}, rules={"door": RULE})
+
+
+def states(desk: Desk) -> dict[str, int]:
+    return {state: count for (_, state), count in desk.alerts.outbox.counts().items()}
+
+
+@contextmanager
+def mailbox() -> Iterator[tuple[int, list[str]]]:
+    """A socket that speaks as much SMTP as a sender needs; yields its port and the mails."""
+    mails: list[str] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(HANG_S)
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection, connection.makefile("rw", newline="\r\n", encoding="utf-8") as lines:
+
+                def say(text: str) -> None:
+                    lines.write(f"{text}\r\n")
+                    lines.flush()
+
+                say("220 test")
+                for line in lines:
+                    if line.upper().startswith("DATA"):
+                        say("354 go on")
+                        mails.append("".join(iter(lines.readline, ".\r\n")))
+                    elif line.upper().startswith("QUIT"):
+                        say("221 bye")
+                        return
+                    say("250 ok")
+
+        serving = Thread(target=serve, daemon=True)
+        serving.start()
+        yield listener.getsockname()[1], mails
+        serving.join(timeout=HANG_S)
+
+
+def test_mail_says_what_when_and_where_with_a_link(tmp_path: Path) -> None:
+    with mailbox() as (port, mails):
+        url = f"mailto://127.0.0.1:{port}?from=ears@example.org&to=guard@example.org&mode=insecure&format=text"
+        with running_desk(notify_site(tmp_path, url, timeout_s=60)) as desk:
+            desk.finish(sound(1))
+            wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+    [text] = mails
+    mail = message_from_string(text, policy=default)
+    assert mail["Subject"] == "livessl small: door"
+    assert "guard@example.org" in mail["To"]
+    part = mail.get_body(("plain",))
+    assert part is not None
+    alert = desk.published[0]
+    assert part.get_content().split() == f"{alert['text']}\n{alert['time_utc']}\n{alert['link']}".split()
+
+
+def test_service_that_refuses_is_tried_again(tmp_path: Path) -> None:
+    with running_receiver() as receiver:
+        receiver.answer = lambda: (500, {})
+        url = receiver.url.replace("http://", "json://")
+        with running_desk(notify_site(tmp_path, url, timeout_s=60)) as desk:
+            desk.finish(sound(1))
+            wait_until(lambda: desk.alerts.couriers["tell"].failed >= 2, "failed attempts")
+            receiver.answer = lambda: (200, {})
+            wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+    assert json.loads(receiver.accepted[0].body)["title"] == "livessl small: door"
+
+
+@pytest.mark.parametrize("url", ["", "nothing://secret", "json://localhost json://localhost"])
+def test_file_without_one_known_url_is_refused_without_repeating_it(tmp_path: Path, url: str) -> None:
+    with pytest.raises(ConfigError, match=r"notify\.url: expected one URL of a service that Apprise knows") as caught:
+        Desk(notify_site(tmp_path, url))
+    assert "secret" not in str(caught.value)
