@@ -142,8 +142,8 @@ FAULTS: Final = (
 )
 
 
-def site_of(arrays: int, seed: int) -> Site:
-    """A site with so many arrays, which are turned at random."""
+def site_of(arrays: int, seed: int, **settings: Any) -> Site:
+    """A site with so many arrays, which are turned at random, and with other settings of the site file."""
     rng = np.random.default_rng([seed, 1])
     names = list(POSITIONS_M)[:arrays]
     text: dict[str, Any] = {
@@ -157,18 +157,25 @@ def site_of(arrays: int, seed: int) -> Site:
             }
             for name in names
         },
+        **settings,
     }
     return parse_site(json.dumps(text))
 
 
-def built(site: Site, seed: int) -> dict[str, FloatArray]:
+def built(
+    site: Site,
+    seed: int,
+    position_std_m: float = POSITION_STD_M,
+    orientation_std_deg: float = ORIENTATION_STD_DEG,
+    microphone_std_m: float = MICROPHONE_STD_M,
+) -> dict[str, FloatArray]:
     """The true places of the microphones, metres: not quite those of the site file."""
     rng = np.random.default_rng([seed, 2])
     placed = {}
     for spec in site.specs:
-        turn = Rotation.from_rotvec(np.radians(rng.normal(0.0, ORIENTATION_STD_DEG, 3)))
-        shift_m = rng.normal(0.0, POSITION_STD_M, 3)
-        own_m = rng.normal(0.0, MICROPHONE_STD_M, spec.microphones_m.shape)
+        turn = Rotation.from_rotvec(np.radians(rng.normal(0.0, orientation_std_deg, 3)))
+        shift_m = rng.normal(0.0, position_std_m, 3)
+        own_m = rng.normal(0.0, microphone_std_m, spec.microphones_m.shape)
         placed[spec.name] = turn.apply(spec.microphones_m - spec.centre_m) + spec.centre_m + shift_m + own_m
     return placed
 
@@ -179,7 +186,7 @@ def examined(site: Site, seed: int, fault: Fault) -> tuple[Finding, ...]:
     if fault.placed is not None:
         fault.placed(placed)
     specs = tuple(replace(spec, microphones_m=placed[spec.name]) for spec in site.specs)
-    recordings = _recorded(site, specs, seed)
+    recordings = recorded(site, specs, seed)
     if fault.recorded is not None:
         fault.recorded(recordings, np.random.default_rng([seed, 3]))
     return livessl.examine(site, recordings, RATE_HZ).findings
@@ -188,7 +195,7 @@ def examined(site: Site, seed: int, fault: Fault) -> tuple[Finding, ...]:
 _rendered: dict[Any, Recordings] = {}
 
 
-def _recorded(site: Site, specs: tuple[ArraySpec, ...], seed: int) -> Recordings:
+def recorded(site: Site, specs: tuple[ArraySpec, ...], seed: int) -> Recordings:
     """Recordings of the true microphones; those of a seed are made once where the microphones are the same."""
     rt60_s = RT60_S[seed % len(RT60_S)]
     simulation: Simulation | None = None

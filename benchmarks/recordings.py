@@ -146,7 +146,7 @@ def simulated(sounds: Sequence[NamedSound], rt60_s: float, seeds: Sequence[int],
                 continue
             used.add(nearest.id)
             off = nearest.estimate.position_m - source.position_m
-            distance2 = float(off @ np.linalg.solve(nearest.estimate.covariance_m2, off))
+            distance2 = float(off @ np.linalg.solve(nearest.estimate.sound_covariance_m2, off))
             found.append(Found(source.name, float(np.linalg.norm(off)), distance2))
         surplus += len(events) - len(used)
     return found, surplus

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import exactness
+import help_time
 import peers
 import performance
 import startup
@@ -192,6 +193,12 @@ def test_a_start_is_timed_until_it_listens(tmp_path: Path, monkeypatch: pytest.M
 def test_a_start_that_fails_tells_what_was_said(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="No such file"):
         startup.start(tmp_path / "nothing.yaml", SystemClock())
+
+
+def test_help_is_timed() -> None:
+    took = help_time.measure(["check"], 1)
+    assert 0.0 < took["shortest_s"] <= took["median_s"]
+    assert 0.0 < took["processor_s"] < 60.0
 
 
 def test_text_without_the_service_says_so(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -183,7 +184,7 @@ def run(
             for array in pipeline.arrays:
                 fusion.set_answers(array, True)
     now_ns = 0
-    for now_ns, batch in paced_messages(pipelines, inputs, clock):
+    for now_ns, batch in _together(paced_messages(pipelines, inputs, clock)):
         outputs = fusion.step(_over_the_wire(batch), now_ns)
         while requests := [output for output in outputs if isinstance(output, BackfillRequest)]:
             yield from (output for output in outputs if not isinstance(output, BackfillRequest))
@@ -195,6 +196,13 @@ def run(
         if progress is not None:
             progress(now_ns)
     yield from fusion.flush(now_ns)
+
+
+def _together(batches: Iterable[tuple[int, list[Message]]]) -> Iterator[tuple[int, list[Message]]]:
+    """Join the messages of one time: a step for each block of each array would take as long as locating."""
+    for now_ns, same in groupby(batches, key=lambda batch: batch[0]):
+        if messages := [message for _, some in same for message in some]:
+            yield now_ns, messages
 
 
 def _over_the_wire(batch: Iterable[Message]) -> list[Message]:

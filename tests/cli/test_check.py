@@ -17,7 +17,9 @@ def test_check_summarizes_a_valid_site(run: Run, recorded: Recorded) -> None:
     assert "valid; site 'small', arrays north (4 microphones), south (4 microphones), 3,840 grid points" in done.out
     [checked] = run("check", recorded.site, "--json").objects
     expected = {"valid": True, "faults": [], "warnings": [], "site": "small", "arrays": ["north", "south"]}
+    layout = checked.pop("layout")
     assert checked == {**expected, "nodes": 3840}
+    assert set(layout["arrays"]) == {"north", "south"}
 
 
 FAULTY = {"fusion.method": "music", "colour": "red", "arrays.north.position_m": [9, 9, 9], "grid.spacing_m": 0}
@@ -78,3 +80,12 @@ def test_missing_site_file_is_an_error(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--site", tmp_path / "site.yaml")
     assert done.code == 2
     assert done.err == f"livessl: error: {tmp_path / 'site.yaml'}: cannot be read: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "config").glob("*.yaml")), ids=lambda path: path.stem
+)
+def test_shipped_configs_pass_the_check_without_a_note(run: Run, path: Path) -> None:
+    done = run("check", path)
+    assert (done.code, done.err) == (0, "")
+    assert "expected error at 1.5 m height" in done.out

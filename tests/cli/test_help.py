@@ -9,11 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import yaml
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from cli.command_runs import COMMANDS, Run, interrupted
 from livessl import __version__
-from livessl.capture.sound_device import InputDevice
+from livessl.capture.portaudio import InputDevice
 from livessl.cli.main import main
 from livessl.site.models import Site
 from small_site import site_of, write_site
@@ -84,7 +85,7 @@ def test_commands_compute_on_one_thread(run: Run, tmp_path: Path, monkeypatch: p
         seen.append(threads())
         return site_of()
 
-    monkeypatch.setattr("livessl.cli.check.load_site", load)
+    monkeypatch.setattr("livessl.site.load.load_site", load)
     with threadpool_limits(limits=2, user_api="blas"):
         if threads() != {2}:
             pytest.skip("this machine's BLAS has one thread anyway")
@@ -110,8 +111,8 @@ def test_demo_on_a_port_in_use_fails_at_once(capsys: pytest.CaptureFixture[str])
     assert "cannot be used: Address already in use" in capsys.readouterr().err
 
 
-TEXT_ONLY = {"serve", "capture", "record", "simulate", "keys", "calibrate"}
-"""Commands that print no results; the actions of `keys` and `calibrate` that do are tested elsewhere."""
+TEXT_ONLY = {"serve", "capture", "record", "simulate", "keys", "calibrate", "init", "config"}
+"""Commands that print no results; the actions of `keys`, `calibrate` and `config` that do are tested elsewhere."""
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in TEXT_ONLY])
@@ -142,6 +143,38 @@ def test_devices_lists_the_inputs(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert done.code == 0
     assert re.search(r"^ +8 +48000Hz  ALSA: UMC1820$", done.out, re.MULTILINE)
     assert json.loads(run("devices", "--json").out) == [asdict(found[0])]
+
+
+def test_devices_prints_a_line_to_paste_that_tells_equal_interfaces_apart(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [
+        InputDevice("HDA Intel: ALC257 (hw:0,0)", "ALSA", 2, 44100.0),
+        InputDevice("UMC1820: USB Audio (hw:1,0)", "ALSA", 8, 48000.0, "A1", "usb-0000:00:14.0-1"),
+        InputDevice("UMC1820: USB Audio (hw:2,0)", "ALSA", 8, 48000.0, "A2", "usb-0000:00:14.0-2"),
+        InputDevice("Cheap: USB Audio (hw:3,0)", "ALSA", 4, 48000.0, "0", "usb-0000:00:14.0-3"),
+        InputDevice("Cheap: USB Audio (hw:4,0)", "ALSA", 4, 48000.0, "0", "usb-0000:00:14.0-4"),
+        InputDevice("pulse", "ALSA", 32, 44100.0),
+    ]
+    monkeypatch.setattr("livessl.cli.devices.input_devices", lambda: found)
+    lines = run("devices").out.partition("under nodes.NAME:\n")[2].splitlines()
+    assert lines == [
+        '  device: {name: "HDA Intel: ALC257", sample_rate_hz: 44100}',
+        '  device: {name: "UMC1820: USB Audio", serial: "A1", sample_rate_hz: 48000}',
+        '  device: {name: "UMC1820: USB Audio", serial: "A2", sample_rate_hz: 48000}',
+        '  device: {name: "Cheap: USB Audio", usb_port: "usb-0000:00:14.0-3", sample_rate_hz: 48000}',
+        '  device: {name: "Cheap: USB Audio", usb_port: "usb-0000:00:14.0-4", sample_rate_hz: 48000}',
+        '  device: {name: "ALSA: pulse", sample_rate_hz: 44100}',
+    ]
+    for device, line in zip(found, lines, strict=True):
+        entry = yaml.safe_load(line)["device"]
+        same = [other for other in found if other.matches(entry["name"])]
+        assert [
+            other
+            for other in same
+            if entry.get("serial", other.serial) == other.serial
+            and entry.get("usb_port", other.usb_port) == other.usb_port
+        ] == [device]
 
 
 def test_evaluate_prints_the_files_written(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

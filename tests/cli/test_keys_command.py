@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from cli.command_runs import Run
-from livessl.site.tokens import read_tokens
+from livessl.cli.keys import ROLES
+from livessl.site.tokens import Role, read_tokens
 from small_site import write_site
 
 
@@ -43,3 +44,7 @@ def test_results_are_printed_as_json_on_request(run: Run, site: Path) -> None:
     assert json.dumps(listed) == json.dumps(
         {"nodes": {"lab-pc": node["public_key"]}, "clients": [{"name": "wall", "role": "operator"}]}
     )
+
+
+def test_roles_of_the_command_are_those_of_the_tokens() -> None:
+    assert tuple(map(str, Role)) == ROLES

@@ -109,7 +109,7 @@ def test_record_never_overwrites_recordings(run: Run, recorded: Recorded, tmp_pa
 def test_interrupted_simulation_exits_130(
     run: Run, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.cli.simulate.write_scene", interrupted)
+    monkeypatch.setattr("livessl.simulation.export.write_scene", interrupted)
     assert run(*simulate_arguments(recorded.site, tmp_path)).code == 130
 
 

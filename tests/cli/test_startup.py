@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from cli.command_runs import COMMANDS
 from small_site import write_site
 
 PAPER = Path(__file__).parents[2] / "config" / "paper.yaml"
@@ -76,7 +77,33 @@ def test_evaluate_imports_the_evaluation() -> None:
     assert loaded("evaluate", "report", "--out", "unused", code=2) >= EVALUATION
 
 
-def test_check_of_a_method_of_ones_own_imports_nothing_that_localizes(tmp_path: Path) -> None:
+def test_check_of_a_method_of_ones_own_imports_neither_the_method_nor_the_fusion(tmp_path: Path) -> None:
     """The module of the method does not exist, and the check does not look for it."""
     site = write_site(tmp_path, {"fusion.method": "nowhere:Method"})
-    assert loaded("check", str(site), code=0) & LOCALIZES == set()
+    names = loaded("check", str(site), code=0)
+    assert "livessl.lab.plan.prediction" in names, "the expected error"
+    live = {"livessl.core.stream.fusion", "livessl.core.locate.peak_search", "livessl.server", "fastapi", "matplotlib"}
+    assert names & live == set()
+
+
+SLOW_HELP = {"replay", "evaluate", "devices"}
+"""Commands whose help still imports what they compute with."""
+
+
+def test_help_imports_no_numerics() -> None:
+    """All in one process: the help of any command would leave its modules behind."""
+    commands = [name for name in COMMANDS if name not in SLOW_HELP]
+    script = f"""
+import sys
+from livessl.cli.main import main
+for command in ([], *([name] for name in {commands})):
+    try:
+        main([*command, "--help"])
+    except SystemExit as end:
+        assert end.code == 0, command
+print(sorted(sys.modules), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    names = {name.strip("'") for name in done.stderr.strip("[]\n").split(", ")}
+    assert "livessl.cli.init" in names
+    assert names & {"numpy", "pydantic", "scipy", "threadpoolctl", "tqdm", "yaml", "zmq"} == set()

@@ -145,7 +145,7 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "array in millimetres": (
         {f"{ARRAY}.position_m": [1900, 1300, 1400]},
         ARRAY,
-        r"outside the room \(4, 5, 3\) m; give metres, not millimetres",
+        r"outside the room \(4, 5, 3\) m; did you mean position_m: \[1.9, 1.3, 1.4\], from millimetres\?",
     ),
     "array under the floor": ({f"{ARRAY}.position_m": [1.0, 1.3, -0.5]}, ARRAY, "microphone 1 .* outside the room"),
     "grid inside out": (
@@ -161,8 +161,8 @@ ONE_FAULT: dict[str, tuple[Changes, str, str]] = {
     "too many channels": ({f"{NODE}.arrays.south": [5, 6, 7, 8, 9]}, f"{NODE}.arrays.south", "expected 4 .* got 5"),
     "channel 0": (
         {f"{NODE}.arrays.north": [0, 1, 2, 3]},
-        f"{NODE}.arrays.north.0",
-        "from 1 on, got 0; channels count from 1",
+        f"{NODE}.arrays",
+        r"from 1 on, got 0; channels count from 1; did you mean {north: \[1, 2, 3, 4\], south: \[6, 7, 8, 9\]}\?$",
     ),
     "channel of two arrays": (
         {f"{NODE}.arrays.south": [4, 6, 7, 8]},

@@ -1,6 +1,7 @@
 """Types of command-line arguments: each function turns a text into a value.
 
-They are passed to argparse as `type`, and raise `ArgumentTypeError` with what was expected and what was given.
+They are passed to argparse as `type`, and raise `ArgumentTypeError` with what was expected and what was given. Modules
+that they need are imported when there is a value, so that help takes no time.
 """
 
 from __future__ import annotations
@@ -11,11 +12,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
-
-from livessl.clock import utc_ns
-from livessl.core.methods import is_method, unknown_method
-from livessl.site import keys as keyring
-from livessl.site.addresses import check_endpoint
 
 T = TypeVar("T")
 
@@ -63,6 +59,8 @@ def channels(text: str) -> tuple[str, list[int]]:
 
 def method(text: str) -> str:
     """Return the name of a localization method after checking that it is registered or has the form `MODULE:NAME`."""
+    from livessl.core.methods import is_method, unknown_method
+
     if not is_method(text):
         raise argparse.ArgumentTypeError(unknown_method(text))
     return text
@@ -70,16 +68,22 @@ def method(text: str) -> str:
 
 def endpoint(text: str) -> str:
     """Return a ZeroMQ address after checking that a socket can connect to it."""
+    from livessl.site.addresses import check_endpoint
+
     return _read(text, check_endpoint)
 
 
 def key(text: str) -> bytes:
     """Return the bytes of a public key in the form that `livessl keys` prints."""
-    return _read(text, keyring.as_key)
+    from livessl.site.keys import as_key
+
+    return _read(text, as_key)
 
 
 def time(text: str) -> int:
     """Return an RFC 3339 time as nanoseconds UTC."""
+    from livessl.clock import utc_ns
+
     return _read(text, utc_ns)
 
 

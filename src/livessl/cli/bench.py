@@ -10,7 +10,6 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
 from livessl.clock import SystemClock
-from livessl.lab.bench import kernels, live
 
 
 def add_arguments(parser: Any) -> None:
@@ -57,6 +56,8 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.lab.bench import kernels, live
+
     if not arguments.live:
         with progress.counted("measuring", "round") as show:
             report = kernels.measure(SystemClock(), progress=show)

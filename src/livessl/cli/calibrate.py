@@ -8,22 +8,20 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-import yaml
-
-from livessl.calibration import MOST_CLAPS, Clap, claps_of, measured_poses, verified
 from livessl.cli import argument, progress
 from livessl.cli.doctor import add_recordings, finding_line, recordings_given
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json
 from livessl.cli.output import complain, print_warnings, xyz
 from livessl.clock import SystemClock, utc_text
-from livessl.core.commission.finding import Severity
-from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M, MeasuredPose
 from livessl.errors import UseError
-from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from livessl.calibration import Clap
+    from livessl.core.commission.resection import MeasuredPose
+    from livessl.site.models import Site
 
 LARGE_ERROR_M: Final = 0.3
 """Error at a known place, in metres, from which `verify` fails even if nothing explains it."""
@@ -84,12 +82,18 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.calibration import MOST_CLAPS
+
     if len(arguments.at) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
     return int(arguments.act(arguments))
 
 
 def _claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
+    import numpy as np
+
+    from livessl.calibration import claps_of
+
     site, parts, span = recordings_given(arguments, "calibrate")
     print_warnings(site)
     with progress.timed("locating", *span) as bar:
@@ -97,6 +101,9 @@ def _claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
+    from livessl.calibration import verified
+    from livessl.core.commission.finding import Severity
+
     site, claps = _claps(arguments)
     for clap in claps:
         print(json.dumps(_clap_object(clap)) if arguments.json else _clap_line(clap), flush=True)
@@ -134,6 +141,9 @@ def _clap_line(clap: Clap) -> str:
 def _poses(arguments: argparse.Namespace) -> int:
     if arguments.undo:
         return _undo(arguments.write)
+    from livessl.calibration import measured_poses
+    from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M
+
     site, claps = _claps(arguments)
     poses = measured_poses(site, claps, arguments.place_std)
     for name, pose in poses.items():
@@ -155,7 +165,7 @@ def _pose_object(name: str, pose: MeasuredPose) -> dict[str, Any]:
         "array": name,
         "microphones_m": pose.microphones_m.round(4).tolist(),
         "shift_m": pose.shift_m.round(4).tolist(),
-        "turn_deg": np.degrees(pose.turn.as_rotvec()).round(2).tolist(),
+        "turn_deg": [round(math.degrees(angle), 2) for angle in pose.turn.as_rotvec().tolist()],
         "position_std_m": round(pose.position_std_m, 4),
         "orientation_std_deg": round(pose.orientation_std_deg, 2),
         "misfit_us": [round(1e6 * pose.misfit_before_s, 1), round(1e6 * pose.misfit_s, 1)],
@@ -174,6 +184,8 @@ def _pose_line(name: str, pose: MeasuredPose) -> str:
 
 def _write(path: Path, site: Site, sounds: int, poses: Mapping[str, MeasuredPose]) -> None:
     """Write a calibration file, and keep the one that it replaces."""
+    import yaml
+
     arrays = {
         name: {
             "microphones_m": pose.microphones_m.round(4).tolist(),

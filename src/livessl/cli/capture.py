@@ -5,13 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from livessl.capture.node import capture_device, capture_recordings
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
-from livessl.cli.node_input import audio_device, check_files, node_config, recordings, run_id
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
-from livessl.recordings.assign import span_ns
 
 
 def add_arguments(parser: Any) -> None:
@@ -32,6 +29,10 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.capture.node import capture_device, capture_recordings
+    from livessl.cli.node_input import audio_device, check_files, node_config, recordings, run_id
+    from livessl.recordings.assign import span_ns
+
     site = read_site(arguments)
     config = node_config(site, arguments.node, arguments.site)
     check_files(arguments, config)

@@ -1,4 +1,4 @@
-"""`livessl check`: validate a site file and list all its faults."""
+"""`livessl check`: validate a site file, list all its faults and likely mistakes, and draw what it describes."""
 
 from __future__ import annotations
 
@@ -7,23 +7,33 @@ import json
 from pathlib import Path
 from typing import Any
 
+from livessl.cli import argument
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json
 from livessl.cli.output import print_warnings
 from livessl.errors import ConfigError, Fault
-from livessl.site.build.grid import search_grid
-from livessl.site.checks import unprotected_addresses
-from livessl.site.load import load_site
 
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("site", type=Path, help="site file")
+    parser.add_argument(
+        "--rt60",
+        type=argument.rt60,
+        default=0.7,
+        metavar="S",
+        help="reverberation time for the expected error, seconds (default 0.7)",
+    )
+    parser.add_argument("--png", type=Path, metavar="FILE", help="also draw floor plan, side view and arrays there")
     add_json(parser, "print one JSON object")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.site.build.grid import search_grid
+    from livessl.site.checks import unprotected_addresses
+    from livessl.site.load import load_site
+
     try:
         site = load_site(arguments.site)
         doors = unprotected_addresses(site)
@@ -35,12 +45,20 @@ def run(arguments: argparse.Namespace) -> int:
             print(json.dumps({"valid": False, "faults": faults}))
             return WRONG_USE
         raise
-    grid = search_grid(site)
+    from livessl.lab.layout import measures, terminal
+
+    grid, layout = search_grid(site), measures.layout_of(site, arguments.rt60)
+    if arguments.png is not None:
+        from livessl.lab.layout import figure
+
+        figure.draw(site, arguments.png)
     if arguments.json:
         checked = {"valid": True, "faults": [], "warnings": list(site.warnings), "site": site.site}
-        print(json.dumps({**checked, "arrays": list(site.arrays), "nodes": grid.size}))
+        summary = {**checked, "arrays": list(site.arrays), "nodes": grid.size}
+        print(json.dumps({**summary, "layout": terminal.as_json(layout, arguments.rt60)}))
     else:
         print_warnings(site)
         arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)
         print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid points")
+        print(terminal.as_text(layout, arguments.rt60))
     return OK

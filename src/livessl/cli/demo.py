@@ -10,15 +10,17 @@ import tempfile
 import threading
 import webbrowser
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json
 from livessl.cli.output import xyz
 from livessl.clock import SystemClock
-from livessl.lab import demo
-from livessl.server.api.encode import JsonObject
+
+if TYPE_CHECKING:
+    from livessl.lab import demo
+    from livessl.server.api.encode import JsonObject
 
 WITHIN_M: Final = 0.5
 """Largest error, in metres, of a sound that counts as located; the paper uses the same limit."""
@@ -47,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show(arguments: argparse.Namespace) -> int:
+    from livessl.lab import demo
+
     clock = SystemClock()
     with (
         tempfile.TemporaryDirectory(prefix="livessl-demo-") as name,

@@ -8,19 +8,19 @@ import urllib.error
 import urllib.request
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.errors import RunError, UseError
-from livessl.examination import Examination, examine_parts
-from livessl.recordings.assign import AssignedRecording, assign_files, assign_sessions, span_ns
-from livessl.recordings.session import read_session
-from livessl.site.load import load_site
-from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from livessl.core.commission.finding import Finding
+    from livessl.examination import Examination
+    from livessl.recordings.assign import AssignedRecording
+    from livessl.site.models import Site
 
 ANSWER_S: Final = 10.0
 """Longest wait for a server's answer, seconds."""
@@ -50,6 +50,8 @@ def add_recordings(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.core.commission.finding import LEAST_SOUNDS
+
     examination = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
         print(
@@ -67,6 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _examine(arguments: argparse.Namespace) -> Examination:
+    from livessl.examination import examine_parts
+
     site, parts, span = recordings_given(arguments, "doctor", ", or --url")
     print_warnings(site)
     with progress.timed("examining", *span) as bar:
@@ -75,6 +79,9 @@ def _examine(arguments: argparse.Namespace) -> Examination:
 
 def _ask(url: str, token_file: Path | None) -> Examination:
     """Return what a running server has found."""
+    from livessl.core.commission.finding import Finding, Severity
+    from livessl.examination import Examination
+
     address = f"{url.rstrip('/')}/api/v1/findings"
     if not address.startswith(("http://", "https://")):
         raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
@@ -104,6 +111,10 @@ def recordings_given(
     arguments: argparse.Namespace, command: str, otherwise: str = ""
 ) -> tuple[Site, list[AssignedRecording], tuple[int, int | None]]:
     """Return the site and the recordings that --session, or --site and --wav, name, and their span in nanoseconds."""
+    from livessl.recordings.assign import assign_files, assign_sessions, span_ns
+    from livessl.recordings.session import read_session
+    from livessl.site.load import load_site
+
     if bool(arguments.session) == bool(arguments.wav):
         raise UseError(
             f"{command}: expected --session DIR, or --wav ARRAY=FILE for each array{otherwise}; give one of them"

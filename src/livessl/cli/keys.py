@@ -13,8 +13,9 @@ from livessl.cli import argument
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json, add_site
 from livessl.errors import ConfigError, Fault
-from livessl.site import keys, tokens
-from livessl.site.load import load_site
+
+ROLES: Final = ("viewer", "operator", "admin")
+"""Names of the roles, as in `livessl.site.tokens.Role`, which takes longer to import than help may take."""
 
 ONE_OBJECT: Final = "print one JSON object"
 
@@ -50,7 +51,7 @@ def add_arguments(parser: Any) -> None:
     sub.add_argument("--name", required=True, help="name of the client, by which its token can be revoked")
     sub.add_argument(
         "--role",
-        choices=[str(role) for role in tokens.Role],
+        choices=ROLES,
         default="viewer",
         help="what the client may do (default viewer)",
     )
@@ -71,6 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _folder(arguments: argparse.Namespace) -> Path:
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     if site.keys is None:
         what = "expected the folder that holds the keys, got none; add keys: keys to the site file"
@@ -79,6 +82,8 @@ def _folder(arguments: argparse.Namespace) -> Path:
 
 
 def _tokens_file(arguments: argparse.Namespace) -> Path:
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     if site.server.http.tokens is None:
         what = "expected the file that holds the tokens, got none; add tokens: tokens.yaml to server.http"
@@ -87,6 +92,8 @@ def _tokens_file(arguments: argparse.Namespace) -> Path:
 
 
 def _server(arguments: argparse.Namespace) -> int:
+    from livessl.site import keys
+
     key = keys.make_server_keys(_folder(arguments))
     print(json.dumps({"public_key": key.hex()}) if arguments.json else key.hex())
     logging.info(
@@ -96,6 +103,8 @@ def _server(arguments: argparse.Namespace) -> int:
 
 
 def _node(arguments: argparse.Namespace) -> int:
+    from livessl.site import keys
+
     key = keys.make_node_keys(_folder(arguments), arguments.name, arguments.server)
     print(json.dumps({"name": arguments.name, "public_key": key.hex()}) if arguments.json else key.hex())
     logging.info(
@@ -107,12 +116,16 @@ def _node(arguments: argparse.Namespace) -> int:
 
 
 def _enrol(arguments: argparse.Namespace) -> int:
+    from livessl.site import keys
+
     keys.enrol(_folder(arguments), arguments.name, arguments.key)
     logging.info("node %r is enrolled; restart a running server to admit it", arguments.name)
     return OK
 
 
 def _token(arguments: argparse.Namespace) -> int:
+    from livessl.site import tokens
+
     token = tokens.add_token(_tokens_file(arguments), arguments.name, arguments.role)
     print(json.dumps({"name": arguments.name, "role": arguments.role, "token": token}) if arguments.json else token)
     logging.info("store the token now, because it is shown only once; a running server accepts it within a second")
@@ -120,6 +133,8 @@ def _token(arguments: argparse.Namespace) -> int:
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
+    from livessl.site import keys, tokens
+
     if arguments.node is not None:
         keys.dismiss(_folder(arguments), arguments.node)
         logging.info("node %r is no longer enrolled; restart a running server to disconnect it", arguments.node)
@@ -130,6 +145,9 @@ def _revoke(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
+    from livessl.site import keys, tokens
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     nodes = {} if site.keys is None else keys.enrolled(site.file(site.keys))
     file = site.server.http.tokens

@@ -5,15 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from livessl import offline
 from livessl.cli import progress
 from livessl.cli.exits import OK
 from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, import_from_here, read_site, wavs
 from livessl.cli.output import complain, print_event, print_warnings
 from livessl.clock import UnpacedClock
-from livessl.core.types import Event
-from livessl.recordings.assign import assign_files, span_ns
-from livessl.server.api.encode import Messages
 
 
 def add_arguments(parser: Any) -> None:
@@ -32,6 +28,11 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl import offline
+    from livessl.core.types import Event
+    from livessl.recordings.assign import assign_files, span_ns
+    from livessl.server.api.encode import Messages
+
     import_from_here()
     site = read_site(arguments)
     print_warnings(site)

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
-from threadpoolctl import threadpool_limits
-
 from livessl import __version__
 from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctrl_c
 from livessl.cli.output import complain
@@ -80,7 +78,9 @@ COMMANDS: Final = (
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
+    Command("init", "write a first site file", "livessl init --room 8,10,4 --arrays 2 --interface UMC1820"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
+    Command("config", "show the settings that are in effect", "livessl config show site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
 )
 """All commands, in the order in which the help lists them."""
@@ -95,6 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else arguments
     parsed = _parser(given).parse_args(given)
+    from threadpoolctl import threadpool_limits
+
     logging.basicConfig(
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )

@@ -6,13 +6,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from livessl.cli import argument
 from livessl.core.methods import METHODS
 from livessl.errors import ConfigError, Fault
-from livessl.site.load import load_site
-from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from livessl.site.models import Site
 
 T = TypeVar("T")
 
@@ -82,21 +83,24 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
 
 def read_site(arguments: argparse.Namespace) -> Site:
     """Read the site file that --site names, with the arrays that --joint joins."""
+    from livessl.site.load import load_site
+
     return load_site(arguments.site, joints(arguments))
 
 
 def joints(arguments: argparse.Namespace) -> dict[str, list[str]]:
     """Return the names of the arrays that --joint joins, by the name of the joint array."""
-    return _each_once(arguments.joint, "--joint")
+    return each_once(arguments.joint, "--joint")
 
 
 def wavs(arguments: argparse.Namespace) -> tuple[dict[str, tuple[Path, ...]], dict[str, list[int]]]:
     """Return the files of --wav and the channels of --channels, by array."""
     each = "; give one file for each microphone as ARRAY=FILE,FILE,…"
-    return _each_once(arguments.wav, "--wav", each), _each_once(arguments.channels, "--channels")
+    return each_once(arguments.wav, "--wav", each), each_once(arguments.channels, "--channels")
 
 
-def _each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
+def each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
+    """Return what an option says of each array; raise `ConfigError` if it names one twice."""
     names = [name for name, _ in pairs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from livessl.site.models import Site
+if TYPE_CHECKING:
+    from livessl.site.models import Site
 
 
 def complain(text: str, kind: str = "error") -> None:

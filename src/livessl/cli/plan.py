@@ -11,8 +11,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json, add_site
 from livessl.cli.output import complain
-from livessl.lab.plan import design, figure, words
-from livessl.site.load import load_site
+from livessl.lab.plan.defaults import CALIBRATION_M
 
 
 def add_arguments(parser: Any) -> None:
@@ -34,9 +33,9 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument(
         "--calibration",
         type=argument.above_zero,
-        default=design.CALIBRATION_M,
+        default=CALIBRATION_M,
         metavar="M",
-        help=f"standard deviation of the microphone positions, metres (default {design.CALIBRATION_M:g})",
+        help=f"standard deviation of the microphone positions, metres (default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
@@ -44,6 +43,9 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.lab.plan import design, figure, words
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     if arguments.out is not None:
         figure.require_matplotlib()

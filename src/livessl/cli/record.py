@@ -7,17 +7,12 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from livessl.capture.record import record_device
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK, stop_on_signal
-from livessl.cli.node_input import audio_device, check_files, node_config, recordings
 from livessl.cli.options import add_site, add_wav
 from livessl.cli.output import complain
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault
-from livessl.recordings.recorder import Recorder, record_playback
-from livessl.recordings.session import SESSION_FILE
-from livessl.site.load import load_site
 
 
 def add_arguments(parser: Any) -> None:
@@ -36,6 +31,11 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.capture.record import record_device
+    from livessl.cli.node_input import audio_device, check_files, node_config, recordings
+    from livessl.recordings.recorder import Recorder, record_playback
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     if site.privacy == "positions-only":
         what = (
@@ -76,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _refuse_to_overwrite(directory: Path) -> None:
     """Raise an error if a folder holds recordings: they are neither overwritten nor mixed with others."""
+    from livessl.recordings.session import SESSION_FILE
+
     held = directory.iterdir() if directory.is_dir() else ()
     names = sorted(path.name for path in held if path.name == SESSION_FILE or path.suffix.lower() in (".wav", ".flac"))
     if names:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from livessl.cli.exits import OK
 from livessl.cli.options import add_joint, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import print_warnings
 from livessl.clock import SystemClock
-from livessl.server.app import Server
+
+if TYPE_CHECKING:
+    from livessl.server.app import Server
 
 
 def add_arguments(parser: Any) -> None:
@@ -22,6 +24,8 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.server.app import Server
+
     import_from_here()
     site = read_site(arguments)
     print_warnings(site)

@@ -12,11 +12,6 @@ from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_site
 from livessl.cli.output import complain
 from livessl.errors import ConfigError, Fault
-from livessl.recordings.session import SESSION_FILE
-from livessl.simulation.export import TRUTH_FILE, write_scene
-from livessl.simulation.of_site import DEFAULT_RATE_HZ, device_rates_hz, scene_of
-from livessl.simulation.scene import read_sounds
-from livessl.site.load import load_site
 
 
 def add_arguments(parser: Any) -> None:
@@ -56,6 +51,12 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from livessl.recordings.session import SESSION_FILE
+    from livessl.simulation.export import TRUTH_FILE, write_scene
+    from livessl.simulation.of_site import DEFAULT_RATE_HZ, device_rates_hz, scene_of
+    from livessl.simulation.scene import read_sounds
+    from livessl.site.load import load_site
+
     site = load_site(arguments.site)
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])

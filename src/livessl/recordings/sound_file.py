@@ -96,17 +96,34 @@ class SoundFile:
         DeviceError
             If the file is damaged.
         """
-        for first in range(0, frames, length):
-            piece = np.empty((min(length, frames - first), self.channels), dtype=np.float32)
-            for at in range(0, len(piece), _READ_SAMPLES):
-                part = piece[at : at + _READ_SAMPLES]
+        at_once = length * max(1, _READ_SAMPLES // length)
+        for first in range(0, frames, at_once):
+            count = min(at_once, frames - first)
+            try:
+                several = self._read(first, count)
+            except DeviceError as damage:  # what comes before it is read piece by piece
                 try:
-                    got = len(self._file.read(out=part))
-                except soundfile.SoundFileError as error:
-                    raise self._damaged(first + at, getattr(error, "error_string", str(error))) from error
-                if got < len(part):
-                    raise self._damaged(first + at + got, "it ends there")
-            yield piece
+                    self._file.seek(first)
+                except soundfile.SoundFileError:
+                    raise damage from damage.__cause__
+                for begin in range(first, first + count, length):
+                    yield self._read(begin, min(length, frames - begin))
+                raise
+            for begin in range(0, count, length):
+                yield several[begin : begin + length]
+
+    def _read(self, first: int, count: int) -> Float32Array:
+        """Read the next samples (count, channels), of which the first has that number in the file."""
+        piece = np.empty((count, self.channels), dtype=np.float32)
+        for at in range(0, count, _READ_SAMPLES):
+            part = piece[at : at + _READ_SAMPLES]
+            try:
+                got = len(self._file.read(out=part))
+            except soundfile.SoundFileError as error:
+                raise self._damaged(first + at, getattr(error, "error_string", str(error))) from error
+            if got < len(part):
+                raise self._damaged(first + at + got, "it ends there")
+        return piece
 
     def _note(self, repair: Repair) -> str:
         return f"{self._path}: {repair.fault}; {repair.frames / self.sample_rate_hz:.2f} s of sound were found and read"

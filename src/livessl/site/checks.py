@@ -21,18 +21,13 @@ from livessl.site.alert_checks import alert_faults, alert_warnings
 from livessl.site.build.grid import search_grid
 from livessl.site.fields import Bounds
 from livessl.site.findings import unknown_array
+from livessl.site.guesses import box_cure, position_cure, rate_cure, unlikely
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 from livessl.site.place import Finding, Place
 
 COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
-
-HOT_C: Final = 50.0
-"""Temperature, in degrees Celsius, from which Fahrenheit is more likely: that of a cold room."""
-
-TALL_M: Final = 100.0
-"""Shortest edge of a room, in metres, from which centimetres are more likely."""
 
 SAMPLED_GRID_POINTS: Final = 500
 """Approximate number of grid points at which `_wide_arrays` compares the grid with an array: enough for a median."""
@@ -72,7 +67,8 @@ def cross_faults(site: Site) -> Iterator[Finding]:
 def warnings_of(site: Site) -> tuple[str, ...]:
     """Return warnings about settings that are valid but unlikely to work as expected."""
     return (
-        *_unlikely_values(site),
+        *unlikely(site),
+        *_near_arrays(site),
         *_wide_arrays(site),
         *_look_alikes(site),
         *_privacy_gaps(site),
@@ -114,11 +110,13 @@ def _name_faults(site: Site) -> Iterator[Finding]:
 
 
 def _outside(site: Site, bounds: Bounds | None) -> Iterator[str]:
-    for axis, (low, high), size in zip("xyz", bounds or (), site.room.size_m, strict=False):
+    if bounds is None:
+        return
+    for axis, (low, high), size in zip("xyz", bounds, site.room.size_m, strict=True):
         if high < 0 or low > size:
             yield (
                 f"expected a box that reaches into the room, on {axis} from 0 to {size:g} m, got [{low:g}, {high:g}]; "
-                "correct it or room.size_m"
+                f"{box_cure(site, bounds)}"
             )
 
 
@@ -128,14 +126,11 @@ def _array_faults(site: Site, spec: ArraySpec) -> Iterator[str]:
         if np.linalg.norm(positions[i] - positions[k]) < COINCIDENT_M:
             yield f"microphones {i + 1} and {k + 1} are at one place {_xyz(positions[i])}; correct one of them"
     size = np.array(site.room.size_m)
-    wide_m, most_m = spec.aperture_m, float(np.linalg.norm(size))
     outside = ((positions < 0) | (positions > size)).any(axis=1)
     if outside.any():
         k = int(outside.argmax())
-        in_mm = bool(((positions >= 0) & (positions <= 1000 * size)).all() and (positions.max(axis=1) > 100).all())
-        in_mm |= most_m < wide_m <= 1000 * most_m
-        cure = "give metres, not millimetres" if in_mm else "correct the array's position or room.size_m"
-        yield f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m; {cure}"
+        what = f"microphone {k + 1} at {_xyz(positions[k])} is outside the room {_xyz(size)} m"
+        yield f"{what}; {position_cure(site, spec)}"
 
 
 def _coincident(one: ArraySpec, other: ArraySpec) -> Iterator[str]:
@@ -191,7 +186,7 @@ def _capture_faults(node: NodeConfig, spec: ArraySpec, channels: Sequence[int]) 
     if rate is not None and high >= rate / 2:
         yield (
             f"band_hz up to {high:g} Hz needs a sample rate above {2 * high:g} Hz, the device has {rate:g} Hz; "
-            "lower band_hz or raise sample_rate_hz"
+            f"{rate_cure(rate, 2 * high)}"
         )
 
 
@@ -218,20 +213,8 @@ def _wide_arrays(site: Site) -> Iterator[str]:
             )
 
 
-def _unlikely_values(site: Site) -> Iterator[str]:
-    """Yield a warning for values that are possible, but more likely in another unit, or copied."""
-    celsius = site.temperature_c
-    if celsius is not None and celsius >= HOT_C:
-        yield (
-            f"temperature_c: {celsius:g} degrees Celsius is unlikely, and a wrong temperature moves positions; did you "
-            f"mean {(celsius - 32) / 1.8:.1f}, from Fahrenheit?"
-        )
-    size_m = site.room.size_m
-    if min(size_m) >= TALL_M:
-        yield (
-            f"room.size_m: {' x '.join(f'{x:g}' for x in size_m)} m is unlikely; did you mean "
-            f"[{', '.join(f'{x / 100:g}' for x in size_m)}], from centimetres?"
-        )
+def _near_arrays(site: Site) -> Iterator[str]:
+    """Yield a warning for each two arrays that are within each other."""
     for one, other in combinations(site.processed, 2):
         apart_m = float(np.linalg.norm(one.centre_m - other.centre_m))
         if apart_m < min(one.aperture_m, other.aperture_m) / 2.0:

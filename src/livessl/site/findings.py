@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, Final, get_args
+from typing import Any, Final, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel
@@ -28,6 +28,23 @@ _SENTENCES: Final = {
     "too_long": "expected at most {max_length} items, got {actual_length}",
 }
 """Sentence for each type of pydantic error; other types keep pydantic's own."""
+
+
+_FOREIGN_UNITS: Final = {
+    "mm": ("m", "millimetres"),
+    "cm": ("m", "centimetres"),
+    "ft": ("m", "feet"),
+    "rad": ("deg", "radians"),
+    "f": ("c", "degrees Fahrenheit"),
+    "k": ("c", "kelvin"),
+    "khz": ("hz", "kilohertz"),
+    "ms": ("s", "milliseconds"),
+    "us": ("s", "microseconds"),
+}
+"""Ends of keys in units that are not used, each with the end and the unit's name: the value must be converted, too."""
+
+_MOST_PLACES: Final = 3
+"""Most places that are named for a key that stands at the wrong one."""
 
 
 def read_yaml(text: str) -> Any:
@@ -87,12 +104,16 @@ class Locator:
 
     def fault(self, place: Place, what: str) -> Fault:
         """Return a fault with the line of `place`, or of the innermost part of it that the file has."""
+        line = self.line(place)
+        where = self._source if line is None else f"{self._source}:{line}"
+        return Fault(f"{where}: {dotted(place)}" if place else where, what)
+
+    def line(self, place: Place) -> int | None:
+        """Return the line of `place`, or of the innermost part of it that the file has; None if it has none."""
         known = tuple(map(str, place))
         while known and known not in self._lines:
             known = known[:-1]
-        line = self._lines.get(known)
-        where = self._source if line is None else f"{self._source}:{line}"
-        return Fault(f"{where}: {dotted(place)}" if place else where, what)
+        return self._lines.get(known)
 
 
 def dotted(place: Place) -> str:
@@ -118,21 +139,58 @@ def validation_findings(model: type[BaseModel], errors: Iterable[Mapping[str, An
     for error in errors:
         place = tuple(part for part in error["loc"] if part != "[key]")
         if error["type"] == "extra_forbidden":
-            found.append((place, unknown_key(str(place[-1]), _keys_at(model, place[:-1]))))
+            found.append((place, _unknown_key(model, place)))
         else:
             found.append((place, _sentence(error)))
     return found
 
 
-def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Return the sentence for a key that is not known, with the closest known key, if there is one."""
-    similar = get_close_matches(key, list(known), 1)
+def unknown_key(key: str, known: Iterable[str], elsewhere: Iterable[str] = ()) -> str:
+    """Return the sentence for a key that is not known, with what was probably meant.
+
+    Parameters
+    ----------
+    key : str
+    known : iterable of str
+        Keys that are known at its place.
+    elsewhere : iterable of str
+        Places at which the very key is known.
+    """
+    names = list(known)
+    stem, _, unit = key.rpartition("_")
+    for meant in names if unit in _FOREIGN_UNITS else ():
+        if meant.rpartition("_")[0] == stem:
+            own, others = _FOREIGN_UNITS[unit]
+            if meant.endswith(f"_{own}"):
+                return f"unknown key {key!r}; did you mean {meant!r}? Convert its value from {others}"
+    places = list(elsewhere)
+    if places:
+        return f"unknown key {key!r}; it belongs to {' or '.join(places[:_MOST_PLACES])}"
+    similar = get_close_matches(key.lower(), names, 1)
     return f"unknown key {key!r}; " + (f"did you mean {similar[0]!r}?" if similar else "remove it")
 
 
+def places_of(model: type[BaseModel], key: str, place: str = "") -> list[str]:
+    """Return the places below a model at which a key is known; NAME stands for the name of an entry."""
+    found = [place] if place and key in model.model_fields else []
+    for name, field in model.model_fields.items():
+        below = f"{place}.{name}" if place else name
+        named = get_origin(field.annotation) is dict
+        for inner in _models_in(field.annotation):
+            found += places_of(inner, key, f"{below}.NAME" if named else below)
+    return list(dict.fromkeys(found))
+
+
 def unknown_array(name: str, known: Iterable[str]) -> str:
-    """Return the sentence for an array that the file does not have."""
-    return f"expected one of the arrays {', '.join(known)}, got {name!r}; correct the name or add the array"
+    """Return the sentence for an array that the file does not have, with the name that is most like it."""
+    similar = get_close_matches(name.lower(), list(known), 1)
+    cure = f"did you mean {similar[0]!r}?" if similar else "correct the name or add the array"
+    return f"expected one of the arrays {', '.join(known)}, got {name!r}; {cure}"
+
+
+def _unknown_key(model: type[BaseModel], place: Place) -> str:
+    key = str(place[-1])
+    return unknown_key(key, _keys_at(model, place[:-1]), places_of(model, key))
 
 
 def reason(error: Exception) -> str:

@@ -16,6 +16,7 @@ from livessl.site.findings import (
     Locator,
     duplicate_keys,
     nodes_of,
+    places_of,
     reason,
     unknown_key,
     validation_findings,
@@ -97,7 +98,9 @@ def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, lis
     """Validate each section, then check the valid ones together; return None for the site if too little is valid."""
     known = {key: value for key, value in data.items() if key in SiteFile.model_fields}
     findings: list[Finding] = [
-        ((key,), unknown_key(str(key), SiteFile.model_fields)) for key in data if key not in known
+        ((key,), unknown_key(str(key), SiteFile.model_fields, places_of(SiteFile, str(key))))
+        for key in data
+        if key not in known
     ]
     errors: list[Any] = []
     file = None

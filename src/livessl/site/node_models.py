@@ -4,29 +4,27 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from livessl.site.addresses import check_endpoint
 from livessl.site.fields import FileName, Model, Positive
-
-
-def _from_one(channel: int) -> int:
-    if channel < 1:
-        raise ValueError(f"expected a channel number from 1 on, got {channel}; channels count from 1")
-    return channel
-
-
-Channel = Annotated[int, AfterValidator(_from_one)]
-"""Channel of a device, counted from 1."""
+from livessl.site.slips import counted_from_0
 
 
 class SoundDeviceConfig(Model):
-    """An audio interface, by name."""
+    """An audio interface, by name, and by serial number or USB port where several have one name.
+
+    `latency_s` is the latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so
+    how long the machine may be busy before samples are lost; blocks still arrive every `block_s`.
+    """
 
     type: Literal["sound"] = "sound"
     name: str
+    serial: str | None = None
+    usb_port: str | None = None
     sample_rate_hz: Positive = 48000.0
     block_s: Annotated[float, Field(gt=0, le=1)] = 0.02
+    latency_s: Annotated[float, Field(gt=0, le=2)] = 0.1
 
 
 class WavDeviceConfig(Model):
@@ -66,7 +64,7 @@ class NodeConfig(Model):
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig
     spool: SpoolConfig = SpoolConfig()
-    arrays: Annotated[dict[str, list[Channel]], Field(min_length=1)]
+    arrays: Annotated[dict[str, list[int]], Field(min_length=1)]
 
     @model_validator(mode="before")
     @classmethod
@@ -90,6 +88,14 @@ class NodeConfig(Model):
         if kind is None:
             raise ValueError(f"type: expected one of {', '.join(kinds)}, got {device.get('type')!r}")
         return kind.model_validate(device)
+
+    @field_validator("arrays")
+    @classmethod
+    def _from_one(cls, arrays: dict[str, list[int]]) -> dict[str, list[int]]:
+        wrong = counted_from_0(arrays)
+        if wrong is not None:
+            raise ValueError(wrong)
+        return arrays
 
     @field_validator("server")
     @classmethod

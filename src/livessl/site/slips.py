@@ -1,9 +1,9 @@
-"""Slips of the hand in YAML files, and what was meant: names without quotes, and decimal commas."""
+"""Slips of the hand in YAML files, and what was meant: names without quotes, decimal commas, channels from 0."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import yaml
@@ -78,6 +78,18 @@ def slip(error: Mapping[str, Any]) -> str | None:
     if kind == "string_type" and (got is None or isinstance(got, bool | int | float)):
         return f"expected a text, got {got!r}; put it in quotes"
     return None
+
+
+def counted_from_0(arrays: Mapping[str, Sequence[int]]) -> str | None:
+    """Return what is wrong with the channels of a node, which count from 1; None if nothing is."""
+    lowest = min((channel for channels in arrays.values() for channel in channels), default=1)
+    if lowest >= 1:
+        return None
+    what = f"expected channel numbers from 1 on, got {lowest}; channels count from 1"
+    if lowest < 0:
+        return what
+    meant = ", ".join(f"{name}: {[channel + 1 for channel in channels]}" for name, channels in arrays.items())
+    return f"{what}; did you mean {{{meant}}}?"
 
 
 def _has_commas(numbers: list[Any]) -> bool:

@@ -7,6 +7,8 @@ from typing import Final
 
 import numpy as np
 import pytest
+import scipy.fft
+import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfilt
@@ -109,6 +111,27 @@ def test_a_hum_that_begins_is_one_sound_and_then_background() -> None:
     assert [round(0.05 * start, 1) for start, _ in others] == [10.0]
 
 
+@given(
+    rate_hz=st.sampled_from([8000.0, 16000.0, 44100.0, 44120.0, 48000.0]),
+    high_hz=st.floats(600.0, 3900.0),
+    extra=st.integers(-1, 1),
+    seed=st.integers(0, 1 << 30),
+)
+@settings(max_examples=30)
+def test_the_spectrum_is_that_of_the_frame_with_a_hann_window(
+    rate_hz: float, high_hz: float, extra: int, seed: int
+) -> None:
+    """At any rate, up to the highest bin, and for frames that are a sample longer or shorter than usual."""
+    count = round(0.05 * rate_hz)
+    samples = np.random.default_rng(seed).standard_normal((3, count + extra)).astype(np.float32)
+    found = SteadyBackground(rate_hz, (100.0, high_hz), 3.0, 0.95).spectrum(samples, scipy.fft.rfft(samples, axis=1))
+    fitted = np.pad(samples, ((0, 0), (0, 1)))[:, :count]
+    window = scipy.signal.get_window("hann", count)
+    spectra = np.abs(np.fft.rfft(fitted * window, axis=1)) ** 2
+    expected = 2.0 * spectra.mean(axis=0) / (count**2 * np.mean(window**2))
+    np.testing.assert_allclose(found, expected[: len(found)], rtol=1e-3, atol=1e-6 * expected.max())
+
+
 @pytest.mark.parametrize("level", [0.0, 1e-4, 1e-2])
 @given(seed=st.integers(0, 1 << 30))
 @settings(max_examples=10)
@@ -117,7 +140,8 @@ def test_without_hum_the_level_is_the_plain_power_in_the_band(level: float, seed
     background = SteadyBackground(rate_hz, BAND_HZ, 3.0, 0.95)
     for _ in range(70):
         samples = (level * rng.standard_normal((4, 800))).astype(np.float32)
-        spectrum, power = background.spectrum(samples), float(band_power(samples, rate_hz, BAND_HZ).mean())
+        spectrum = background.spectrum(samples, scipy.fft.rfft(samples, axis=1))
+        power = float(band_power(samples, rate_hz, BAND_HZ).mean())
         background.learn(spectrum)
         assert background.changing_power(spectrum, power) == power
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import scipy.fft
 
-from livessl.core.types import BoolArray, Float32Array, FloatArray
+from livessl.core.types import BoolArray, ComplexArray, Float32Array, FloatArray
 
 ENVELOPE_ABOVE: Final = 0.25
 """Ratio of lower band edge to band width above which the envelope is used: 0.017 for 100 to 6000 Hz, 0.33 for 4 to
@@ -47,10 +47,16 @@ def band_power(samples: Float32Array, sample_rate_hz: float, band_hz: tuple[floa
     n = samples.shape[1]
     if n == 0:
         return np.zeros(len(samples))
-    spectrum = scipy.fft.rfft(samples, axis=1)
-    low, high = band_bins(n, sample_rate_hz, band_hz)
-    inside = spectrum[:, low:high]
-    return np.asarray(2.0 * (inside.real**2 + inside.imag**2).sum(axis=1, dtype=np.float64) / n**2)
+    return spectrum_power(scipy.fft.rfft(samples, axis=1), n, sample_rate_hz, band_hz)
+
+
+def spectrum_power(
+    spectra: ComplexArray, count: int, sample_rate_hz: float, band_hz: tuple[float, float]
+) -> FloatArray:
+    """Mean power (K,) of each channel inside a band, full scale squared, from spectra (K, F) of `count` samples."""
+    low, high = band_bins(count, sample_rate_hz, band_hz)
+    inside = spectra[:, low:high]
+    return np.asarray(2.0 * (inside.real**2 + inside.imag**2).sum(axis=1, dtype=np.float64) / count**2)
 
 
 def band_bins(n_fft: int, sample_rate_hz: float, band_hz: tuple[float, float]) -> tuple[int, int]:

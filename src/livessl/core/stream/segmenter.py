@@ -6,8 +6,9 @@ from collections import deque
 from typing import Final
 
 import numpy as np
+import scipy.fft
 
-from livessl.core.correlate.band import band_power
+from livessl.core.correlate.band import spectrum_power
 from livessl.core.stream.activity import ActivityParameters, CausalActivity
 from livessl.core.stream.steady_background import SteadyBackground
 from livessl.core.stream.timeline import Cut, Framer
@@ -77,8 +78,9 @@ class Segmenter:
             self._quiet_frames = self._hang_over + 1
         self._frame_index = cut.frame_index
         samples = self._selected(cut)
-        power = band_power(samples, self._rate_hz, self._spec.band_hz)
-        spectrum, mean = self._background.spectrum(samples), float(power.mean())
+        plain = scipy.fft.rfft(samples, axis=1)
+        power = spectrum_power(plain, samples.shape[1], self._rate_hz, self._spec.band_hz)
+        spectrum, mean = self._background.spectrum(samples, plain), float(power.mean())
         before = self._background.changing_power(spectrum, mean)
         self._background.learn(spectrum)
         if self._warm_up is None:

@@ -102,7 +102,7 @@ class _Motion:
 
 @dataclass(frozen=True, slots=True)
 class _Measurement:
-    """An estimate with the covariance (3, 3) of its error, its confidence included."""
+    """An estimate with the covariance (3, 3) of its error, its confidence included, but not the error of the set-up."""
 
     time_ns: int
     position_m: FloatArray
@@ -111,10 +111,11 @@ class _Measurement:
 
     @classmethod
     def of(cls, estimate: Estimate, *, probable: bool) -> _Measurement:
-        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(estimate.covariance_m2)[-1])))
+        covariance_m2 = estimate.sound_covariance_m2
+        spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1])))
         wrong = 1.0 - estimate.confidence if probable else 0.0
         least_m2 = MIN_STD_M**2 + wrong * WRONG_STD_M**2
-        noise_m2 = estimate.covariance_m2 + least_m2 * np.eye(3)
+        noise_m2 = covariance_m2 + least_m2 * np.eye(3)
         return cls(estimate.time_ns, estimate.position_m, noise_m2, spread_m <= GATE_M)
 
 

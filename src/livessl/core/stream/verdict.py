@@ -16,6 +16,7 @@ from livessl.core.geometry import direction_deg
 from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
 from livessl.core.locate.map_estimator import MapEstimator
+from livessl.core.locate.set_up_error import set_up_covariance_m2
 from livessl.core.stream.evidence import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
 from livessl.core.stream.site_state import SiteState
@@ -123,7 +124,7 @@ class Verdicts:
         if len(used.sounds) < least:
             return Verdict([replace(first, received=self._received(None, received, faults))], None)
         found = self._state.estimator.locate(used.sounds)
-        estimate = _estimate(found, used)
+        estimate = self._estimate(found, used)
         status, reason = self._judged(estimate, found)
         heard = self._received(found, received, faults)
         reason, power = _joined(reason, faults) or None, found.power or first.power
@@ -139,9 +140,9 @@ class Verdicts:
                 status=Status.LOCATED,
                 reason=_joined(None, faults) or None,
                 received=(),
-                estimate=_estimate(other, used),
+                estimate=self._estimate(other, used),
                 power=other.power or first.power,
-                contributions=self._contributions(used.powers, _estimate(other, used), found, backfilled),
+                contributions=self._contributions(used.powers, self._estimate(other, used), found, backfilled),
             )
             for source, other in enumerate(self._others(found, used), 2)
         )
@@ -184,7 +185,7 @@ class Verdicts:
     def locate_window(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
         """Locate a window of an event that goes on; return the update, and the location that it was made from."""
         found = self._state.estimator.locate(excerpt.sounds)
-        estimate = _estimate(found, excerpt)
+        estimate = self._estimate(found, excerpt)
         status, _ = self._judged(estimate, found)
         return Update(
             event_id=self._id(event.start),
@@ -193,7 +194,7 @@ class Verdicts:
             power=excerpt.greatest_power,
             contributions=self._contributions(excerpt.powers, estimate, found),
             complete_ns=excerpt.end_ns,
-            others=tuple(_estimate(other, excerpt) for other in self._others(found, excerpt)),
+            others=tuple(self._estimate(other, excerpt) for other in self._others(found, excerpt)),
         ), found
 
     def count_votes(self, event: PendingEvent, excerpt: Excerpt, verdict: Verdict) -> None:
@@ -203,7 +204,23 @@ class Verdicts:
 
     def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Localization, ...]:
         """Return those further sources of the same sound that are positions."""
-        return tuple(o for o in found.others if self._judged(_estimate(o, excerpt), o)[0] is Status.LOCATED)
+        return tuple(o for o in found.others if self._judged(self._estimate(o, excerpt), o)[0] is Status.LOCATED)
+
+    def _estimate(self, found: Localization, excerpt: Excerpt) -> Estimate:
+        arrays = _used(found, excerpt.sounds)
+        of_set_up_m2 = np.zeros((3, 3))
+        if arrays:
+            axes = np.flatnonzero(np.diag(found.covariance_m2))
+            of_set_up_m2 = set_up_covariance_m2(self._state.specs(arrays), found.position_m, axes.tolist())
+        return Estimate(
+            excerpt.middle_ns,
+            found.position_m,
+            found.covariance_m2 + of_set_up_m2,
+            found.confidence,
+            arrays,
+            found.candidates,
+            of_set_up_m2,
+        )
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         status, reason = judged(found, self._state.specs(estimate.arrays))
@@ -229,13 +246,6 @@ class Verdicts:
 
     def _id(self, frame_index: int) -> str:
         return f"{self._state.site}-{frame_index * FRAME_NS // 1_000_000}"
-
-
-def _estimate(found: Localization, excerpt: Excerpt) -> Estimate:
-    arrays = _used(found, excerpt.sounds)
-    return Estimate(
-        excerpt.middle_ns, found.position_m, found.covariance_m2, found.confidence, arrays, found.candidates
-    )
 
 
 def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+
 from livessl.core.types.arrays import FloatArray, read_only
 from livessl.core.types.sound import Evidence, Received
 
@@ -55,7 +57,8 @@ class Estimate:
     position_m : (3,) float64
         Metres, room corner at the origin.
     covariance_m2 : (3, 3) float64
-        Square metres. Rows and columns are zero along an axis on which the search volume is flat.
+        Square metres; of the position's whole error. Rows and columns are zero along an axis on which the search volume
+        is flat.
     confidence : float
         0 to 1. With `onset`, the probability that the position is right to within 0.5 m. With other methods, the margin
         of the map's peak over the next best place; it is not a probability.
@@ -64,6 +67,9 @@ class Estimate:
     candidates : tuple of Candidate
         The position, and then the places that explain the sound about as well, most probable first; empty if there are
         none.
+    set_up_covariance_m2 : (3, 3) float64
+        The part of `covariance_m2` that comes from poses and the speed of sound, as uncertain as the site file says.
+        All sounds from one place have this error in common.
 
     Raises
     ------
@@ -77,6 +83,12 @@ class Estimate:
     confidence: float
     arrays: tuple[str, ...]
     candidates: tuple[Candidate, ...] = ()
+    set_up_covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @property
+    def sound_covariance_m2(self) -> FloatArray:
+        """The part of `covariance_m2` (3, 3) by which positions of one source differ from one another."""
+        return self.covariance_m2 - self.set_up_covariance_m2
 
     def __post_init__(self) -> None:
         if self.position_m.shape != (3,) or self.covariance_m2.shape != (3, 3):
@@ -86,6 +98,7 @@ class Estimate:
             )
         read_only(self.position_m)
         read_only(self.covariance_m2)
+        read_only(self.set_up_covariance_m2)
 
 
 @dataclass(frozen=True, slots=True)

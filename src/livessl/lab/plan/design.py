@@ -13,6 +13,7 @@ from livessl.core.geometry import Grid
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction
+from livessl.lab.plan.defaults import CALIBRATION_M
 from livessl.simulation.room import absorption
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
@@ -28,9 +29,6 @@ SHARES: Final = (5, 25, 50, 75, 95)
 
 HEIGHT_M: Final = 1.5
 """Default height, in metres, of the expected sounds: about that of a mouth, a table or a door handle."""
-
-CALIBRATION_M: Final = 0.002
-"""Default error, in metres, of a microphone's position: a careful tape measurement. The paper's own left 0.7 mm."""
 
 SOUND_S: Final = 0.5
 """Length, in seconds, of the expected sound; it hardly matters with reverberation, see `prediction.observation_s`."""
@@ -65,6 +63,25 @@ class Errors:
     def percentile_m(self, share: float) -> float:
         """Return a percentile of the total error over the map, in metres."""
         return float(np.percentile(self.total_m, share))
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The predicted errors of each array alone and of all together, on a floor map at one height.
+
+    `absorption` is the share of sound that the walls absorb.
+    """
+
+    absorption: float
+    conditions: prediction.Conditions
+    floor: Grid
+    alone: tuple[Errors, ...]
+    fused: Errors
+
+    @property
+    def height_m(self) -> float:
+        """Height of the map, in metres."""
+        return self.floor.bounds_m[2][0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +174,35 @@ def make_plan(
     ValueError
         If the room cannot have the reverberation time, or the height lies outside the search volume.
     """
+    expected = predict(site, rt60_s, height_m, calibration_m)
+    conditions, points = expected.conditions, expected.floor.points_m()
+    volume = _volume(site)
+    extent = volume.upper_m - volume.lower_m
+    arrays = tuple(_array_plan(site, spec, volume, own) for spec, own in zip(site.specs, expected.alone, strict=True))
+    room, step = site.room.size_m, _step_m(site.room.size_m)
+    moves = prediction.best_moves(site.specs, points, conditions, room, extent, step, progress)
+    addition = None
+    if len(site.specs) == 1:
+        addition = prediction.best_addition(site.specs[0], points, conditions, room, extent, step)
+    return Plan(
+        site=site,
+        rt60_s=rt60_s,
+        absorption=expected.absorption,
+        conditions=conditions,
+        height_m=expected.height_m,
+        x_m=expected.floor.axis_m(0),
+        y_m=expected.floor.axis_m(1),
+        arrays=arrays,
+        fused=expected.fused,
+        moves=tuple(move for move in moves if move.after_m <= WORTH_WHILE * move.before_m)[:MOST_MOVES],
+        addition=addition,
+    )
+
+
+def predict(
+    site: Site, rt60_s: float, height_m: float | None = None, calibration_m: float = CALIBRATION_M
+) -> Prediction:
+    """Predict the errors of the arrays of a site, where they are; parameters and errors are those of `make_plan`."""
     alpha = absorption(rt60_s, site.room.size_m, site.c_m_s)
     conditions = prediction.Conditions(
         prediction.critical_distance_m(alpha, site.room.size_m),
@@ -169,28 +215,15 @@ def make_plan(
     points = floor.points_m()
     extent = volume.upper_m - volume.lower_m
     information = [prediction.information_1_m2(spec, points, conditions) for spec in site.specs]
-    arrays = tuple(
-        _array_plan(site, spec, volume, _errors(own, floor, extent, spec.centre_m))
-        for spec, own in zip(site.specs, information, strict=True)
-    )
     middle = np.mean([spec.centre_m for spec in site.specs], axis=0)
-    room, step = site.room.size_m, _step_m(site.room.size_m)
-    moves = prediction.best_moves(site.specs, points, conditions, room, extent, step, progress)
-    addition = None
-    if len(site.specs) == 1:
-        addition = prediction.best_addition(site.specs[0], points, conditions, room, extent, step)
-    return Plan(
-        site=site,
-        rt60_s=rt60_s,
+    return Prediction(
         absorption=alpha,
         conditions=conditions,
-        height_m=floor.bounds_m[2][0],
-        x_m=floor.axis_m(0),
-        y_m=floor.axis_m(1),
-        arrays=arrays,
+        floor=floor,
+        alone=tuple(
+            _errors(own, floor, extent, spec.centre_m) for spec, own in zip(site.specs, information, strict=True)
+        ),
         fused=_errors(np.sum(information, axis=0), floor, extent, middle),
-        moves=tuple(move for move in moves if move.after_m <= WORTH_WHILE * move.before_m)[:MOST_MOVES],
-        addition=addition,
     )
 
 

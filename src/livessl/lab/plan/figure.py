@@ -31,8 +31,13 @@ class FigureError(RunError):
     """The figure cannot be drawn."""
 
 
-def require_matplotlib() -> None:
+def require_matplotlib(option: str = "--out") -> None:
     """Check, before anything is computed, that figures can be drawn.
+
+    Parameters
+    ----------
+    option : str
+        The option that asked for the figure.
 
     Raises
     ------
@@ -44,7 +49,7 @@ def require_matplotlib() -> None:
         import matplotlib  # noqa: F401
     except ImportError as error:
         raise FigureError(
-            "plan.png needs matplotlib, which is not installed; run `sh scripts/setup.sh figures`, or omit --out"
+            f"figures need matplotlib, which is not installed; run `sh scripts/setup.sh figures`, or omit {option}"
         ) from error
 
 

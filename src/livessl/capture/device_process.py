@@ -1,0 +1,149 @@
+"""The node's end of one run of the process that owns its device: its blocks, its reports, its output, and its end."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Final
+
+import numpy as np
+
+from livessl.capture.device_report import Report, Wanted
+from livessl.capture.ring import RingReader
+from livessl.core.types import Block
+
+OUTPUT_BYTES: Final = 65536
+"""Most output of native libraries that is read at once, in bytes. It is the size of a pipe: a library that prints more
+waits until the node has read it."""
+
+ENDING_S: Final = 0.5
+"""Time in seconds in which the process may end by itself; then it is killed."""
+
+PROGRAM: Final = (sys.executable, "-P", "-m", "livessl.capture.device_main")
+"""The program that owns the device."""
+
+
+class DeviceProcess:
+    """One run of the process that owns the device. It begins with the object.
+
+    Parameters
+    ----------
+    wanted : Wanted
+        The device.
+    program : sequence of str
+        The program and its arguments; it gets the device and its file descriptors as two more.
+    environment : mapping or None
+        Its environment variables; None for those of this process.
+    """
+
+    def __init__(
+        self, wanted: Wanted, program: Sequence[str] = PROGRAM, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self._wanted = wanted
+        self._ring = RingReader(wanted.ring)
+        self._reports_fd, report_fd = os.pipe()
+        self._rest = b""
+        fds = (self._ring.memory_fd, self._ring.published_fd, report_fd)
+        try:
+            self._process = subprocess.Popen(  # noqa: S603  # our own program
+                [*program, wanted.to_json(), ",".join(map(str, fds))],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                pass_fds=fds,
+                env=environment,
+            )
+        finally:
+            os.close(report_fd)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._stdin, self._output_fd = self._process.stdin, self._process.stdout.fileno()
+        for fd in (self._reports_fd, self._output_fd):
+            os.set_blocking(fd, False)
+        self._poll = select.poll()
+        self._poll.register(self._ring.published_fd, select.POLLIN)
+        self._poll.register(self._reports_fd, select.POLLIN)
+        self._closed = False
+
+    @property
+    def waiting(self) -> int:
+        """Number of blocks that `block` returns without a wait."""
+        return self._ring.waiting
+
+    @property
+    def overruns(self) -> int:
+        """Number of blocks lost because the node did not read them in time."""
+        return self._ring.overruns
+
+    @property
+    def flagged(self) -> int:
+        """Number of blocks dropped because the driver flagged a loss in them."""
+        return self._ring.flagged
+
+    @property
+    def beats(self) -> int:
+        """Turns of the process's main loop."""
+        return self._ring.beats
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code of the process, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    def wait(self, seconds: float) -> None:
+        """Return when the process has published a block or a report, or has ended, or after some seconds."""
+        if not self._ring.waiting:
+            self._poll.poll(seconds * 1e3)
+            self._ring.receive()
+
+    def block(self) -> Block | None:
+        """Return the next block, with samples (channels, n) of its own; None if none is there."""
+        if not self._ring.waiting:
+            return None
+        slot = self._ring.first()
+        with slot.samples:
+            samples = np.frombuffer(slot.samples, dtype=np.float32).reshape(slot.count, self._wanted.channels)
+            own = samples.T.copy(order="C")
+            del samples
+        self._ring.release()
+        return Block(slot.first_index, own, slot.time_ns, slot.lost)
+
+    def reports(self) -> list[Report]:
+        """Return the reports that have come since the last call."""
+        *lines, self._rest = (self._rest + self._read(self._reports_fd)).split(b"\n")
+        return [Report.from_json(line.decode()) for line in lines]
+
+    def output(self) -> bytes:
+        """Return what native libraries have printed since the last call, at most `OUTPUT_BYTES`."""
+        return self._read(self._output_fd)
+
+    def end(self, *, kill: bool) -> bytes:
+        """End the process, by force with `kill` or if it takes long; return its last output."""
+        if self._closed:
+            return b""
+        self._closed = True
+        with suppress(BrokenPipeError):
+            self._stdin.close()
+        if not kill:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(ENDING_S)
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):  # the kernel may hold it in a driver; it ends when that returns
+            self._process.wait(ENDING_S)
+        last = self.output()
+        self._ring.close()
+        os.close(self._reports_fd)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        return last
+
+    @staticmethod
+    def _read(fd: int) -> bytes:
+        try:
+            return os.read(fd, OUTPUT_BYTES)
+        except BlockingIOError:
+            return b""
