@@ -2,7 +2,8 @@
 # Installs livessl with everything that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
 set -eu
 cd "$(dirname "$0")/.."
-packages="chromium mosquitto nginx-light libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl gcc libc6-dev libasound2-dev"
+packages="chromium mosquitto nginx-light libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl
+gcc libc6-dev libasound2-dev"
 command -v npm >/dev/null || packages="$packages nodejs npm" # where it is not from elsewhere already
 
 missing=

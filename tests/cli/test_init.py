@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cli.command_runs import Run
-from livessl.capture.sound_device import InputDevice
+from livessl.capture.portaudio import InputDevice
 from livessl.errors import DeviceError
 from livessl.lab.frame_drawing import PAGE_MM, drawing
 from livessl.site.draft import proposed_pose, searchable, shape_m, site_text
@@ -35,7 +35,7 @@ def connected(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """A function that sets the interfaces that are connected to the machine."""
 
     def connect(*devices: InputDevice) -> None:
-        monkeypatch.setattr("livessl.capture.sound_device.input_devices", lambda: list(devices))
+        monkeypatch.setattr("livessl.capture.portaudio.input_devices", lambda: list(devices))
 
     connect()
     return connect
@@ -148,7 +148,7 @@ def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, mo
     def missing() -> list[InputDevice]:
         raise DeviceError("no PortAudio")
 
-    monkeypatch.setattr("livessl.capture.sound_device.input_devices", missing)
+    monkeypatch.setattr("livessl.capture.portaudio.input_devices", missing)
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
     assert load_site(tmp_path / "site.yaml").warnings == ()
 

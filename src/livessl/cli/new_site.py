@@ -237,7 +237,7 @@ def _free_names(taken: Sequence[str], count: int) -> list[str]:
 
 def _connected() -> dict[str, int]:
     """Return the interfaces that are connected, with their number of inputs; none without PortAudio."""
-    from livessl.capture.sound_device import input_devices
+    from livessl.capture.portaudio import input_devices
 
     try:
         return {device.name: device.channels for device in input_devices() if device.is_hardware}
