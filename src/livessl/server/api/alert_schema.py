@@ -66,7 +66,9 @@ class Alert(BaseModel):
         description="What, where, and how sure, for people.",
         examples=["sound at (0.52, 0.61, 1.20) m, uncertain by 0.09 m, confidence 0.93"],
     )
-    link: str = Field(description="Address of the event, or of the dashboard.", examples=["http://127.0.0.1:8000/"])
+    link: str = Field(
+        description="Address of the event on the dashboard.", examples=["http://127.0.0.1:8000/#event=lab-1"]
+    )
     zones: list[str] = Field(description="Zones of the rule that it came from.", examples=[["door"]])
     membership: list[Membership] = Field(description="The same zones with their probabilities.")
     count: int = Field(ge=1, description="Events that the rule asks for within its span.", examples=[1])
