@@ -114,6 +114,7 @@ class SoundDevice:
         self._lag_ns: int | None = None
         self._delivered = False
         self._reported = False
+        self._realtime_logged = False
         self._lost = False
         self._base_index = self._handed_index = 0
         self._entered = False
@@ -200,6 +201,7 @@ class SoundDevice:
             if report.state is DeviceState.OPEN:
                 rule = HARDWARE if report.hardware else SOUND_SERVER
                 self._gaps = GapWatch(self.sample_rate_hz, self._block_s, rule)
+                self._log_realtime(report.not_realtime)
         run.read_output(self._output)
         verdict = judge(self.name, self._block_s, run.seen(delivered_before=self._delivered))
         if verdict is not None:
@@ -208,6 +210,17 @@ class SoundDevice:
                 self._give_up(run)
         elif run.delivers:
             self.problem = self._lag(run)
+
+    def _log_realtime(self, refused: str) -> None:
+        """Log once that the device's process competes with other programs for the processor."""
+        if refused and not self._realtime_logged:
+            self._realtime_logged = True
+            _log.info(
+                "the process that reads device %r was refused %s; a busy machine may lose sound. "
+                "deploy/livessl-node@.service grants both (LimitRTPRIO, LimitMEMLOCK)",
+                self.name,
+                refused,
+            )
 
     def _lag(self, run: _Run) -> str | None:
         """Return a problem while blocks were lost lately because this process did not read them in time."""
