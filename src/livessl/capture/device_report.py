@@ -1,4 +1,4 @@
-"""What the node tells the process that owns its device, and what that process reports, as JSON.
+"""The request to the process that owns a device, and the reports of that process, as JSON.
 
 The standard library is enough for this module, because the device process loads as little as possible.
 """
@@ -60,7 +60,7 @@ class Wanted:
 
 
 class DeviceState(StrEnum):
-    """What the device process has found."""
+    """State of the device, as the process that owns it reports it."""
 
     OPEN = "open"
     """The stream has started."""
