@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -201,3 +203,12 @@ def test_process_tries_to_start_portaudio_again(sd: FakePortAudio, ring: Ends, m
     _, second, third = ran(monkeypatch, ring, at)
     assert second.message == "PortAudio cannot be started: no host API; trying again"
     assert third.state is DeviceState.OPEN
+
+
+def test_process_loads_as_little_as_possible() -> None:
+    script = "import sys, livessl.capture.device_main; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    heavy = {"asyncio", "logging", "numpy", "pydantic", "scipy", "yaml", "zmq"}
+    assert heavy.isdisjoint(loaded)
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("livessl.")}
+    assert rooms == {"capture", "clock", "errors"}
