@@ -52,14 +52,6 @@ def test_capture_imports_nothing_that_localizes() -> None:
     assert names & (LOCALIZES | heavy | OTHER_COMMANDS | NEVER_LIVE) == set()
 
 
-def test_the_process_that_owns_a_device_loads_as_little_as_possible() -> None:
-    script = "import json, sys, livessl.capture.device_main; print(json.dumps(sorted(sys.modules)))"
-    names = set(json.loads(subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout))
-    assert "livessl.capture.portaudio" in names
-    assert names & {"logging", "numpy", "pydantic", "scipy", "yaml", "zmq"} == set()
-    assert not any(name.startswith(("livessl.core", "livessl.recordings", "livessl.site")) for name in names)
-
-
 def test_serve_imports_nothing_of_other_commands(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         text = PAPER.read_text(encoding="utf-8")
