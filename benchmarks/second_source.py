@@ -133,19 +133,23 @@ def _judged(pair: TwoSources, truths_m: FloatArray) -> dict[str, Any]:
 
 
 def fit(rows: Sequence[Mapping[str, Any]]) -> FloatArray:
-    """Fit the log-odds that the second place is a true source: intercept, and the weights of its terms (1 + T,)."""
+    """Fit the log-odds that the second place is a true source: intercept, and the weights of its terms (1 + T,).
+
+    Right and wrong places have the same weight together: how often two sounds begin at once depends on the site.
+    """
     fitted = [row for row in rows if row["layout"] in FITTED and row["kind"] != "near"]  # those are neither one nor two
     pairs = [pair for row in fitted for pair in row["pairs"]]
     values = np.array([SecondSourceFeatures(**pair["features"]).terms for pair in pairs])
     right = np.array([pair["right"] for pair in pairs], dtype=np.float64)
+    counts = np.where(right > 0.0, 0.5 / right.mean(), 0.5 / (1.0 - right.mean()))
     mean, deviation = values.mean(axis=0), values.std(axis=0)
     design = np.column_stack([np.ones(len(values)), (values - mean) / deviation])
     penalty = RIDGE * len(values) * np.diag([0.0, *np.ones(values.shape[1])])
     weights = np.zeros(design.shape[1])
     for _ in range(100):
         probability = 1.0 / (1.0 + np.exp(-design @ weights))
-        slope = design.T @ (right - probability) - penalty @ weights
-        curvature = (design.T * (probability * (1.0 - probability))) @ design + penalty
+        slope = design.T @ (counts * (right - probability)) - penalty @ weights
+        curvature = (design.T * (counts * probability * (1.0 - probability))) @ design + penalty
         step = np.linalg.solve(curvature, slope)
         weights += step
         if np.abs(step).max() < 1e-9:

@@ -48,7 +48,7 @@ remainder may be reflections."""
 UNEXPLAINED: Final = 0.05
 """Share of the height of the pairs' GCCs that a source may leave unexplained because the lag axis is sampled."""
 
-_FIT: Final = (-10.21, 3.52, 1.75, 4.08, 1.24)
+_FIT: Final = (-10.16, 4.06, 1.91, 6.71, 0.97)
 """Log-odds of a second source at a place: intercept and the weights of `SecondSourceFeatures.terms`. Fitted by
 `benchmarks/second_source.py` to sounds of the development half in simulated rooms."""
 
