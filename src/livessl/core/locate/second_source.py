@@ -22,7 +22,7 @@ from livessl.core.locate.frame_gccs import FrameGCCs, Remainder
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.outside import highest_power
 from livessl.core.locate.peak_search import PeakSearch
-from livessl.core.locate.place import Place, highest_place
+from livessl.core.locate.place import Place
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Evidence, FloatArray
 
@@ -253,11 +253,17 @@ class SecondSourceSearch:
         remainders = [each.without(taken_s) for each, taken_s in zip(frames, _delays_s(place), strict=True)]
         chosen = self._clearest(place, remainders)
         evidence = tuple(each.evidence_of(at_s) for each, at_s in zip(remainders, _delays_s(chosen), strict=True))
-        chosen = highest_place(evidence, self._search, self._grid, self._c_m_s)
+        chosen = self._highest(evidence)
         prominences = _prominences(remainders, chosen)
         above_all, above_noise = np.mean(prominences, axis=0)
         margin = refine.margin(chosen.power, chosen.rival_power)
         return chosen, SecondSourceFeatures(above_all, above_noise, margin, _explained(chosen))
+
+    def _highest(self, evidence: tuple[Evidence, ...]) -> Place:
+        """Search for the highest place of some evidence; one climb suffices, as no other answer is compared with it."""
+        find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
+        position_m, power = refine.refine_peaks(functional, find(1), self._grid)
+        return Place(evidence, functional, position_m, power, refine.rival_power(find, self._grid, position_m))
 
     def _clearest(self, place: Place, remainders: Sequence[Remainder]) -> Place:
         """Of the candidates with the highest power, return the one with the highest product of power and prominence."""
