@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ def test_intervals_are_those_of_wilson(count: int, total: int, low: float, high:
 def test_the_fit_recovers_the_log_odds_that_sounds_were_drawn_by() -> None:
     rng = np.random.default_rng(3)
     true = np.array([-4.0, 2.0, 1.0, 3.0, 0.8])
-    rows = []
+    rows: list[dict[str, Any]] = []
     for _ in range(6000):
         features = {
             "above_all": rng.uniform(0.0, 2.0),
