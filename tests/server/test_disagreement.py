@@ -60,9 +60,11 @@ def test_turned_array_is_named_by_events_state_and_metrics() -> None:
 
 
 def test_two_sources_at_once_are_two_events_and_stay_two() -> None:
+    """The second begins while the first goes on: two equal noises that begin and end together are not told apart."""
     places_m = [np.array([0.7, 3.1, 1.1]), np.array([3.2, 1.9, 1.9])]
     sources = tuple(
-        Source(f"hiss {seed}", 1.0, place_m, hiss(0.4, 1, seed=seed)[0]) for seed, place_m in enumerate(places_m)
+        Source(f"hiss {seed}", 1.0 + 0.15 * seed, place_m, hiss(0.4, 1, seed=seed)[0])
+        for seed, place_m in enumerate(places_m)
     )
     sounding = replace(scene(), sources=sources, duration_s=2.5)
     with running_server(site_of(THREE)) as server:

@@ -41,6 +41,10 @@ and a floor return a clap almost undiminished."""
 BACKGROUND: Final = 3.0
 """Ratio of the highest remainder that a steady noise leaves in a frame to the root mean square in the pre-roll."""
 
+BEGINNING: Final = 2
+"""Last frames of the pre-roll that may hold the beginning of the sound already: the activity rule needs power, and the
+first foot of an onset has little. Its correlation is clear before that."""
+
 _FITTED_DELAYS: Final = 3.0
 """Independent delays of an array of four microphones, in units of which prominence is measured."""
 
@@ -61,7 +65,7 @@ class FrameGCCs:
     powers : (F,) float64
         Greatest in-band mean power of the frames that each one was merged from, full scale squared.
     quiet : (F,) bool
-        Whether the frame is part of the pre-roll.
+        Whether the frame is part of the pre-roll, and not one of its last `BEGINNING`.
     """
 
     spec: ArraySpec
@@ -84,7 +88,7 @@ class FrameGCCs:
         powers, quiet = np.zeros(len(together)), np.zeros(len(together), dtype=np.bool_)
         if course is not None:
             powers = np.maximum.reduceat(course.powers, firsts)
-            quiet = np.maximum.reduceat(course.frame_indices, firsts) < course.begin
+            quiet = np.maximum.reduceat(course.frame_indices, firsts) < course.begin - BEGINNING
         whole = summed(together)
         even = live[:, None] * np.float32(whole.weight) / whole.heights(microphone_pairs(len(spec.microphones_m)))
         coarse = np.asarray(np.stack([one.lags for one in together]).real * even, dtype=np.float32)
@@ -134,9 +138,23 @@ class Remainder:
 
     def evidence(self) -> Evidence:
         """Return the sum of the remainders, in which a frame counts the less the louder it is, down to `LITTLE`."""
+        weights = self._frames.weights
+        scale = 1.0 / np.maximum(weights, LITTLE)
+        return self._summed(scale / max(float((weights * scale).sum()), 1e-9))
+
+    def evidence_of(self, delays_s: FloatArray) -> Evidence:
+        """Return the sum of the remainders, in which a frame counts as far as a source at delays (P,) made it.
+
+        The share of that source in the frame's height counts squared, beside the removed source and the root mean
+        square; it is 0 in the pre-roll. Loud frames count for more, as in the evidence of a source alone.
+        """
+        frames = self._frames
+        heights = np.where(frames.quiet, 0.0, np.maximum(self.heights(delays_s)[0], 0.0))
+        scale = np.square(heights / np.maximum(heights + self.removed_heights + frames.rms, 1e-9))
+        return self._summed(scale / max(float((frames.weights * scale).sum()), 1e-9))
+
+    def _summed(self, scale: FloatArray) -> Evidence:
         frames, count = self._frames, len(self._frames.lags_s)
-        scale = 1.0 / np.maximum(frames.weights, LITTLE)
-        scale /= max(float((frames.weights * scale).sum()), 1e-9)
         values = np.einsum("f,fpl->pl", scale.astype(np.float32), frames.values)
         weighed = scale.astype(np.float32) @ self._share
         for pair in frames.live:

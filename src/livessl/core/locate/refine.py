@@ -119,11 +119,24 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: 
     value : float
         The functional there.
     """
+    tops = [_climb(functional, *top, grid, stride) for top in _finer(functional, starts_m, grid, stride)]
+    return max(tops, key=lambda top: top[1])
+
+
+def near_top(functional: SRPFunctional, peak: Peak, grid: Grid) -> tuple[FloatArray, float]:
+    """Return the highest point of the finer local grid around a peak, and the functional there, without climbing.
+
+    It costs a tenth of `refine_peaks`, and is off by at most half of the finer spacing along each axis.
+    """
+    (top,) = _finer(functional, grid.point_m(peak.point), grid, peak.stride)
+    return top
+
+
+def _finer(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: int) -> list[tuple[FloatArray, float]]:
+    """Highest point of a finer local grid around each start (N, 3) or (3,), and the functional there."""
     near = np.clip(np.atleast_2d(starts_m)[:, None] + stride * _offsets_m(grid), grid.lower_m, grid.upper_m)
     values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
-    best = values.argmax(axis=1)
-    tops = [_climb(functional, near[n, k], float(values[n, k]), grid, stride) for n, k in enumerate(best)]
-    return max(tops, key=lambda top: top[1])
+    return [(near[n, k], float(values[n, k])) for n, k in enumerate(values.argmax(axis=1))]
 
 
 def _offsets_m(grid: Grid) -> FloatArray:

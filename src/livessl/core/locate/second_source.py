@@ -16,10 +16,11 @@ import numpy as np
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M, Judgement, array_power, peak_to_rms
+from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M, Judgement, array_power
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
-from livessl.core.locate.frame_gccs import FrameGCCs
+from livessl.core.locate.frame_gccs import FrameGCCs, Remainder
 from livessl.core.locate.outliers import Consensus
+from livessl.core.locate.outside import highest_power
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
 from livessl.core.locate.srp import SRPFunctional
@@ -44,10 +45,12 @@ CLEAR: Final = 1.0
 """Prominence of the second source in a frame from which the frame's power is divided between both sources; below it the
 remainder may be reflections."""
 
-_FIT: Final = (-7.52, 14.62, -6.40, 8.48, 1.81)
-"""Log-odds of a second source at a place: intercept and the weights of the fields of `SecondSourceFeatures` in their
-order. Fitted to pairs of sounds and to single sounds of the development half, at two and four tetrahedra, eight pairs
-of microphones and four frames of a metre."""
+UNEXPLAINED: Final = 0.05
+"""Share of the height of the pairs' GCCs that a source may leave unexplained because the lag axis is sampled."""
+
+_FIT: Final = (-10.16, 4.06, 1.91, 6.71, 0.97)
+"""Log-odds of a second source at a place: intercept and the weights of `SecondSourceFeatures.terms`. Fitted by
+`benchmarks/second_source.py` to sounds of the development half in simulated rooms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,29 +64,27 @@ class SecondSourceFeatures:
         alone (`livessl.core.locate.frame_gccs.Remainder.prominences`). In the frames of a source of its own the first
         one is weak and both are nearly equal; reflections of the first come with it.
     margin : float
-        1 - (power at the best other place) / (power at the place), of what remains without the first source.
-    peak_to_rms : float
-        Mean over the arrays of the peak-to-RMS ratio at the place, of what remains without the first source.
+        1 - (power at the best other place) / (power at the place), of the evidence of the second source.
+    explained : float
+        Mean over the arrays of the height of its pairs' GCCs at the place, relative to the highest that each of them
+        has anywhere. All pairs of all arrays receive a source; of a place where reflections happen to meet, some do.
     """
 
     above_all: float
     above_noise: float
     margin: float
-    peak_to_rms: float
+    explained: float
+
+    @property
+    def terms(self) -> FloatArray:
+        """Terms of the log-odds, without the intercept: (4,). Each halving of what is not explained counts alike."""
+        unexplained = max(0.0, 1.0 - self.explained) + UNEXPLAINED
+        return np.array([self.above_all, self.above_noise, self.margin, -np.log(unexplained)])
 
     @property
     def confidence(self) -> float:
-        """Probability that there is a second source at the place.
-
-        It is 0 if the place is not the highest of all that remains: then it is a side lobe, or was pushed out of the
-        neighbourhood of the first source by one too near to be told apart.
-        """
-        return self.prospect if self.margin > 0.0 else 0.0
-
-    @property
-    def prospect(self) -> float:
-        """Probability that there is a second source, here or near to a higher place."""
-        log_odds = float(np.dot(_FIT, (1.0, self.above_all, self.above_noise, self.margin, self.peak_to_rms)))
+        """Probability that there is a second source at the place."""
+        log_odds = _FIT[0] + float(self.terms @ np.array(_FIT[1:]))
         return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
@@ -94,15 +95,11 @@ def majority(of_arrays: Sequence[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TwoSources:
-    """Two places at which sources sounded at the same time, and the confidence that the second one is a source.
-
-    `powers` are the greatest in-band powers of a frame that each of them has, full scale squared.
-    """
+    """Two places at which sources may have sounded at the same time, and what shows whether the second is a source."""
 
     first: Place
     second: Place
-    confidence: float
-    powers: tuple[float, float]
+    features: SecondSourceFeatures
 
     @property
     def stand_out_everywhere(self) -> bool:
@@ -176,13 +173,16 @@ class SecondSourceSearch:
             if not used:
                 return None
             first = replace(consensus.place, evidence=used, functional=SRPFunctional(used, self._c_m_s))
-            found = self.find(first, [frames_of(part) for part in used])
+            frames = [frames_of(part) for part in used]
+            found = self.find(first, frames)
             disputed = consensus.refused is not None or len(tried) > len(agreeing)
             if found is not None and (found.stand_out_everywhere or not disputed):
-                return self._separation(consensus, found, keeps_first=not disputed)
+                return self._separation(consensus, found, frames, keeps_first=not disputed)
         return None
 
-    def _separation(self, consensus: Consensus, found: TwoSources, *, keeps_first: bool) -> Separation:
+    def _separation(
+        self, consensus: Consensus, found: TwoSources, frames: Sequence[FrameGCCs], *, keeps_first: bool
+    ) -> Separation:
         """Judge both places. With `keeps_first` the consensus remains the first place if that is more confident.
 
         Equalising the frames weakens a short first source.
@@ -193,17 +193,18 @@ class SecondSourceSearch:
         judged = [(place, place.judgement(self._grid)) for place in places]
         first, judgement = max(judged, key=lambda pair: pair[1].features.confidence)
         second, used = found.second.judgement(self._grid), {part.spec.name for part in found.second.evidence}
+        powers = _powers(found.first, found.second, frames)
         return Separation(
             first,
             judgement,
-            found.powers[0],
+            powers[0],
             Localization(
                 found.second.position_m,
                 second.covariance_m2,
-                found.confidence,
+                found.features.confidence,
                 found.second.evidence,
                 features=second.features,
-                power=found.powers[1],
+                power=powers[1],
                 outliers={name: off_deg for name, off_deg in consensus.outliers.items() if name not in used},
             ),
         )
@@ -211,8 +212,23 @@ class SecondSourceSearch:
     def find(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources | None:
         """Find a second source; None if there is none.
 
+        Parameters
+        ----------
+        first : Place
+            The place of all evidence.
+        frames : sequence of FrameGCCs
+            Frames of the same arrays in the same order.
+        """
+        found = self.most_likely(first, frames)
+        apart = found.first.apart_m(found.second) >= APART_M
+        return found if apart and found.features.confidence >= LEAST_CONFIDENCE else None
+
+    def most_likely(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources:
+        """Return the most likely pair of places, whether or not there is a second source.
+
         The first source is removed and the second searched for; with the second removed the first is searched for
-        again, and then the second once more. If the first would then be elsewhere, both stay where they were found.
+        again, and then the second once more. If the first would then be elsewhere, both stay where they were found. If
+        there is hardly a second source at first sight, it is not examined further.
 
         Parameters
         ----------
@@ -222,16 +238,12 @@ class SecondSourceSearch:
             Frames of the same arrays in the same order.
         """
         second, features = self.beside(first, frames)
-        if features.prospect < LEAST_PROSPECT:
-            return None
-        again, _ = self.beside(second, frames)
-        if again.apart_m(first) > NEAR_M:
-            again = first
-        else:
-            second, features = self.beside(again, frames)
-        if features.confidence < LEAST_CONFIDENCE or again.apart_m(second) < APART_M:
-            return None
-        return TwoSources(again, second, features.confidence, _powers(again, second, frames))
+        if features.confidence >= LEAST_PROSPECT:
+            again, known = self.beside(second, frames)
+            if again.apart_m(first) <= NEAR_M or known.confidence >= LEAST_CONFIDENCE:
+                first = again
+                second, features = self.beside(first, frames)
+        return TwoSources(first, second, features)
 
     def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, SecondSourceFeatures]:
         """Most likely other place once the source at `place` is removed, and what shows whether it is a source.
@@ -239,30 +251,51 @@ class SecondSourceSearch:
         Of the candidates with the highest power, the one with the highest product of power and prominence wins.
         """
         remainders = [each.without(taken_s) for each, taken_s in zip(frames, _delays_s(place), strict=True)]
+        chosen = self._clearest(place, remainders)
+        evidence = tuple(each.evidence_of(at_s) for each, at_s in zip(remainders, _delays_s(chosen), strict=True))
+        chosen = self._highest(evidence)
+        prominences = _prominences(remainders, chosen)
+        above_all, above_noise = np.mean(prominences, axis=0)
+        margin = refine.margin(chosen.power, chosen.rival_power)
+        return chosen, SecondSourceFeatures(above_all, above_noise, margin, _explained(chosen))
+
+    def _highest(self, evidence: tuple[Evidence, ...]) -> Place:
+        """Search for the highest place of some evidence; one climb suffices, as no other answer is compared with it."""
+        find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
+        position_m, power = refine.refine_peaks(functional, find(1), self._grid)
+        return Place(evidence, functional, position_m, power, refine.rival_power(find, self._grid, position_m))
+
+    def _clearest(self, place: Place, remainders: Sequence[Remainder]) -> Place:
+        """Of the candidates with the highest power, return the one with the highest product of power and prominence."""
         evidence = tuple(each.evidence() for each in remainders)
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [refine.neighbourhood(place.position_m, self._grid)]
         apart_points = round(CANDIDATES_APART_M / self._grid.spacing_m)
-        best, chosen, prominences = 0.0, place, [(0.0, 0.0)]
+        best, chosen = 0.0, place
         for _ in range(CANDIDATES):
             found = find(1, without=known)
             if not found:
                 break
-            position_m, power = refine.refine_peaks(functional, found, self._grid)
+            position_m, power = refine.near_top(functional, found[0], self._grid)
             candidate = Place(evidence, functional, position_m, power, power)
-            each = zip(remainders, _delays_s(candidate), strict=True)
-            of_frames = [one.prominences(delays_s) for one, delays_s in each]
-            of_arrays = [(float(above_all.max()), float(above_noise.max())) for above_all, above_noise in of_frames]
-            score = power * majority([above_all for above_all, _ in of_arrays])
+            score = power * majority([above_all for above_all, _ in _prominences(remainders, candidate)])
             if score > best:
-                best, chosen, prominences = score, candidate, of_arrays
+                best, chosen = score, candidate
             known.append(refine.box_around(self._grid, found[0].point, apart_points))
-        chosen = replace(chosen, rival_power=refine.rival_power(find, self._grid, chosen.position_m))
-        above_all, above_noise = np.mean(prominences, axis=0)
-        terms = chosen.functional.pair_terms(chosen.position_m)
-        peaks = [peak_to_rms(part, array_power(part, term)) for part, term in zip(chosen.evidence, terms, strict=True)]
-        margin = refine.margin(chosen.power, chosen.rival_power)
-        return chosen, SecondSourceFeatures(above_all, above_noise, margin, float(np.mean(peaks)))
+        return chosen
+
+
+def _explained(place: Place) -> float:
+    """Mean over the arrays of the power at a place relative to the highest that each one's pairs can have."""
+    terms = place.functional.pair_terms(place.position_m)
+    each = zip(place.evidence, terms, strict=True)
+    return float(np.mean([array_power(part, term) / max(highest_power([part]), 1e-9) for part, term in each]))
+
+
+def _prominences(remainders: Sequence[Remainder], place: Place) -> list[tuple[float, float]]:
+    """Greatest prominence in a frame of each array, above reflections and noise and above noise alone."""
+    of_frames = [each.prominences(delays_s) for each, delays_s in zip(remainders, _delays_s(place), strict=True)]
+    return [(float(above_all.max()), float(above_noise.max())) for above_all, above_noise in of_frames]
 
 
 def _delays_s(place: Place) -> list[FloatArray]:
