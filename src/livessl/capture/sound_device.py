@@ -103,7 +103,7 @@ class SoundDevice:
         self.starts = 0
         self.unflagged_gaps = 0
         self._block_s = config.block_s
-        self._wanted = _wanted(config, channels)
+        self._wanted = wanted_device(config, channels)
         self._clock = clock
         self._start = start
         self._output = NativeOutput()
@@ -331,7 +331,8 @@ class _Run:
         self._flagged = self.process.flagged
 
 
-def _wanted(config: SoundDeviceConfig, channels: int) -> Wanted:
+def wanted_device(config: SoundDeviceConfig, channels: int) -> Wanted:
+    """Return what the process that owns the device is told of it."""
     block_samples = max(1, round(config.block_s * config.sample_rate_hz))
     slots = max(2, math.ceil(QUEUE_S * config.sample_rate_hz / block_samples)) + 1
     return Wanted(
