@@ -16,11 +16,15 @@ from livessl.core.commission.taps import Tap
 Places = Mapping[int, tuple[str, int]]
 """Array and microphone (from 1) of each input (from 1) that the site file names."""
 
-BAR: Final = 24
-"""Width of the bar of a level, in characters."""
+MOST_BAR: Final = 24
+LEAST_BAR: Final = 6
+"""Largest and least width of the bar of a level, in characters; a terminal without room for it shows none."""
 
 BAR_DBFS: Final = -72.0
-"""Level at which the bar begins: three decibels for each character."""
+"""Level at which the bar begins."""
+
+WORDS: Final = 20
+"""Room for the words of the faults, in characters: for three of them."""
 
 LAST_TAPS: Final = 3
 """Taps that stay below the table."""
@@ -145,7 +149,7 @@ class Screen:
         """Draw the table."""
         size = shutil.get_terminal_size()
         footer = [*self._taps, *([self._problem] if self._problem else []), "Ctrl-C ends"]
-        lines = [f"{self._name}, {time_s:.0f} s", *table(levels, self._places, bars=True), *footer]
+        lines = [f"{self._name}, {time_s:.0f} s", *table(levels, self._places, size.columns), *footer]
         room = max(size.lines - 1, len(footer) + 2)
         if len(lines) > room:
             hidden = len(lines) - room + 1
@@ -177,27 +181,39 @@ class Screen:
 
     @staticmethod
     def _marked(line: str, words: set[str]) -> str:
-        """Return a line with the words of its faults, at its end, in red."""
-        kept = line.rstrip().split(" ")
+        """Return a line with the words of faults in red, if it is that of an input, which begins with a number."""
+        if not line[:1].isdigit():
+            return line
+        kept = line.split(" ")
         return " ".join(f"{_RED}{word}{_PLAIN}" if word.strip(",") in words else word for word in kept)
 
 
-def table(levels: Sequence[InputLevel], places: Places, *, bars: bool = False) -> list[str]:
-    """Return the lines of a table with its heading; nothing without levels."""
+def table(levels: Sequence[InputLevel], places: Places, columns: int = 0) -> list[str]:
+    """Return the lines of a table with its heading; nothing without levels.
+
+    Parameters
+    ----------
+    levels : sequence of InputLevel
+    places : Places
+    columns : int
+        Width of the terminal, in which bars are drawn as far as there is room; 0 for none.
+    """
     if not levels:
         return []
-    names = [place_name(number, places) for number in range(1, len(levels) + 1)]
+    numbers = range(1, len(levels) + 1)
+    names = [
+        f"{number} {places[number][0]}/{places[number][1]}" if number in places else f"{number}" for number in numbers
+    ]
     width = max(map(len, [*names, "input"]))
-    bar = f"  {'':{BAR}}" if bars else ""
-    head = f"{'input':<{width}}{bar}  {'peak':>6}  {'RMS':>6}  {'noise':>6}  {'clipped':>8}  {'DC':>8}  {'hum':>12}"
-    unit = (
-        f"{'':<{width}}{bar}  {'dBFS':>6}  {'dBFS':>6}  {'dBFS':>6}  {'samples':>8}  {'% of FS':>8}  {'Hz, dBFS':>12}"
-    )
+    head = f"  {'peak':>6}  {'RMS':>6}  {'noise':>6}  {'clipped':>7}  {'DC':>6}  {'hum':>7}"
+    unit = f"  {'dBFS':>6}  {'dBFS':>6}  {'dBFS':>6}  {'samples':>7}  {'%':>6}  {'Hz,dBFS':>7}"
+    bar = min(MOST_BAR, columns - width - len(head) - WORDS - 2)
+    blank = " " * (bar + 2) if bar >= LEAST_BAR else ""
     return [
-        head,
-        unit,
+        f"{'input':<{width}}{blank}{head}",
+        f"{'':<{width}}{blank}{unit}",
         *(
-            f"{name:<{width}}{'  ' + _bar(level) if bars else ''}  {_row(level)}".rstrip()
+            f"{name:<{width}}{'  ' + _bar(level, bar) if blank else ''}  {_row(level)}".rstrip()
             for name, level in zip(names, levels, strict=True)
         ),
     ]
@@ -227,21 +243,21 @@ def place_name(number: int, places: Places, prefix: str = "") -> str:
 
 
 def _row(level: InputLevel) -> str:
-    hum = "-" if level.hum_hz is None else f"{level.hum_hz:.0f}, {level.hum_dbfs:.1f}"
+    hum = "-" if level.hum_hz is None else f"{level.hum_hz:.0f}, {level.hum_dbfs:.0f}"
     mean = "-" if level.mean is None else f"{100.0 * level.mean:+.2f}"
     noise = "-" if level.noise_dbfs is None else f"{level.noise_dbfs:.1f}"
     return (
-        f"{level.peak_dbfs:6.1f}  {level.rms_dbfs:6.1f}  {noise:>6}  {level.clipped:8d}  {mean:>8}  {hum:>12}  "
+        f"{level.peak_dbfs:6.1f}  {level.rms_dbfs:6.1f}  {noise:>6}  {level.clipped:7d}  {mean:>6}  {hum:>7}  "
         f"{', '.join(level.faults)}"
     )
 
 
-def _bar(level: InputLevel) -> str:
+def _bar(level: InputLevel, width: int) -> str:
     """Return a bar up to the RMS, with a mark at the peak."""
 
     def at(value_dbfs: float) -> int:
-        return min(BAR, max(0, round(BAR * (1.0 - value_dbfs / BAR_DBFS))))
+        return min(width, max(0, round(width * (1.0 - value_dbfs / BAR_DBFS))))
 
     filled, peak = at(level.rms_dbfs), at(level.peak_dbfs)
-    bar = "#" * filled + " " * (BAR - filled)
+    bar = "#" * filled + " " * (width - filled)
     return bar if peak <= filled else f"{bar[: peak - 1]}|{bar[peak:]}"
