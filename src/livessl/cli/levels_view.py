@@ -142,11 +142,13 @@ class Screen:
         self._places = places
         self._taps: list[str] = []
         self._problem: str | None = None
+        self._time_s = 0.0
         self._drawn = 0
         self._color = "NO_COLOR" not in os.environ
 
     def levels(self, time_s: float, levels: Sequence[InputLevel]) -> None:
         """Draw the table."""
+        self._time_s = time_s
         size = shutil.get_terminal_size()
         footer = [*self._taps, *([self._problem] if self._problem else []), "Ctrl-C ends"]
         lines = [f"{self._name}, {time_s:.0f} s", *table(levels, self._places, size.columns), *footer]
@@ -162,10 +164,10 @@ class Screen:
         self._taps = [*self._taps[1 - LAST_TAPS :], tap_line(tap, self._places)]
 
     def problem(self, problem: str | None) -> None:
-        """Keep the problem for the next drawing; draw at once where no sound comes."""
+        """Draw the problem in place of the table, because levels of a while ago would mislead."""
         self._problem = problem
         if problem:
-            self.levels(0.0, ())
+            self.levels(self._time_s, ())
 
     def summary(self, time_s: float, levels: Sequence[InputLevel]) -> None:
         """Replace the table by that of the whole time."""
