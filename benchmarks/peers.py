@@ -34,14 +34,14 @@ from livessl import wire
 from livessl.cli.progress import counted
 from livessl.clock import SystemClock
 from livessl.core.correlate.band import band_bins
-from livessl.core.correlate.gcc_phat import GCCPhat, correlated, microphone_pairs
+from livessl.core.correlate.gcc_phat import GCCPhat, correlated
 from livessl.core.correlate.spectra import Spectra, whole_segment
-from livessl.core.geometry import Grid, posed, tetrahedron
+from livessl.core.geometry import Grid, microphone_pairs, pair_weight, posed, tetrahedron
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.locate import peak_search, srp
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.refine import Peak
-from livessl.core.locate.srp import SRPMapper, pair_weight
+from livessl.core.locate.srp import SRPMapper
 from livessl.core.steering import steering_delays_s
 from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray, Frame, RealArray
 from livessl.lab.bench import kernels as bench

@@ -6,6 +6,7 @@ channel, so a test knows of each sample where it belongs.
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import os
 import shutil
@@ -39,6 +40,7 @@ def built() -> Path:
     require(Path("/usr/include/alsa/asoundlib.h").exists(), "ALSA's headers are not installed (libasound2-dev)")
     require(find_library("portaudio") is not None, "PortAudio is not installed (libportaudio2)")
     folder = Path(mkdtemp(prefix="livessl-interface-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for source, library in _LIBRARIES.items():
         command = ["gcc", "-O2", "-Wall", "-Werror", "-shared", "-fPIC", "-DPIC", "-o", str(folder / library)]
         libraries = ["-ldl", "-Wl,--no-as-needed", "-lasound"]

@@ -134,6 +134,24 @@ def test_fault_is_reported_and_survived(fault: str, words: str) -> None:
             assert [block.overflow for block in blocks] == [False] * 4 + [True] + [False] * 3
 
 
+@pytest.mark.parametrize(
+    ("damage", "what"),
+    [
+        (
+            "ring._bytes[64 + 4 * ring._shape.slot_bytes :][8:16] = b'x' * 8; os.eventfd_write(published_fd, 1)",
+            "ring: ",
+        ),
+        ("os.write(report_fd, b'{{}}\\n')", "report: "),
+        ('os.write(report_fd, b\'{"state": "odd"}\\n\')', "report: "),
+    ],
+)
+def test_damaged_process_is_started_again(damage: str, what: str) -> None:
+    with device(f"report('open'); deliver(4, 0.02); {damage}; beat_for_ever()", DELIVER) as (entered, runs):
+        _, problems = blocks_until(entered, lambda blocks: len(blocks) == 6)
+        assert len(runs.started) == 2
+    assert any(f"the process that reads device 'UMC' is damaged ({what}" in str(problem) for problem in problems)
+
+
 def test_loss_of_processor_time_is_told_so() -> None:
     slow = "[(ring.beat(), time.sleep(0.8)) for _ in range(3)]"
     with device(f"report('open'); deliver(4); {slow}; deliver(10**6, 0.02)") as (entered, runs):

@@ -174,6 +174,22 @@ def test_unsuitable_interface_is_refused(interfaces: Interfaces, channels: int, 
     assert words in str(caught.value)
 
 
+def test_process_has_real_time_priority_where_permitted_and_says_where_not(
+    interfaces: Interfaces, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    interfaces.add()
+    with opened(interfaces) as device:
+        blocks_until(device, lambda blocks: len(blocks) == 2)
+        [child] = children(os.getpid())
+        policies = {os.sched_getscheduler(int(task.name)) for task in Path(f"/proc/{child}/task").iterdir()}
+    if "was refused real-time scheduling" in caplog.text:
+        assert policies == {os.SCHED_OTHER}
+    else:
+        assert os.SCHED_RR in policies  # its watching thread is older and has none
+        assert len(policies) <= 2
+
+
 class Server:
     """The real receiver of a server, and a node as a process."""
 
@@ -193,7 +209,7 @@ class Server:
     @property
     def children(self) -> list[int]:
         """The process that owns the device, if there is one now."""
-        return [int(pid) for pid in Path(f"/proc/{self.node.pid}/task/{self.node.pid}/children").read_text().split()]
+        return children(self.node.pid)
 
 
 @contextmanager
@@ -208,6 +224,12 @@ def node(interfaces: Interfaces, folder: Path) -> Iterator[Server]:
             yield Server(receiver, process)
     finally:
         receiver.stop()
+
+
+def children(pid: int) -> list[int]:
+    """Return the device processes that a process has started."""
+    started_by = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [child for child in started_by if b"device_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def is_alive(pid: int) -> bool:

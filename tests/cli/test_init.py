@@ -138,10 +138,11 @@ def test_arrays_are_dealt_to_the_inputs_of_known_interfaces(
 
 def test_connected_interface_is_proposed(run: Run, tmp_path: Path, connected: Callable[..., None]) -> None:
     connected(
-        InputDevice("HDA Intel: (hw:0,0)", "ALSA", 2, 44100.0), InputDevice("Zoom F8: (hw:1,0)", "ALSA", 8, 48000.0)
+        InputDevice("HDA Intel: ALC892 (hw:0,0)", "ALSA", 2, 44100.0),
+        InputDevice("Zoom F8: USB Audio (hw:1,0)", "ALSA", 8, 48000.0),
     )
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
-    assert load_site(tmp_path / "site.yaml").nodes["lab-pc"].device.name == "Zoom F8"  # type: ignore[union-attr]
+    assert load_site(tmp_path / "site.yaml").nodes["lab-pc"].device.name == "Zoom F8: USB Audio"  # type: ignore[union-attr]
 
 
 def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,5 +93,12 @@ def test_warnings_say_what_can_be_lost() -> None:
     assert killed.startswith("alerts: without server.events_db")
     assert restart.startswith("alerts: a restart forgets")
     assert len(load({"rules": rules, "actions": RUN, "outbox": "alerts.sqlite"}).warnings) == 1
+    everywhere = {
+        **kept,
+        "server.http": {"host": "0.0.0.0", "tokens": "tokens.yaml", "certificate": "a", "private_key": "b"},
+    }
+    [links] = load({"rules": rules, "actions": RUN}, everywhere).warnings
+    assert links.startswith("alerts.url: links in alerts name 0.0.0.0")
+    assert load({"rules": rules, "actions": RUN, "url": "https://ears.example.org/"}, everywhere).warnings == ()
     [unused] = load({"rules": {"door": {"events": {}}}, "actions": RUN}, kept).warnings
     assert unused == "alerts.actions.run: no rule takes this action; name it in the actions of a rule"

@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from livessl.capture.device_report import DeviceState, OpeningError, Report, Wanted
 from livessl.capture.portaudio import is_active, library, open_stream, rescan
+from livessl.capture.realtime import request_realtime
 from livessl.capture.ring import RingWriter
 from livessl.clock import Clock, SystemClock
 
@@ -104,11 +105,13 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
 
     sd: Any = None
     stream: Any = None
+    not_realtime = ""
     while stream is None:
         ring.beat()
         try:
             if sd is None:
                 sd = library()
+                not_realtime = request_realtime()  # the library has started its helpers, and not yet its threads
             else:
                 rescan(sd)
             stream, is_hardware = open_stream(sd, wanted, receiver)
@@ -118,7 +121,7 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
                 if ended.wait(BEAT_S):
                     return
                 ring.beat()
-    reporter.report(Report(DeviceState.OPEN, hardware=is_hardware))
+    reporter.report(Report(DeviceState.OPEN, hardware=is_hardware, not_realtime=not_realtime))
     while not ended.wait(BEAT_S):
         ring.beat()
         if not is_active(sd, stream):

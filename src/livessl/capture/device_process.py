@@ -27,6 +27,10 @@ PROGRAM: Final = (sys.executable, "-P", "-m", "livessl.capture.device_main")
 """The program that owns the device."""
 
 
+class DamageError(Exception):
+    """The process has written something into the ring or its reports that it never writes: its memory is damaged."""
+
+
 class DeviceProcess:
     """One run of the process that owns the device. It begins with the object.
 
@@ -101,10 +105,19 @@ class DeviceProcess:
             self._ring.receive()
 
     def block(self) -> Block | None:
-        """Return the next block, with samples (channels, n) of its own; None if none is there."""
+        """Return the next block, with samples (channels, n) of its own; None if none is there.
+
+        Raises
+        ------
+        DamageError
+            If the process has damaged the ring.
+        """
         if not self._ring.waiting:
             return None
-        slot = self._ring.first()
+        try:
+            slot = self._ring.first()
+        except ValueError as error:
+            raise DamageError(str(error)) from error
         with slot.samples:
             samples = np.frombuffer(slot.samples, dtype=np.float32).reshape(slot.count, self._wanted.channels)
             own = samples.T.copy(order="C")
@@ -113,9 +126,18 @@ class DeviceProcess:
         return Block(slot.first_index, own, slot.time_ns, slot.lost)
 
     def reports(self) -> list[Report]:
-        """Return the reports that have come since the last call."""
+        """Return the reports that have come since the last call.
+
+        Raises
+        ------
+        DamageError
+            If they cannot be read.
+        """
         *lines, self._rest = (self._rest + self._read(self._reports_fd)).split(b"\n")
-        return [Report.from_json(line.decode()) for line in lines]
+        try:
+            return [Report.from_json(line.decode()) for line in lines]
+        except (ValueError, TypeError, KeyError) as error:
+            raise DamageError(f"report: {error}") from error
 
     def output(self) -> bytes:
         """Return what native libraries have printed since the last call, at most `OUTPUT_BYTES`."""

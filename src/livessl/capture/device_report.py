@@ -1,4 +1,4 @@
-"""What the node tells the process that owns its device, and what that process reports, as JSON.
+"""The request to the process that owns a device, and the reports of that process, as JSON.
 
 The standard library is enough for this module, because the device process loads as little as possible.
 """
@@ -60,7 +60,7 @@ class Wanted:
 
 
 class DeviceState(StrEnum):
-    """What the device process has found."""
+    """State of the device, as the process that owns it reports it."""
 
     OPEN = "open"
     """The stream has started."""
@@ -87,11 +87,14 @@ class Report:
         The problem, in words; empty if there is none.
     hardware : bool
         Whether samples come directly from the device, not through a sound server.
+    not_realtime : str
+        Why the process has no real-time scheduling or no locked memory; empty if it has both.
     """
 
     state: DeviceState
     message: str = ""
     hardware: bool = False
+    not_realtime: str = ""
 
     def to_json(self) -> str:
         """Return one line."""
@@ -101,7 +104,7 @@ class Report:
     def from_json(cls, line: str) -> Report:
         """Return what `to_json` has written."""
         data = json.loads(line)
-        return cls(DeviceState(data["state"]), str(data["message"]), bool(data["hardware"]))
+        return cls(**{**data, "state": DeviceState(data["state"])})
 
 
 class OpeningError(Exception):

@@ -8,7 +8,7 @@ from typing import Final
 from livessl.capture.device_report import DeviceState, Report
 
 START_NOTICE_S: Final = 1.5
-"""Time in seconds without a first report after which that is told."""
+"""Time in seconds without a first report after which the problem says so."""
 
 START_S: Final = 15.0
 """Time in seconds that the process may take until its first report; slow machines load the library for seconds."""
@@ -40,7 +40,7 @@ BEATS_PER_S: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the node sees of the process.
+    """Observations of the process by the node.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class GapRule:
-    """What counts as a gap.
+    """Windows and threshold of the search for gaps.
 
     Parameters
     ----------

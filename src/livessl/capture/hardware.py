@@ -1,6 +1,6 @@
-"""The capture devices that the Linux kernel lists, in words: names, USB ports, serial numbers, and who holds them.
+"""The capture devices that the Linux kernel lists: names, USB ports, serial numbers, and the programs that hold them.
 
-PortAudio hides a device that another program holds; the kernel's lists tell it from one that is not connected.
+PortAudio hides a device that another program holds. The kernel's lists distinguish it from one that is not connected.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What native libraries print: logged once per distinct message, counted, and limited."""
+"""Messages of native libraries: each distinct one is logged once and counted, and their number is limited."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.capture.device_process import DeviceProcess
+from livessl.capture.device_process import DamageError, DeviceProcess
 from livessl.capture.device_report import DeviceState, Report, Wanted
 from livessl.capture.device_watch import Seen, judge
 from livessl.capture.gap_watch import HARDWARE, SOUND_SERVER, GapWatch
@@ -114,6 +114,7 @@ class SoundDevice:
         self._lag_ns: int | None = None
         self._delivered = False
         self._reported = False
+        self._realtime_logged = False
         self._lost = False
         self._base_index = self._handed_index = 0
         self._entered = False
@@ -133,7 +134,10 @@ class SoundDevice:
         deadline_ns = self._clock.monotonic_ns() + round(FIRST_REPORT_S * 1e9)
         while not self._reported and self._run is not None and self._clock.monotonic_ns() < deadline_ns:
             self._run.wait()
-            self._look_after(self._run)
+            try:
+                self._look_after(self._run)
+            except DamageError as error:
+                self._damaged(self._run, error)
         return self
 
     def __exit__(
@@ -162,9 +166,7 @@ class SoundDevice:
         if run is None:
             self._wait_to_begin()
         else:
-            run.wait()
-            block = run.block()
-            self._look_after(run)
+            block = self._step(run)
             if block is not None:
                 return self._handed(block)
         nothing = np.empty((self.channels, 0), dtype=np.float32)
@@ -190,6 +192,21 @@ class SoundDevice:
         self._handed_index = first_index + block.samples.shape[1]
         return Block(first_index, block.samples, block.stamp_ns, overflow)
 
+    def _step(self, run: _Run) -> Block | None:
+        """Wait for the process; return its next block, if there is one."""
+        run.wait()
+        try:
+            block = run.block()
+            self._look_after(run)
+        except DamageError as error:
+            self._damaged(run, error)
+            return None
+        return block
+
+    def _damaged(self, run: _Run, error: DamageError) -> None:
+        self.problem = f"the process that reads device {self.name!r} is damaged ({error}); it was started again"
+        self._give_up(run)
+
     def _look_after(self, run: _Run) -> None:
         """Take note of reports and output of the process; end it if it does not work."""
         for report in run.new_reports():
@@ -200,6 +217,7 @@ class SoundDevice:
             if report.state is DeviceState.OPEN:
                 rule = HARDWARE if report.hardware else SOUND_SERVER
                 self._gaps = GapWatch(self.sample_rate_hz, self._block_s, rule)
+                self._log_realtime(report.not_realtime)
         run.read_output(self._output)
         verdict = judge(self.name, self._block_s, run.seen(delivered_before=self._delivered))
         if verdict is not None:
@@ -208,6 +226,17 @@ class SoundDevice:
                 self._give_up(run)
         elif run.delivers:
             self.problem = self._lag(run)
+
+    def _log_realtime(self, refused: str) -> None:
+        """Log once that the device's process competes with other programs for the processor."""
+        if refused and not self._realtime_logged:
+            self._realtime_logged = True
+            _log.info(
+                "the process that reads device %r was refused %s; a busy machine may lose sound. "
+                "deploy/livessl-node@.service grants both (LimitRTPRIO, LimitMEMLOCK)",
+                self.name,
+                refused,
+            )
 
     def _lag(self, run: _Run) -> str | None:
         """Return a problem while blocks were lost lately because this process did not read them in time."""

@@ -249,7 +249,7 @@ def _interface(questions: Questions, connected: Mapping[str, int]) -> str:
     """Return the interface to use: by default the connected one with most inputs."""
     best = max(connected, key=lambda name: connected[name], default=INTERFACE)
     known = known_interface(best)
-    default = best.partition(":")[0] if known is None else known.name
+    default = best.partition(" (hw:")[0] if known is None else known.name
     for name, inputs in connected.items():
         questions.say(f"  connected: {name}, {inputs} inputs")
     questions.say(f"  known: {', '.join(one.name for one in INTERFACES)}; others work, too")

@@ -196,6 +196,11 @@ class Grid:
         return np.asarray(self.lower_m + (cell + 0.5) * self.cell_m)
 
 
+def pair_weight(microphones: int) -> float:
+    """Weight of a pair of an array of K microphones, 2/K: see `livessl.core.locate.srp`."""
+    return 2.0 / microphones
+
+
 @cache
 def microphone_pairs(count: int) -> IntArray:
     """All pairs (i, k), i < k, of `count` microphones: (P, 2)."""

@@ -64,6 +64,11 @@ def alert_warnings(site: Site) -> Iterator[str]:
         )
     if site.alerts.rules and outbox_file(site) is None:
         yield "alerts: a restart forgets what is not delivered, and what is armed; set alerts.outbox"
+    if site.alerts.rules and site.alerts.url is None and site.server.http.host in ("0.0.0.0", "::"):  # noqa: S104
+        yield (
+            f"alerts.url: links in alerts name {site.server.http.host}, which no browser can open; set it to the "
+            "address under which people reach this server"
+        )
     used = {action for rule in site.alerts.rules.values() for action in rule.actions}
     for name in site.alerts.actions:
         if name not in used:

@@ -126,6 +126,8 @@ def _lines(draft: Draft) -> Iterator[str]:
         yield _noted(yaw, "turn from +x, counter-clockwise from above; to the degree")
     if draft.nodes:
         yield ""
+        if len({node.interface for node in draft.nodes}) < len(draft.nodes):
+            yield "# Interfaces of one name on one machine: paste the lines that `livessl devices` prints."
         yield "nodes:"
     for node in draft.nodes:
         yield _noted(f"  {_text(node.name)}:", f"livessl capture --site FILE --node {node.name}")

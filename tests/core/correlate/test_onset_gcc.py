@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
-from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
+from livessl.core.correlate.gcc_phat import LagSampling
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import onset
 from livessl.core.locate.estimator import Sound
 from livessl.core.locate.onset import Onset

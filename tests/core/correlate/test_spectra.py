@@ -7,9 +7,9 @@ import pytest
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
 from livessl.core.correlate import spectra
-from livessl.core.correlate.gcc_phat import CrossSpectra, GCCPhat, microphone_pairs
+from livessl.core.correlate.gcc_phat import CrossSpectra, GCCPhat
 from livessl.core.correlate.spectra import averaged, cepstral, minimum_phase_cepstrum, whole_segment
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.joint_array import joined
 from livessl.core.locate.estimator import Localization, Sound, create
 from livessl.core.locate.map_estimator import third_octaves_below_hz

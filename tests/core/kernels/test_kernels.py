@@ -7,7 +7,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from livessl.core.correlate.gcc_phat import microphone_pairs
+from livessl.core.geometry import microphone_pairs
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.kernels.arguments import NO_LAG, OnsetParameters, OnsetState
 from livessl.core.types import ComplexArray, Float32Array

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, ideal_gcc, tetra, true_lags_s
 from livessl.core.correlate.gcc_phat import GCCPhat
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, pair_weight
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.kernels.arguments import BLOCKS, RUNS
 from livessl.core.kernels.search_with_numpy import lag_places
@@ -245,7 +245,7 @@ def test_the_peak_in_a_yard_is_the_highest_of_the_points_examined(
             total = np.zeros(len(points), np.float32)
             for row, place in zip(part.gcc.values, places, strict=True):
                 total += row[place]
-            power += np.float32(srp.pair_weight(len(microphones_m))) * total
+            power += np.float32(pair_weight(len(microphones_m))) * total
         (found,) = searching(evidence, grid).among(evidence)(1)
         assert (found.point, found.power) == (points[power.argmax()], power.max())
         assert found.stride in cubes.strides

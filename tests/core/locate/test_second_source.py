@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from free_field import C_M_S, RATE_HZ, band_mean_cos, burst, heard, tetra, true_lags_s
-from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
-from livessl.core.geometry import Grid
+from livessl.core.correlate.gcc_phat import LagSampling
+from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate.estimator import Course, Localization, Sound
 from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.onset import Onset

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from free_field import BAND_HZ, C_M_S, RATE_HZ, band_mean_cos, burst, heard, ideal_gcc, tetra, true_lags_s
-from livessl.core.correlate.gcc_phat import GCCPhat, microphone_pairs
-from livessl.core.geometry import Grid, line
-from livessl.core.locate.srp import SRPFunctional, SRPMapper, pair_weight
+from livessl.core.correlate.gcc_phat import GCCPhat
+from livessl.core.geometry import Grid, line, microphone_pairs, pair_weight
+from livessl.core.locate.srp import SRPFunctional, SRPMapper
 from livessl.core.steering import steering_delays_s
 from livessl.core.types import GCC, ArraySpec, Evidence, FloatArray
 

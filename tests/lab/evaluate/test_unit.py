@@ -10,9 +10,9 @@ import pytest
 
 from evaluate.small_campaign import CLASSES, small_job, write_sounds
 from livessl.core.correlate.band import band_bins
-from livessl.core.correlate.gcc_phat import CrossSpectra, microphone_pairs
+from livessl.core.correlate.gcc_phat import CrossSpectra
 from livessl.core.correlate.spectra import whole_segment
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.steering import alias_free_hz, steering_delays_s
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.lab.evaluate.job import read_clips

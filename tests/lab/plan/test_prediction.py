@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from free_field import BAND_HZ, C_M_S, tetra
-from livessl.core.correlate.gcc_phat import microphone_pairs
-from livessl.core.geometry import Grid, line, posed, tetrahedron
+from livessl.core.geometry import Grid, line, microphone_pairs, posed, tetrahedron
 from livessl.core.steering import alias_free_hz, delay_gradients_s_m, steering_delays_s
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction

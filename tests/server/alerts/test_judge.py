@@ -60,7 +60,7 @@ def test_final_located_events_in_the_zone_alert_and_refused_ones_never() -> None
     assert alert["event"] == encoded(inside)
     assert alert["zones"] == ["door"]
     assert alert["membership"][0]["probability"] > 0.99
-    assert alert["link"] == "http://127.0.0.1:8000/api/v1/events/small-1"
+    assert alert["link"] == "http://127.0.0.1:8000/#event=small-1"
     assert alert["text"].startswith(
         "sound at (0.50, 0.50, 1.00) m, uncertain by 0.09 m, in zone 'door' with probability 1.00, confidence 0.90"
     )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
+import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -21,9 +24,10 @@ from livessl.errors import ConfigError
 from livessl.lab.processes import free_port
 from livessl.site.models import Site
 from mosquitto import running_mosquitto
-from small_site import HANG_S, wait_until
+from small_site import HANG_S, started, wait_until, write_site
 
 RULE = {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["home"]}
+LIVES = Path(__file__).parents[2] / "alert_lives.py"
 PATH_OF_PASSWORDS = Path("/usr/bin/mosquitto_passwd")
 
 
@@ -99,6 +103,23 @@ def test_alert_is_published_with_its_key_and_the_servers_presence_is_kept(tmp_pa
     with Listener(port) as later:
         wait_until(lambda: later.of(availability) == [b"offline"], "the kept presence")
         assert later.alerts() == []
+
+
+@pytest.mark.processes
+def test_broker_announces_a_server_that_was_killed(tmp_path: Path, port: int) -> None:
+    rule = {**RULE, "actions": ["guard"]}
+    alerts = {"actions": {"guard": {**PATIENT, "mqtt": {"port": port}}}, "rules": {"door": rule}}
+    site = write_site(tmp_path, {"server.events_db": "events.sqlite", "alerts": alerts})
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with Listener(port) as listener, started(sys.executable, LIVES, site, "100000", **pipes) as lives:
+        assert lives.stdin is not None
+        assert lives.stdout is not None
+        print("live", file=lives.stdin, flush=True)
+        process = int(lives.stdout.readline())
+        wait_until(lambda: listener.alerts(), "an alert")
+        os.kill(process, signal.SIGKILL)
+        presence = "livessl/small/availability"
+        wait_until(lambda: listener.of(presence) == [b"online", b"offline"], "the last will")
 
 
 DOCUMENTED = {

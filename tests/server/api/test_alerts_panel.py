@@ -15,7 +15,7 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import Event
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
-from small_site import HANG_S, running_server, site_of
+from small_site import HANG_S, running_server, site_of, wait_until
 
 pytestmark = [pytest.mark.browser]
 
@@ -78,6 +78,23 @@ def test_page_lists_rules_and_alerts_and_asks_before_it_disarms(browser: Browser
         page.get_by_role("button", name="Arm door", exact=True).press("Enter")
         state(page, "door", "armed")
         expect(page.get_by_role("button", name="Disarm door")).to_be_focused()
+
+
+def test_link_of_an_alert_opens_its_event_though_the_list_does_not_reach_so_far(
+    browser: Browser, server: Server
+) -> None:
+    first = sound(0, power=0.02)
+    finish(server, first, *(sound(number) for number in range(1, 60)))
+    wait_until(lambda: server.parts.alerts.states["door"].alerts == 60, "all alerts")
+    alerts = [alert for _, alert in server.parts.alerts.outbox.recent(60)]
+    with faultless_page(browser) as page:
+        for alert in (alerts[-1], alerts[0]):
+            visit(page, alert["link"])
+            row = page.locator(f'[data-event-id="{alert["event"]["id"]}"]')
+            expect(row.locator(".details")).to_be_visible(timeout=1000 * HANG_S)
+            expect(page.locator(".event.selected")).to_have_count(1)
+        expect(page.get_by_test_id("event")).to_have_count(51)
+        assert page.get_by_test_id("event").last.get_attribute("data-event-id") == first.id
 
 
 def test_no_text_of_the_panel_is_clipped_at_any_width(browser: Browser, server: Server) -> None:

@@ -38,6 +38,12 @@ ROUTES = {
     "/api/v1/findings",
     "/api/v1/health",
     "/api/v1/access",
+    "/api/v1/alerts",
+    "/api/v1/alerts/dead-letters",
+    "/api/v1/alerts/dead-letters/{number}/resend",
+    "/api/v1/alerts/rules",
+    "/api/v1/alerts/rules/{name}/armed",
+    "/api/v1/alerts/rules/{name}/dry-run",
     "/metrics",
 }
 """Every promised path but the WebSockets, which OpenAPI cannot describe."""
@@ -66,7 +72,8 @@ def test_openapi_is_complete(client: httpx.Client) -> None:
     described = client.get("/api/v1/openapi.json").json()
     assert set(described["paths"]) == ROUTES
     for path, methods in described["paths"].items():
-        assert set(methods) == {"put" if path.endswith("/enabled") else "get"}
+        changes = {"/enabled": "put", "/armed": "put", "/resend": "post"}
+        assert set(methods) == {next((change for end, change in changes.items() if path.endswith(end)), "get")}
         assert all(method["description"] for method in methods.values()), path
     parameters = {p["name"] for p in described["paths"]["/api/v1/events"]["get"]["parameters"]}
     assert parameters == {"since", "until", "zone", "min_confidence", "limit", "cursor"}

@@ -28,8 +28,9 @@ import scipy.fft
 
 from livessl.core.correlate.band import band_bins
 from livessl.core.correlate.decimation import Decimator, decimation
-from livessl.core.correlate.gcc_phat import CrossSpectra, LagSampling, microphone_pairs, uses_envelope
+from livessl.core.correlate.gcc_phat import CrossSpectra, LagSampling, uses_envelope
 from livessl.core.correlate.spectra import Spectra, fast_length
+from livessl.core.geometry import microphone_pairs
 from livessl.core.kernels import kernels
 from livessl.core.kernels.arguments import OnsetParameters, OnsetState
 from livessl.core.types import ArraySpec, ComplexArray, Float32Array, FloatArray, IntArray

@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, pair_weight
 from livessl.core.locate import refine
-from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
+from livessl.core.locate.srp import PairTerms, SRPFunctional
 from livessl.core.types import ArraySpec, Candidate, Evidence, FloatArray
 
 NEAR_M: Final = 0.5

@@ -26,9 +26,9 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
-from livessl.core.geometry import microphone_pairs
+from livessl.core.geometry import microphone_pairs, pair_weight
 from livessl.core.locate.confidence import array_power
-from livessl.core.locate.srp import PairTerms, pair_weight
+from livessl.core.locate.srp import PairTerms
 from livessl.core.types import ArraySpec, Evidence
 
 FALSE_ALARMS: Final = 1e-3

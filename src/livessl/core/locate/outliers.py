@@ -14,11 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.geometry import Grid, angle_deg
+from livessl.core.geometry import Grid, angle_deg, pair_weight
 from livessl.core.locate.confidence import NEAR_M, array_power, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
-from livessl.core.locate.srp import PairTerms, pair_weight
+from livessl.core.locate.srp import PairTerms
 from livessl.core.types import ArraySpec, Evidence, FloatArray, IntArray
 
 MAX_LOSS: Final = 0.8

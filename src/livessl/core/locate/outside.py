@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.geometry import Grid, angle_deg
+from livessl.core.geometry import Grid, angle_deg, pair_weight
 from livessl.core.locate import refine
 from livessl.core.locate.ambiguity import SAME_POWER
 from livessl.core.locate.confidence import CLEAR_PEAK_TO_RMS, NEAR_M, peak_to_rms
 from livessl.core.locate.place import Place
-from livessl.core.locate.srp import SRPFunctional, pair_weight
+from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Candidate, Evidence, FloatArray
 
 GAIN: Final = 0.1

@@ -15,14 +15,14 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.correlate.gcc_phat import LagSampling, microphone_pairs
+from livessl.core.correlate.gcc_phat import LagSampling
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, microphone_pairs, pair_weight
 from livessl.core.kernels import kernels
 from livessl.core.kernels.arguments import BLOCKS, NO_LAG, REACHES, RUNS, SearchBounds, SearchCells, SearchRows
 from livessl.core.locate.refine import FindPeaks, Peak, box_around, laplace_covariance_m2
 from livessl.core.locate.search_cubes import CELLS_PER_CUBE, search_cubes
-from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper, pair_weight
+from livessl.core.locate.srp import LagPlaces, SRPFunctional, SRPMapper
 from livessl.core.types import (
     GCC,
     ArraySpec,

@@ -10,9 +10,9 @@ from typing import Final, Protocol
 import numpy as np
 
 from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, pair_weight
 from livessl.core.kernels import kernels
-from livessl.core.locate.srp import PairTerms, SRPFunctional, pair_weight
+from livessl.core.locate.srp import PairTerms, SRPFunctional
 from livessl.core.types import BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 CANDIDATES: Final = 2

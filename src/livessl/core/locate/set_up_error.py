@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
-from livessl.core.geometry import microphone_pairs
-from livessl.core.locate.srp import pair_weight
+from livessl.core.geometry import microphone_pairs, pair_weight
 from livessl.core.types import ArraySpec, FloatArray
 
 _DELAY_M: Final = 0.003

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, pair_weight
 from livessl.core.kernels import kernels
 from livessl.core.kernels.arguments import SmoothRows
 from livessl.core.kernels.search_with_numpy import lag_places
@@ -100,11 +100,6 @@ class SRPMapper:
         power = np.zeros(self._table.shape[0], dtype=np.float32)
         self.add(power, *gccs)
         return power
-
-
-def pair_weight(microphones: int) -> float:
-    """Weight of a pair of an array of K microphones, 2/K: see the module's docstring."""
-    return 2.0 / microphones
 
 
 class SRPFunctional:

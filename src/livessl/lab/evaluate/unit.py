@@ -14,9 +14,9 @@ import pyarrow as pa
 import scipy.fft
 from scipy.signal import butter, sosfilt
 
-from livessl.core.correlate.gcc_phat import CrossSpectra, microphone_pairs
+from livessl.core.correlate.gcc_phat import CrossSpectra
 from livessl.core.correlate.spectra import FrontEnd, averaged, cepstral, whole_segment
-from livessl.core.geometry import Grid, direction_deg
+from livessl.core.geometry import Grid, direction_deg, microphone_pairs
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, IntArray
 from livessl.lab.evaluate.maps import PairMatrices, PairTables, reach_samples

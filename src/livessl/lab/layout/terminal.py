@@ -54,13 +54,13 @@ def floor_plan(site: Site) -> list[str]:
                 put(np.array([edge[0], along[1]]), "·")
     for index, spec in enumerate(site.specs):
         put(spec.centre_m, mark_of(index))
-    yield_rows = ["".join(row) for row in reversed(cells)]
+    drawn = ["".join(row) for row in reversed(cells)]
     left = len(f"{y:g}")
     return [
         f"{f'{y:g}':>{left}} ┌{'─' * columns}┐",
-        *(f"{'':>{left}} │{row}│" for row in yield_rows),
+        *(f"{'':>{left}} │{row}│" for row in drawn),
         f"{'0':>{left}} └{'─' * columns}┘",
-        f"{'':>{left}}  0{f'{x:g} m':>{columns - 1}}",
+        f"{'':>{left}}  0{f' {x:g} m':>{columns - 1}}",
     ]
 
 

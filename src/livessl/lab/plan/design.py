@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.correlate.gcc_phat import microphone_pairs
-from livessl.core.geometry import Grid
+from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, FloatArray
 from livessl.lab.plan import prediction

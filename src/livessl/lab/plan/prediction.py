@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import sici
 
-from livessl.core.correlate.gcc_phat import microphone_pairs
-from livessl.core.locate.srp import pair_weight
+from livessl.core.geometry import microphone_pairs, pair_weight
 from livessl.core.steering import delay_gradients_s_m
 from livessl.core.types import ArraySpec, FloatArray, IntArray
 

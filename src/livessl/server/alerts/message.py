@@ -48,7 +48,7 @@ class AlertMessages:
             **self._head(rule, event["id"], raised_ns),
             "time_utc": event["time_utc"],
             "text": _event_text(event, match.zones, count),
-            "link": f"{self._url}/api/v1/events/{event['id']}",
+            "link": f"{self._url}/#event={event['id']}",
             "zones": [zone["name"] for zone in zones],
             "membership": zones,
             "count": count,

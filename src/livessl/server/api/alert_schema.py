@@ -66,13 +66,15 @@ class Alert(BaseModel):
         description="What, where, and how sure, for people.",
         examples=["sound at (0.52, 0.61, 1.20) m, uncertain by 0.09 m, confidence 0.93"],
     )
-    link: str = Field(description="Address of the event, or of the dashboard.", examples=["http://127.0.0.1:8000/"])
+    link: str = Field(
+        description="Address of the event on the dashboard.", examples=["http://127.0.0.1:8000/#event=lab-1"]
+    )
     zones: list[str] = Field(description="Zones of the rule that it came from.", examples=[["door"]])
     membership: list[Membership] = Field(description="The same zones with their probabilities.")
     count: int = Field(ge=1, description="Events that the rule asks for within its span.", examples=[1])
     event: Event | None = Field(description="The event, the last one of several.")
-    array: AlertedArray | None
-    finding: AlertedFinding | None
+    array: AlertedArray | None = Field(description="The array, if the alert is about one.")
+    finding: AlertedFinding | None = Field(description="The finding, if the alert is about one.")
 
 
 class Delivery(BaseModel):
@@ -183,16 +185,16 @@ class Resent(_Versioned):
 class TriedAlert(BaseModel):
     """An event about which a rule would have alerted."""
 
-    event_id: str = Field(examples=["small-1767225600000-1"])
-    time_utc: UtcTime | None
+    event_id: str = Field(description="Id of the event.", examples=["small-1767225600000-1"])
+    time_utc: UtcTime | None = Field(description="When the sound began.")
 
 
 class Tried(_Versioned):
     """Result of a dry run: the alerts that an armed rule would have raised."""
 
     name: RuleName
-    since_utc: UtcTime
-    until_utc: UtcTime
+    since_utc: UtcTime = Field(description="Begin of the span that was tried.")
+    until_utc: UtcTime = Field(description="End of the span that was tried.")
     events: Count = Field(description="Stored events of that time that were tried.", examples=[512])
     matched: Count = Field(description="Events that meet the rule's condition.", examples=[20])
     alerts: Count = Field(description="Alerts that it would have raised.", examples=[14])

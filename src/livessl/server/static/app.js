@@ -68,6 +68,8 @@ let colours;
 const arrivedIds = new Set();
 let shownResult = null;
 let announcedAt = -Infinity;
+/** The part of the page's address whose event was selected last. */
+let linkedHash = "";
 let dirty = true;
 let frameRequested = false;
 
@@ -194,7 +196,20 @@ function loadEvents() {
     eventList.load(events, arrivedIds, model.serverNow());
     model.takeStored(events);
     header.showLatency(model.latencies);
+    await showLinked();
   });
+}
+
+/** Select the event that the page's address names, `#event=ID`, as the links in alerts do; once for each address. */
+async function showLinked() {
+  const { hash } = location;
+  const id = new URLSearchParams(hash.slice(1)).get("event");
+  if (id === null || hash === linkedHash) return;
+  linkedHash = hash;
+  const response = await get(new URL(`events/${encodeURIComponent(id)}`, API));
+  if (!response.ok) return; // it was deleted
+  const { v, ...event } = await response.json();
+  eventList.reveal(event, model.serverNow());
 }
 
 function loadAlerts() {
@@ -294,6 +309,7 @@ applyTheme();
 light.addEventListener("change", applyTheme);
 const sizes = new ResizeObserver(redraw);
 for (const plan of plans) sizes.observe(plan.canvas);
+addEventListener("hashchange", () => retrying(showLinked));
 onTokenNeeded(askForToken);
 find("token-form").addEventListener("submit", () => {
   useToken(find("token").value.trim());

@@ -46,12 +46,26 @@ export class EventList {
       row.root.classList.add("fresh");
       const rows = [...this.rows];
       const earlier = rows.findIndex(([, { event: other }]) => other.time_utc <= event.time_utc);
-      const place = event.late && earlier >= 0 ? earlier : 0;
-      rows.splice(place, 0, [event.id, row]);
-      this.list.insertBefore(row.root, rows[place + 1]?.[1].root ?? null);
-      this.rows = new Map(rows);
+      this.#insert(row, event.late && earlier >= 0 ? earlier : 0);
     }
     this.#trim();
+  }
+
+  /** Select an event; one that is older than the list is inserted by its time. */
+  reveal(event, nowMs) {
+    if (!this.rows.has(event.id)) {
+      const earlier = [...this.rows.values()].findIndex(({ event: other }) => other.time_utc <= event.time_utc);
+      this.#insert(this.#row(event, nowMs), earlier < 0 ? this.rows.size : earlier);
+      this.empty.hidden = true;
+    }
+    this.#select(event.id);
+  }
+
+  #insert(row, place) {
+    const rows = [...this.rows];
+    rows.splice(place, 0, [row.event.id, row]);
+    this.list.insertBefore(row.root, rows[place + 1]?.[1].root ?? null);
+    this.rows = new Map(rows);
   }
 
   #remove(id) {

@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import oaconvolve
 
-from livessl.core.correlate.gcc_phat import CrossSpectra, microphone_pairs
+from livessl.core.correlate.gcc_phat import CrossSpectra
 from livessl.core.correlate.spectra import whole_segment
+from livessl.core.geometry import microphone_pairs
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.lab.evaluate.figures.canvas import COLOURS, panels
 from livessl.lab.evaluate.maps import PairMatrices, reach_samples
