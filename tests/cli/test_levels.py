@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -142,6 +143,18 @@ def test_meter_waits_for_an_absent_interface_and_names_one_that_is_unplugged(int
 
 @pytest.mark.processes
 @pytest.mark.sound_card
+def test_fewer_inputs_than_the_arrays_have_are_metered(interfaces: Interfaces, tmp_path: Path) -> None:
+    interfaces.add(channels=18).play(hiss(1.0, 18, level=0.01))
+    site = write_site(tmp_path, {"nodes.lab-pc.device.sample_rate_hz": CARD_HZ})
+    with levels(interfaces, "--site", site, "--node", "lab-pc", "--inputs", 6, "--seconds", 1.5) as running:
+        assert running.ended() == 0
+    names = [("north", 1), ("north", 2), ("north", 3), ("north", 4), ("south", 1), ("south", 2)]
+    assert [(each["array"], each["microphone"]) for each in running.of("summary")] == names
+    assert {each["noise_dbfs"] is None for each in running.of("summary")} == {False}
+
+
+@pytest.mark.processes
+@pytest.mark.sound_card
 def test_busy_interface_is_named_and_the_command_fails_without_sound(interfaces: Interfaces) -> None:
     with interfaces.add().held(), levels(interfaces, "--device", "UMC1820", "--seconds", 0.5) as running:
         assert running.ended() == 1
@@ -149,6 +162,33 @@ def test_busy_interface_is_named_and_the_command_fails_without_sound(interfaces:
         assert "device 'UMC1820' delivered no sound" in running.process.stderr.read()
     assert "is busy: " in running.of("problem")[0]["message"]
     assert running.of("summary") == []
+
+
+@pytest.mark.processes
+@pytest.mark.sound_card
+def test_meter_on_a_terminal_is_drawn_until_sigterm(interfaces: Interfaces) -> None:
+    interfaces.add(channels=2).play(hiss(1.0, 2, level=0.01))
+    ours, theirs = os.openpty()
+    os.set_blocking(ours, False)
+    command = (sys.executable, "-m", "livessl", "levels", "--device", "UMC1820")
+    printed = ""
+
+    def drawn() -> bool:
+        nonlocal printed
+        with suppress(BlockingIOError):
+            printed += os.read(ours, 65536).decode()
+        return printed.count("Ctrl-C ends") >= 3 and "#" in printed
+
+    environment = {**interfaces.environment, "COLUMNS": "100", "LINES": "30"}
+    with started(*command, env=environment, stdout=theirs, stderr=subprocess.PIPE) as process:
+        wait_until(drawn, "three drawings")
+        process.terminate()
+        assert process.wait(HANG_S) == 0
+    drawn()
+    os.close(ours)
+    os.close(theirs)
+    assert "UMC1820, in all " in printed
+    assert "input " in printed
 
 
 def test_file_is_metered_at_once(run: Run, tmp_path: Path) -> None:
@@ -243,7 +283,10 @@ def test_table_on_a_terminal_is_redrawn_in_place(
     )
     assert shown[7] == "Ctrl-C ends"
     screen.problem("device 'UMC1820' was unplugged; waiting for it")
-    assert "was unplugged" in capsys.readouterr().out
+    gone = capsys.readouterr().out
+    assert "UMC1820, 2 s" in gone
+    assert "was unplugged" in gone
+    assert "north/1" not in gone
 
 
 def test_words_of_faults_fit_a_terminal_of_80_columns_and_bars_take_what_is_left() -> None:

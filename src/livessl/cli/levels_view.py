@@ -1,4 +1,4 @@
-"""How `livessl levels` shows what it measures: a table that is redrawn on a terminal, lines of text, or JSON."""
+"""The views of `livessl levels`: a table that is redrawn on a terminal, lines of text, or JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PLAIN: Final = "\x1b[0m"
 
 
 class View(Protocol):
-    """What the command shows its measurements with."""
+    """A means to show the measurements of the command."""
 
     def levels(self, time_s: float, levels: Sequence[InputLevel]) -> None:
         """Show the levels of the last second."""

@@ -54,7 +54,7 @@ _BESIDE_HZ: Final = (4.0, 15.0)
 
 @dataclass(frozen=True, slots=True)
 class ChannelFigures:
-    """What the samples of one channel say about it.
+    """The figures of one channel.
 
     Parameters
     ----------
