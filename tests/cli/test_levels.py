@@ -109,7 +109,7 @@ def test_known_sounds_of_an_interface_are_metered(interfaces: Interfaces, tmp_pa
     taps = running.of("tap")
     assert taps
     assert {(tap["input"], tap["array"], tap["microphone"]) for tap in taps} == {(8, "south", 4)}
-    assert len({each["time_s"] for each in running.of("levels")}) >= 4
+    assert len({each["time_s"] for each in running.of("levels")}) >= 3
     heard, rate_hz = soundfile.read(out, dtype="float32")
     assert rate_hz == CARD_HZ
     assert len(heard) == round(found[0]["time_s"] * CARD_HZ)
