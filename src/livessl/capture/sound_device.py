@@ -172,6 +172,11 @@ class SoundDevice:
         nothing = np.empty((self.channels, 0), dtype=np.float32)
         return Block(self._handed_index, nothing, self._clock.now_ns())
 
+    @property
+    def has_cause(self) -> bool:
+        """True once the device's process has reported, or has failed: `problem` then names the cause of silence."""
+        return self._reported or self.starts > 1
+
     def _handed(self, block: Block) -> Block:
         """Return a block of the process as one of the device: indices continue after a restart, gaps are marked."""
         first_index = self._base_index + block.first_index

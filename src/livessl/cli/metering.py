@@ -95,7 +95,7 @@ def meter_device(arguments: argparse.Namespace, site: Site | None) -> int:
                 if device.problem != problem:
                     problem = device.problem
                     view.problem(problem)
-                if problem is not None or block.samples.shape[1]:
+                if (problem is not None and device.has_cause) or block.samples.shape[1]:
                     limit.begin(sounds=bool(block.samples.shape[1]))
                 return limit.is_over
 
@@ -185,8 +185,10 @@ def _open_when_there(
                 if device.problem is not None and device.problem != told:
                     told = device.problem
                     view.problem(told)
+                has_cause = device.problem is not None and device.has_cause
+                if has_cause:
                     limit.begin(sounds=False)
-                if limit.is_over or block.samples.shape[1] or (told is not None and clock.monotonic_ns() >= end_ns):
+                if limit.is_over or block.samples.shape[1] or (has_cause and clock.monotonic_ns() >= end_ns):
                     break
     return None
 
