@@ -4,6 +4,7 @@
  *
  * A sample is a 24-bit word in S32_LE: 19 bits count the interface's samples since it was made, 5 bits are the channel.
  * The count goes on while nobody records, so what was lost can be counted.
+ * With a file "sound" in the folder, in S32_LE with the channels interleaved, that is repeated instead.
  *
  * Faults: the first word of the file "control" in the folder, read at every step.
  *     gone      unplugged: every call fails with ENODEV, also the opening
@@ -20,6 +21,7 @@
 #include <stdio.h>
 #include <string.h>
 #include <sys/file.h>
+#include <sys/stat.h>
 #include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
@@ -37,6 +39,8 @@ struct card {
     int64_t made_ns, start_ns; /* of the interface, and of the stream */
     uint64_t origin;           /* the count at the start of the stream */
     uint64_t produced;         /* samples since then */
+    int32_t *sound;            /* of the file; NULL for counts */
+    uint64_t sound_frames;
     long xruns, skips;         /* numbers of the last faults that were carried out */
 };
 
@@ -159,6 +163,8 @@ static snd_pcm_sframes_t on_transfer(snd_pcm_ioplug_t *plug, const snd_pcm_chann
         for (snd_pcm_uframes_t k = 0; k < size; k++, at += area->step / 8) {
             uint64_t count = card->origin + plug->appl_ptr + k;
             uint32_t word = (uint32_t)((count & 0x7FFFF) << 5 | (uint64_t)channel) << 8;
+            if (card->sound)
+                word = (uint32_t)card->sound[count % card->sound_frames * (uint64_t)card->channels + (uint64_t)channel];
             memcpy(at, &word, sizeof word);
         }
     }
@@ -194,6 +200,7 @@ static int on_close(snd_pcm_ioplug_t *plug)
     struct card *card = plug->private_data;
     close(card->timer);
     close(card->lock);
+    free(card->sound);
     free(card);
     return 0;
 }
@@ -223,6 +230,25 @@ static int64_t made_ns(struct card *card)
             close(fd);
     }
     return atoll(text);
+}
+
+static void load_sound(struct card *card)
+{
+    char path[450];
+    struct stat about;
+    snprintf(path, sizeof path, "%s/sound", card->folder);
+    int fd = open(path, O_RDONLY | O_CLOEXEC);
+    if (fd < 0)
+        return;
+    size_t frame = sizeof(int32_t) * (size_t)card->channels;
+    if (fstat(fd, &about) == 0 && (size_t)about.st_size >= frame) {
+        card->sound = malloc((size_t)about.st_size);
+        if (card->sound && read(fd, card->sound, (size_t)about.st_size) == (ssize_t)about.st_size)
+            card->sound_frames = (size_t)about.st_size / frame;
+        else
+            SNDERR("livessl: cannot read %s", path);
+    }
+    close(fd);
 }
 
 static int offer(struct card *card, const char *rates)
@@ -299,6 +325,7 @@ SND_PCM_PLUGIN_DEFINE_FUNC(livessl)
         error = -EBUSY;
     if (!error) {
         card->made_ns = made_ns(card);
+        load_sound(card);
         card->plug.version = SND_PCM_IOPLUG_VERSION;
         card->plug.name = "livessl's virtual audio interface";
         card->plug.poll_fd = card->timer;
@@ -310,6 +337,7 @@ SND_PCM_PLUGIN_DEFINE_FUNC(livessl)
     if (error < 0) {
         close(card->lock);
         close(card->timer);
+        free(card->sound);
         free(card);
         return error;
     }

@@ -111,6 +111,14 @@ def input_devices() -> list[InputDevice]:
         raise DeviceError(f"PortAudio cannot list the devices: {_reason(error)}; is a sound driver running?") from error
 
 
+def find_input(wanted: Wanted) -> InputDevice | None:
+    """Return the input that a stream of that device would be opened on; None if there is none, or several."""
+    try:
+        return _find(_inputs(library()), wanted)[1]
+    except OpeningError:
+        return None
+
+
 def rescan(sd: Any) -> None:
     """Restart PortAudio: only then does it detect devices that were connected after its start.
 

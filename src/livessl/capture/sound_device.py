@@ -103,7 +103,7 @@ class SoundDevice:
         self.starts = 0
         self.unflagged_gaps = 0
         self._block_s = config.block_s
-        self._wanted = _wanted(config, channels)
+        self._wanted = wanted_device(config, channels)
         self._clock = clock
         self._start = start
         self._output = NativeOutput()
@@ -171,6 +171,11 @@ class SoundDevice:
                 return self._handed(block)
         nothing = np.empty((self.channels, 0), dtype=np.float32)
         return Block(self._handed_index, nothing, self._clock.now_ns())
+
+    @property
+    def has_cause(self) -> bool:
+        """True once the device's process has reported, or has failed: `problem` then names the cause of silence."""
+        return self._reported or self.starts > 1
 
     def _handed(self, block: Block) -> Block:
         """Return a block of the process as one of the device: indices continue after a restart, gaps are marked."""
@@ -360,7 +365,8 @@ class _Run:
         self._flagged = self.process.flagged
 
 
-def _wanted(config: SoundDeviceConfig, channels: int) -> Wanted:
+def wanted_device(config: SoundDeviceConfig, channels: int) -> Wanted:
+    """Return what the process that owns the device is told of it."""
     block_samples = max(1, round(config.block_s * config.sample_rate_hz))
     slots = max(2, math.ceil(QUEUE_S * config.sample_rate_hz / block_samples)) + 1
     return Wanted(

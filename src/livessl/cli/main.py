@@ -82,6 +82,11 @@ COMMANDS: Final = (
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
     Command("config", "show the settings that are in effect", "livessl config show site.yaml"),
     Command("devices", "list the audio inputs of this machine", "livessl devices"),
+    Command(
+        "levels",
+        "show the level and faults of every input of an audio device, live",
+        "livessl levels --device UMC1820 --tap",
+    ),
 )
 """All commands, in the order in which the help lists them."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -38,6 +40,9 @@ HUM_DBFS: Final = -70.0
 NOISY_DB: Final = 10.0
 """Level of a channel's noise over its neighbours', in decibels, from which it is told."""
 
+SILENCE_DBFS: Final = -200.0
+"""Level that stands for digital silence, dB re full scale."""
+
 _WINDOW_S: Final = 1.0
 _FRAME_S: Final = 0.05
 _QUIET: Final = 20.0
@@ -45,6 +50,42 @@ _QUIET: Final = 20.0
 
 _LINE_HZ: Final = 1.5
 _BESIDE_HZ: Final = (4.0, 15.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelFigures:
+    """The figures of one channel.
+
+    Parameters
+    ----------
+    mean : float
+        Mean of the samples, full scale 1.
+    hum_hz : float or None
+        Frequency of the mains whose lines stand out, Hz; None if none do.
+    hum_dbfs : float or None
+        Level of these lines together, dB re full scale squared; None without hum.
+    noise_dbfs : float
+        Power about the mean in the quietest fifth of frames of 50 ms, dB re full scale squared.
+    roughness : float
+        Mean squared difference of neighbouring samples in these frames: noise with less weight on low frequencies.
+    """
+
+    mean: float
+    hum_hz: float | None
+    hum_dbfs: float | None
+    noise_dbfs: float
+    roughness: float
+
+
+def dbfs(power: float) -> float:
+    """Return a power in dB re full scale squared, so that a sine of full scale has -3; silence is `SILENCE_DBFS`."""
+    return max(SILENCE_DBFS, 10.0 * float(np.log10(max(power, 1e-30))))
+
+
+def noise_over_neighbours_db(figures: Sequence[ChannelFigures]) -> list[float]:
+    """Return how far the noise of each channel is above the median of all, in decibels."""
+    median = float(np.median([of.roughness for of in figures])) if figures else 0.0
+    return [10.0 * float(np.log10(max(of.roughness, 1e-20) / max(median, 1e-20))) for of in figures]
 
 
 class ChannelMeter:
@@ -55,22 +96,40 @@ class ChannelMeter:
     count : int
         Number of channels, K.
     sample_rate_hz : float
+    windows : int or None
+        Number of seconds, the last ones, that mean, hum and noise are taken from; None for all (for hum the last
+        `MOST_WINDOWS`).
+
+    Attributes
+    ----------
+    clipped : (K,) int64
+        Clipped samples of each channel so far.
+    windows : int
+        Whole windows of one second so far.
     """
 
-    def __init__(self, count: int, sample_rate_hz: float) -> None:
-        self._rate_hz = sample_rate_hz
+    def __init__(self, count: int, sample_rate_hz: float, windows: int | None = None) -> None:
         self._window = round(_WINDOW_S * sample_rate_hz)
         self._frame = round(_FRAME_S * sample_rate_hz)
         self._hann = np.hanning(self._window)
         self._low_bins = min(self._window // 2 + 1, round((HARMONICS * max(MAINS_HZ) + _BESIDE_HZ[1]) * _WINDOW_S) + 1)
-        self._low: list[FloatArray] = []  # spectrum of each window, up to the highest harmonic
-        self._windows = self._samples = 0
-        self._sum, self._clipped = np.zeros(count), np.zeros(count, dtype=np.int64)
-        self._quiet: list[FloatArray] = []
+        # spectrum of each window, up to the highest harmonic
+        self._low: deque[FloatArray] = deque(maxlen=min(windows or MOST_WINDOWS, MOST_WINDOWS))
+        self._means: deque[FloatArray] = deque(maxlen=windows)
+        self._rough: deque[FloatArray] = deque(maxlen=windows)
+        self._quiet: deque[FloatArray] = deque(maxlen=windows)
+        self._samples = 0
+        self._last_over = np.zeros((count, 1), dtype=np.bool_)
         self._rest: Float32Array = np.zeros((count, 0), dtype=np.float32)
+        self.windows = 0
+        self.clipped = np.zeros(count, dtype=np.int64)
 
     def push(self, samples: Float32Array) -> None:
         """Take in the next samples (K, n)."""
+        over = np.concatenate([self._last_over, np.abs(samples) >= CLIPPED], axis=1)
+        self.clipped += (over[:, 1:] & over[:, :-1]).sum(axis=1)
+        self._last_over = over[:, -1:]
+        self._samples += samples.shape[1]
         joined = np.concatenate([self._rest, samples], axis=1)
         whole = joined.shape[1] // self._window
         for index in range(whole):
@@ -78,40 +137,51 @@ class ChannelMeter:
         self._rest = joined[:, whole * self._window :].copy()
 
     def _take(self, window: Float32Array) -> None:
-        self._windows += 1
-        self._samples += window.shape[1]
-        self._sum += window.sum(axis=1, dtype=np.float64)
-        over = np.abs(window) >= CLIPPED
-        self._clipped += (over[:, 1:] & over[:, :-1]).sum(axis=1)
+        self.windows += 1
+        self._means.append(window.mean(axis=1, dtype=np.float64))
         centred = window - window.mean(axis=1, keepdims=True)
         spectrum = np.fft.rfft(centred * self._hann, axis=1)[:, : self._low_bins]
-        self._low = [*self._low[1 - MOST_WINDOWS :], np.abs(spectrum) ** 2]
+        self._low.append(np.abs(spectrum) ** 2)
         frames = window[:, : self._window // self._frame * self._frame].reshape(len(window), -1, self._frame)
-        powers = (np.diff(frames, axis=2).astype(np.float64) ** 2).mean(axis=2)
-        self._quiet.append(np.percentile(powers, _QUIET, axis=1))
+        rough = (np.diff(frames, axis=2).astype(np.float64) ** 2).mean(axis=2)
+        self._rough.append(np.percentile(rough, _QUIET, axis=1))
+        self._quiet.append(np.percentile(frames.var(axis=2, dtype=np.float64), _QUIET, axis=1))
+
+    def figures(self) -> tuple[ChannelFigures, ...]:
+        """Return the figures of each channel; nothing for less than a second of samples."""
+        if self.windows == 0:
+            return ()
+        mean, hum = np.mean(self._means, axis=0), self._hum_dbfs()
+        rough, quiet = np.median(self._rough, axis=0), np.median(self._quiet, axis=0)
+        return tuple(
+            ChannelFigures(
+                mean=float(mean[index]),
+                hum_hz=None if of_hum is None else of_hum[0],
+                hum_dbfs=None if of_hum is None else of_hum[1],
+                noise_dbfs=dbfs(quiet[index]),
+                roughness=float(rough[index]),
+            )
+            for index, of_hum in enumerate(hum)
+        )
 
     def faults(self, array: str) -> Iterator[Finding]:
         """Yield what is wrong with the channels of an array of that name; nothing for less than a second of samples."""
-        if self._windows == 0:
-            return
-        mean, hum = self._sum / self._samples, self._hum_dbfs()
-        floor = np.median(np.array(self._quiet), axis=0)
-        floor_db = 10.0 * np.log10(np.maximum(floor, 1e-20) / max(float(np.median(floor)), 1e-20))
-        for index in range(len(mean)):
+        figures = self.figures()
+        over_db = noise_over_neighbours_db(figures)
+        for index, of in enumerate(figures):
             where = f"channel {index + 1} of {array!r}"
-            if self._clipped[index] > MOST_CLIPPED:
-                share = self._clipped[index] / self._samples
-                what = f"{where} clips: {self._clipped[index]} samples, {100 * share:.2g} %"
+            if self.clipped[index] > MOST_CLIPPED:
+                share = self.clipped[index] / self._samples
+                what = f"{where} clips: {self.clipped[index]} samples, {100 * share:.2g} %"
                 yield _warning("clipping", array, index, what, "lower the gain of this input")
-            if abs(mean[index]) > MOST_CONSTANT:
-                what = f"{where} has a constant of {mean[index]:+.3f} of full scale"
+            if abs(of.mean) > MOST_CONSTANT:
+                what = f"{where} has a constant of {of.mean:+.3f} of full scale"
                 yield _warning("dc", array, index, what, "check the input and its microphone; a high-pass filter helps")
-            if (found := hum[index]) is not None:
-                mains_hz, dbfs = found
-                what = f"{where} hums at {mains_hz:.0f} Hz, {dbfs:.0f} dBFS"
+            if of.hum_hz is not None:
+                what = f"{where} hums at {of.hum_hz:.0f} Hz, {of.hum_dbfs:.0f} dBFS"
                 yield _warning("hum", array, index, what, "use balanced cables, and keep them away from mains cables")
-            if floor_db[index] > NOISY_DB:
-                what = f"{where} has {floor_db[index]:.0f} dB more noise than its neighbours"
+            if over_db[index] > NOISY_DB:
+                what = f"{where} has {over_db[index]:.0f} dB more noise than its neighbours"
                 yield _warning("noisy", array, index, what, "check its cable, microphone and gain")
 
     def _hum_dbfs(self) -> list[tuple[float, float] | None]:
