@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -50,6 +51,21 @@ def test_capture_imports_nothing_that_localizes() -> None:
     assert {"livessl.capture.node", "livessl.capture.link", "livessl.site.models"} <= names
     heavy = {"livessl.server", "livessl.simulation", "fastapi", "numba", "uvicorn"}
     assert names & (LOCALIZES | heavy | OTHER_COMMANDS | NEVER_LIVE) == set()
+
+
+def test_a_command_that_loads_blas_itself_lets_it_have_one_thread() -> None:
+    """A second thread waits in a loop, and the CPU time of `locate` grows by half."""
+    script = (
+        "import json, sys; from livessl.cli.main import main; early = 'numpy' in sys.modules; "
+        "main(['check', sys.argv[1]]); import numpy, scipy.linalg; from threadpoolctl import threadpool_info; "
+        "print(json.dumps([early, [pool['num_threads'] for pool in threadpool_info() if pool['user_api'] == 'blas']]))"
+    )
+    environment = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
+    done = subprocess.run([sys.executable, "-c", script, str(PAPER)], capture_output=True, check=True, env=environment)
+    early, threads = json.loads(done.stdout.splitlines()[-1])
+    assert not early  # otherwise it would be limited anyway
+    assert threads
+    assert set(threads) == {1}
 
 
 def test_serve_imports_nothing_of_other_commands(tmp_path: Path) -> None:

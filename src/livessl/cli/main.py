@@ -98,6 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2 means wrong use or an invalid configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by
     itself.
     """
+    # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
     given = sys.argv[1:] if arguments is None else arguments
     parsed = _parser(given).parse_args(given)
     from threadpoolctl import threadpool_limits
@@ -106,7 +108,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
     )
     try:
-        # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
         with sigterm_as_ctrl_c(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except UseError as error:
