@@ -80,6 +80,10 @@ SERVER = Report(DeviceState.OPEN)
             "to a longer time",
         ),
         (
+            Seen(OPEN, delivered=True, idle_s=9.0, beats=90, flagged=1, unflagged_s=8.9),
+            f"{UMC} stopped delivering sound; opening it again (over)",
+        ),
+        (
             Seen(Report(DeviceState.STOPPED), delivered=True),
             f"{UMC} has stopped; was it unplugged? Waiting for it (over)",
         ),

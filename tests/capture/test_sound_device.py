@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
 import time
@@ -112,6 +113,7 @@ def test_blocks_arrive_in_order_with_their_channels() -> None:
         ("os._exit(3)", "the process that reads device 'UMC' ended with code 3; it was started again"),
         ("os.kill(os.getpid(), 9)", "the process that reads device 'UMC' ended by signal 9; it was started again"),
         ("beat_for_ever()", "device 'UMC' stopped delivering sound; opening it again"),
+        ("ring.count_flagged(); beat_for_ever()", "device 'UMC' stopped delivering sound; opening it again"),
         ("report('stopped'); time.sleep(1000)", "device 'UMC' has stopped; was it unplugged? Waiting for it"),
         ("time.sleep(1000)", "the sound library of device 'UMC' hangs; it was started again"),
         (
@@ -132,6 +134,32 @@ def test_fault_is_reported_and_survived(fault: str, words: str) -> None:
             assert len(runs.started) == 2
             assert [block.first_index for block in blocks] == [160 * k for k in range(8)]
             assert [block.overflow for block in blocks] == [False] * 4 + [True] + [False] * 3
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.6])
+def test_blocks_before_the_end_of_the_process_are_kept_and_the_gap_comes_after_them(late_s: float) -> None:
+    """Also if the node reads them only when the process has ended."""
+    with device("report('open'); deliver(4); os._exit(3)", DELIVER) as (entered, _):
+        time.sleep(late_s)
+        blocks, _ = blocks_until(entered, lambda blocks: len(blocks) == 8)
+    assert [block.first_index for block in blocks] == [160 * k for k in range(8)]
+    assert [block.overflow for block in blocks] == [False] * 4 + [True] + [False] * 3
+
+
+def test_a_process_that_cannot_be_started_is_tried_again() -> None:
+    runs, refused = Runs(DELIVER), [OSError(errno.ENOMEM, "Cannot allocate memory")]
+
+    def start(wanted: Wanted) -> DeviceProcess:
+        if refused:
+            raise refused.pop()
+        return runs(wanted)
+
+    with SoundDevice(SoundDeviceConfig(name="UMC", sample_rate_hz=8000), 3, SystemClock(), start) as entered:
+        assert entered.problem is not None
+        assert "cannot be started: Cannot allocate memory; trying again" in entered.problem
+        blocks, problems = blocks_until(entered, lambda blocks: len(blocks) == 2)
+    assert problems[-1] is None
+    assert len(blocks) == 2
 
 
 @pytest.mark.parametrize(

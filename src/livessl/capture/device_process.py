@@ -49,7 +49,11 @@ class DeviceProcess:
     ) -> None:
         self._wanted = wanted
         self._ring = RingReader(wanted.ring)
-        self._reports_fd, report_fd = os.pipe()
+        try:
+            self._reports_fd, report_fd = os.pipe()
+        except OSError:
+            self._ring.close()
+            raise
         self._rest = b""
         fds = (self._ring.memory_fd, self._ring.published_fd, report_fd)
         try:
@@ -61,6 +65,10 @@ class DeviceProcess:
                 pass_fds=fds,
                 env=environment,
             )
+        except OSError:
+            self._ring.close()
+            os.close(self._reports_fd)
+            raise
         finally:
             os.close(report_fd)
         assert self._process.stdin is not None

@@ -58,6 +58,8 @@ class Seen:
         Time since the last sign of life, in seconds.
     flagged : int
         Blocks in that time that were dropped because the driver flagged a loss in them.
+    unflagged_s : float
+        Time since the last such block, in seconds.
     floods : int
         Number of looks in a row that found a flood of output.
     exit_code : int or None
@@ -71,6 +73,7 @@ class Seen:
     beats: int = 0
     silent_s: float = 0.0
     flagged: int = 0
+    unflagged_s: float = 0.0
     floods: int = 0
     exit_code: int | None = None
 
@@ -129,7 +132,7 @@ def _judge_stream(name: str, block_s: float, seen: Seen, *, is_hardware: bool) -
     first_s = FIRST_BLOCK_S if is_hardware else FIRST_BLOCK_OF_SERVER_S
     if seen.idle_s < block_s + (STALLED_S if seen.delivered else first_s):
         return None
-    if seen.flagged:
+    if seen.flagged and seen.unflagged_s < STALLED_S:
         return Verdict(
             f"device {name!r} loses sound in every block: this machine is too busy; stop other programs, or set "
             "device.latency_s to a longer time"

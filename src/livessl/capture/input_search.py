@@ -6,6 +6,7 @@ Each search also starts the library anew: only then does it list devices that we
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import asdict
@@ -35,15 +36,17 @@ def search_input(wanted: Wanted) -> InputDevice | None:
     command = [sys.executable, "-P", "-m", __name__, wanted.to_json()]
     try:
         done = subprocess.run(command, capture_output=True, timeout=SEARCH_S, check=True)  # noqa: S603  # our program
-    except (subprocess.TimeoutExpired, subprocess.CalledProcessError):
+        found = json.loads(done.stdout.splitlines()[-1])
+    except (subprocess.SubprocessError, OSError, ValueError, IndexError):
         return None
-    found = json.loads(done.stdout.splitlines()[-1])
     return None if found is None else InputDevice(**found)
 
 
 def _main() -> None:
     found = find_input(Wanted.from_json(sys.argv[1]))
-    sys.stdout.write("\n" + json.dumps(None if found is None else asdict(found)))
+    sys.stdout.write("\n" + json.dumps(None if found is None else asdict(found)) + "\n")
+    sys.stdout.flush()
+    os._exit(0)  # a library may hang at its end
 
 
 if __name__ == "__main__":

@@ -84,6 +84,10 @@ def library() -> Any:
             "sound devices need the PortAudio library, which is not on this machine; "
             "install PortAudio: apt install libportaudio2",
         ) from error
+    except Exception as error:  # the import starts PortAudio; the class of its errors is part of what failed to load
+        raise OpeningError(
+            DeviceState.FAILED, f"PortAudio cannot be started: {_reason(error)}; trying again"
+        ) from error
     return sounddevice
 
 

@@ -29,13 +29,20 @@ def request_realtime() -> str:
         Why it was refused; empty if it was granted.
     """
     try:
-        resource.setrlimit(resource.RLIMIT_RTTIME, (LONGEST_S * 1_000_000, LONGEST_S * 1_000_000))
+        resource.setrlimit(resource.RLIMIT_RTTIME, _limits_us())
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
-    except OSError as error:
-        return f"real-time scheduling: {error.strerror}"
+    except (OSError, ValueError) as error:
+        return f"real-time scheduling: {getattr(error, 'strerror', None) or error}"
     if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
         return "locked memory: its size is limited"
     library = ctypes.CDLL(None, use_errno=True)
     if library.mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT) != 0:
         return f"locked memory: {os.strerror(ctypes.get_errno())}"
     return ""
+
+
+def _limits_us() -> tuple[int, int]:
+    """Return the soft and the hard limit of processor time, in microseconds, within what the system permits."""
+    _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+    soft, hard = LONGEST_S * 1_000_000, 2 * LONGEST_S * 1_000_000  # beyond the hard limit the kernel kills at once
+    return (soft, hard) if most == resource.RLIM_INFINITY else (min(soft, most), min(hard, most))

@@ -168,7 +168,7 @@ class SoundDevice:
         else:
             block = self._step(run)
             if block is not None:
-                return self._handed(block)
+                return block
         nothing = np.empty((self.channels, 0), dtype=np.float32)
         return Block(self._handed_index, nothing, self._clock.now_ns())
 
@@ -198,15 +198,17 @@ class SoundDevice:
         return Block(first_index, block.samples, block.stamp_ns, overflow)
 
     def _step(self, run: _Run) -> Block | None:
-        """Wait for the process; return its next block, if there is one."""
+        """Wait for the process; return its next block, if there is one, as one of the device."""
         run.wait()
+        handed = None
         try:
             block = run.block()
+            if block is not None:
+                handed = self._handed(block)  # before the end of the process marks what comes after it as a gap
             self._look_after(run)
         except DamageError as error:
             self._damaged(run, error)
-            return None
-        return block
+        return handed
 
     def _damaged(self, run: _Run, error: DamageError) -> None:
         self.problem = f"the process that reads device {self.name!r} is damaged ({error}); it was started again"
@@ -227,7 +229,8 @@ class SoundDevice:
         verdict = judge(self.name, self._block_s, run.seen(delivered_before=self._delivered))
         if verdict is not None:
             self.problem = verdict.problem
-            if verdict.over:
+            run.process.wait(0.0)  # it may have published something just before its end
+            if verdict.over and not run.process.waiting:
                 self._give_up(run)
         elif run.delivers:
             self.problem = self._lag(run)
@@ -245,18 +248,21 @@ class SoundDevice:
 
     def _lag(self, run: _Run) -> str | None:
         """Return a problem while blocks were lost lately because this process did not read them in time."""
+        self._count_overruns(run)
         now_ns = self._clock.monotonic_ns()
-        lost = run.new_overruns()
-        if lost:
-            self.overruns += lost
-            self._lag_ns = now_ns
-            _log.warning("%d blocks of device %r were lost: this node did not read them in time", lost, self.name)
         if self._lag_ns is None or now_ns - self._lag_ns > LAG_SHOWN_NS:
             return None
         return (
             f"this machine lags: {self.overruns} blocks of device {self.name!r} were lost because the node did not "
             "read them in time; stop other programs"
         )
+
+    def _count_overruns(self, run: _Run) -> None:
+        lost = run.new_overruns()
+        if lost:
+            self.overruns += lost
+            self._lag_ns = self._clock.monotonic_ns()
+            _log.warning("%d blocks of device %r were lost: this node did not read them in time", lost, self.name)
 
     def _give_up(self, run: _Run) -> None:
         self._failures = 0 if run.report is not None else self._failures + 1
@@ -270,7 +276,13 @@ class SoundDevice:
         self._start_ns = self._clock.monotonic_ns()
         self.starts += 1
         self._base_index = self._handed_index
-        self._run = _Run(self._start(self._wanted), self._clock)
+        try:
+            self._run = _Run(self._start(self._wanted), self._clock)
+        except OSError as error:
+            self._failures += 1
+            self.problem = (
+                f"the process that reads device {self.name!r} cannot be started: {error.strerror}; trying again"
+            )
 
     def _wait_to_begin(self) -> None:
         """Start the process again as soon as `RESTART_S` has passed since its last start."""
@@ -284,6 +296,7 @@ class SoundDevice:
     def _end(self, *, kill: bool) -> None:
         run, self._run = self._run, None
         if run is not None:
+            self._count_overruns(run)
             self._output.feed(run.process.end(kill=kill), self._clock.monotonic_ns())
             self._lost = self._lost or self._delivered
 
@@ -298,7 +311,8 @@ class _Run:
         self._clock = clock
         self._idle_s = self._silent_s = 0.0
         self._beats = self._last_beats = process.beats
-        self._flagged = process.flagged
+        self._flagged = self._last_flagged = process.flagged
+        self._unflagged_s = 0.0
         self._overruns = 0
         self._floods = 0
         self._output_ns = clock.monotonic_ns()
@@ -312,6 +326,9 @@ class _Run:
         beats = self.process.beats
         self._silent_s = self._silent_s + waited_s if beats == self._last_beats else 0.0
         self._last_beats = beats
+        flagged = self.process.flagged
+        self._unflagged_s = self._unflagged_s + waited_s if flagged == self._last_flagged else 0.0
+        self._last_flagged = flagged
 
     def block(self) -> Block | None:
         """Return the next block; None if there is none."""
@@ -354,7 +371,8 @@ class _Run:
             idle_s=self._idle_s,
             beats=self._last_beats - self._beats,
             silent_s=self._silent_s,
-            flagged=self.process.flagged - self._flagged,
+            flagged=self._last_flagged - self._flagged,
+            unflagged_s=self._unflagged_s,
             floods=self._floods,
             exit_code=None if self.process.waiting else self.process.exit_code,
         )
@@ -362,7 +380,7 @@ class _Run:
     def _restart_idle(self) -> None:
         self._idle_s = 0.0
         self._beats = self._last_beats
-        self._flagged = self.process.flagged
+        self._flagged = self._last_flagged
 
 
 def wanted_device(config: SoundDeviceConfig, channels: int) -> Wanted:
