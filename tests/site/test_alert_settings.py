@@ -45,6 +45,13 @@ def action(**keys: Any) -> dict[str, Any]:
         (events(min_confidnce=1), "unknown key 'min_confidnce'; did you mean 'min_confidence'?"),
         (span(begin="25:00"), 'begin: expected a time of day from "00:00" to "24:00", got \'25:00\''),
         (span(begin="10:60"), "got '10:60'"),
+        (span(begin=8), 'expected a time of day from "00:00" to "24:00", got 8; write "08:00"'),
+        (span(end=22), 'got 22; write "22:00"'),
+        (span(end=59), "got 59"),
+        (
+            {"rules": {"x": {"events": {}, "actions": ["run", "run"]}}, "actions": RUN},
+            "expected each action once, got 'run' twice; remove one",
+        ),
         (span(begin="08:00", end="08:00"), "expected begin and end to differ"),
         (span(days=["monday"]), "expected 'mon', 'tue', 'wed', 'thu', 'fri', 'sat' or 'sun', got 'monday'"),
         ({"timezone": "Mars/Crater"}, "expected a time zone such as Europe/Berlin or UTC, got 'Mars/Crater'"),

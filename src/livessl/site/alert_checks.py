@@ -53,6 +53,9 @@ def alert_faults(site: Site) -> Iterator[Finding]:
                     f"expected one of alerts.actions, {', '.join(site.alerts.actions) or '(there are none)'}, got "
                     f"{action!r}; correct the name or add the action",
                 )
+        twice = next((action for action in rule.actions if rule.actions.count(action) > 1), None)
+        if twice is not None:
+            yield (*here, "actions"), f"expected each action once, got {twice!r} twice; remove one"
 
 
 def alert_warnings(site: Site) -> Iterator[str]:

@@ -34,10 +34,13 @@ def _not_empty(items: tuple[T, ...]) -> tuple[T, ...]:
 def _minutes(value: Any) -> int:
     """Return the minutes since midnight of a time of day.
 
-    YAML reads 22:00 without quotes as the number 1320, which is the same time in minutes.
+    YAML reads 22:00 without quotes as the number 1320, which is the same time in minutes. A number below 60 was meant
+    as an hour.
     """
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MINUTES_OF_DAY:
+    if isinstance(value, int) and not isinstance(value, bool) and 60 <= value <= MINUTES_OF_DAY:
         return value
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 24:
+        raise ValueError(f'expected a time of day from "00:00" to "24:00", got {value}; write "{value:02d}:00"')
     match = re.fullmatch(r"(\d{1,2}):(\d\d)", value) if isinstance(value, str) else None
     minutes = None if match is None else 60 * int(match[1]) + int(match[2])
     if match is None or minutes is None or int(match[2]) > 59 or minutes > MINUTES_OF_DAY:

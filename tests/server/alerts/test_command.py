@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,13 @@ def test_program_gets_the_alert_on_standard_input_and_in_its_environment(tmp_pat
     assert "LIVESSL_ALERT_RULE=door" in environment
     assert "LIVESSL_ALERT_TITLE=livessl small: door" in environment
     assert f"PWD={tmp_path}" in environment
+
+
+def test_a_program_may_leave_another_running(tmp_path: Path) -> None:
+    with running_desk(command_site(tmp_path, script(tmp_path, "sleep 300 & echo $! > left; exit 0"))) as desk:
+        desk.finish(sound(1))
+        wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+    os.kill(int((tmp_path / "left").read_text(encoding="utf-8")), signal.SIGKILL)
 
 
 def test_arguments_are_passed_without_a_shell(tmp_path: Path) -> None:

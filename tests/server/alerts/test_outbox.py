@@ -46,6 +46,12 @@ def test_an_alert_with_the_same_key_is_kept_once_and_delivered_once() -> None:
     assert raised().alert["key"] != raised(rule="window").alert["key"]
 
 
+def test_an_action_that_is_named_twice_is_done_once() -> None:
+    outbox = Outbox()
+    outbox.commit([raised(actions=("guard", "guard"))], {}, 10)
+    assert outbox.counts() == {("guard", "waiting"): 1}
+
+
 def test_nothing_is_kept_of_a_batch_that_fails() -> None:
     outbox = Outbox()
     broken = raised(1)

@@ -20,7 +20,7 @@ from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.lab.processes import free_port
 from livessl.server.alerts.courier import backoff_s
-from livessl.server.alerts.outbox import DeliveryState
+from livessl.server.alerts.outbox import DeliveryState, OutboxError
 from livessl.site.alert_models import AlertAction
 from livessl.site.models import Site
 from small_site import HANG_S, wait_until
@@ -52,6 +52,36 @@ def receiver() -> Iterator[Receiver]:
 
 def states(desk: Desk) -> dict[str, int]:
     return {state: count for (_, state), count in desk.alerts.outbox.counts().items()}
+
+
+def test_an_alert_that_has_arrived_is_not_sent_again_while_the_outbox_cannot_be_written(
+    tmp_path: Path, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("livessl.server.alerts.courier.REST_S", 0.01)
+    with running_desk(hook_site(tmp_path, receiver.url)) as desk:
+        refused: list[int] = []
+        note = desk.alerts.outbox.delivered
+
+        def full(number: int) -> None:
+            refused.append(number)
+            if len(refused) < 5:
+                raise OutboxError("the disk is full")
+            note(number)
+
+        monkeypatch.setattr(desk.alerts.outbox, "delivered", full)
+        desk.finish(sound(1))
+        wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+    assert len(refused) == 5
+    assert len(receiver.requests) == 1
+
+
+def test_an_error_that_nobody_expected_is_a_failed_attempt(tmp_path: Path) -> None:
+    """A host with an empty label is no host that can be looked up; the library's error is no error of the network."""
+    with running_desk(hook_site(tmp_path, "http://hooks..example.org/", attempts=1)) as desk:
+        desk.finish(sound(1))
+        wait_until(lambda: states(desk) == {"dead": 1}, "the dead letter")
+        [[delivery]] = desk.alerts.outbox.deliveries([key_of(sound(1))]).values()
+    assert "UnicodeError" in str(delivery.error)
 
 
 def test_alert_arrives_signed_and_says_what_when_where_and_how_sure(tmp_path: Path, receiver: Receiver) -> None:

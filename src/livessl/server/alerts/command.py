@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
-from typing import Final
+from tempfile import TemporaryFile
+from typing import IO, Final
 
 import orjson
 
 from livessl.server.alerts.actions import ActionSetting, DeliveryError
 from livessl.server.alerts.message import title
 from livessl.server.api.encode import JsonObject
+
+LAST_ERRORS: Final = 4096
+"""Last part of a program's error output, in bytes, in which its last line is looked for."""
 
 MAX_ERROR: Final = 300
 """Longest part of a program's last error output, in characters, that is kept as the reason of a failure."""
@@ -53,6 +57,18 @@ class Command:
             If it cannot be started, takes too long, or exits with another code.
         """
         about = {name: str(alert[name]) for name in ("key", "rule", "text", "link")} | {"title": title(alert)}
+        with TemporaryFile() as errors:  # a pipe would stay open as long as a program that this one leaves behind
+            code = await self._run(orjson.dumps(alert), about, errors)
+            if code == 0:
+                return
+            errors.seek(max(0, errors.seek(0, os.SEEK_END) - LAST_ERRORS))
+            lines = errors.read().decode(errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        why = f": {last[:MAX_ERROR]}" if last else ""
+        raise DeliveryError(f"{self._command[0]} exited with {code}, expected 0{why}")
+
+    async def _run(self, given: bytes, about: Mapping[str, str], errors: IO[bytes]) -> int | None:
+        """Run the program with something on its standard input; return its exit code."""
         environment = {**os.environ, **{f"LIVESSL_ALERT_{name.upper()}": value for name, value in about.items()}}
         try:
             process = await asyncio.create_subprocess_exec(
@@ -61,14 +77,14 @@ class Command:
                 env=environment,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.DEVNULL,
-                stderr=asyncio.subprocess.PIPE,
+                stderr=errors,
                 start_new_session=True,
             )
         except OSError as error:
             raise DeliveryError(f"cannot run {self._command[0]}: {error.strerror}") from error
         try:
             async with asyncio.timeout(self._timeout_s):
-                _, errors = await process.communicate(orjson.dumps(alert))
+                await process.communicate(given)
         except TimeoutError as error:
             raise DeliveryError(f"{self._command[0]} did not end within {self._timeout_s:g} s") from error
         finally:
@@ -76,8 +92,4 @@ class Command:
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 await process.wait()
-        if process.returncode != 0:
-            lines = errors.decode(errors="replace").split("\n")
-            last = next((line.strip() for line in reversed(lines) if line.strip()), "")
-            why = f": {last[:MAX_ERROR]}" if last else ""
-            raise DeliveryError(f"{self._command[0]} exited with {process.returncode}, expected 0{why}")
+        return process.returncode

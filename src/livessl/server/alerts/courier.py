@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import zlib
+from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.server.alerts.actions import Action, DeliveryError
 from livessl.server.alerts.outbox import Due, Outbox, OutboxError
+from livessl.server.api.encode import JsonObject
 from livessl.site.alert_models import AlertAction
 
 NS_PER_S: Final = 1_000_000_000
@@ -46,6 +49,7 @@ class Courier:
         self._outbox = outbox
         self._clock = clock
         self._news = asyncio.Event()
+        self._outcome: Callable[[], None] | None = None
         self.delivered = 0
         """Alerts that arrived since the start."""
         self.failed = 0
@@ -61,9 +65,10 @@ class Courier:
             while True:
                 self._news.clear()
                 try:
+                    self._note_outcome()
                     due = self._outbox.due(self.name, self._clock.now_ns(), self._longest_wait_ns)
                     if due is not None:
-                        await self._attempt(due)
+                        self._outcome = await self._attempt(due)
                         continue
                     wait_s = self._wait_s()
                 except OutboxError as error:
@@ -92,28 +97,44 @@ class Courier:
             return LOOK_S
         return min(LOOK_S, max(0.0, (next_ns - self._clock.now_ns()) / NS_PER_S))
 
-    async def _attempt(self, due: Due) -> None:
+    def _note_outcome(self) -> None:
+        """Note what has become of the last attempt, before there is another: it must not be made again in vain."""
+        if self._outcome is not None:
+            self._outcome()
+            self._outcome = None
+
+    async def _deliver(self, alert: JsonObject) -> None:
+        """Deliver an alert; a fault of the action that nobody expected is a failed attempt like any other."""
+        try:
+            await self._action.deliver(alert)
+        except DeliveryError:
+            raise
+        except Exception as error:
+            _log.exception("alerts.actions.%s: an unexpected error", self.name)
+            raise DeliveryError(f"{type(error).__name__}: {error}") from error
+
+    async def _attempt(self, due: Due) -> Callable[[], None]:
+        """Try to deliver an alert; return what notes the outcome in the outbox."""
         key, rule = due.alert["key"], due.alert["rule"]
         try:
-            await self._action.deliver(due.alert)
+            await self._deliver(due.alert)
         except DeliveryError as error:
             self.failed += 1
             attempts = due.attempts + 1
             if error.hopeless or attempts >= self._config.attempts:
-                self._outbox.failed(due.number, str(error), None)
                 _log.error(
                     "alerts.actions.%s: alert %s of rule %r was given up after %d attempts: %s; it can be sent again",
                     *(self.name, key, rule, attempts, error),
                 )
-                return
+                return partial(self._outbox.failed, due.number, str(error), None)
             asked_s = min(error.retry_after_s or 0.0, self._longest_wait_ns / NS_PER_S)
             wait_s = max(backoff_s(self._config, attempts, key), asked_s)
-            self._outbox.failed(due.number, str(error), self._clock.now_ns() + round(wait_s * NS_PER_S))
             level = logging.WARNING if attempts == 1 else logging.INFO
             _log.log(level, "alerts.actions.%s: %s; next attempt in %.0f s", self.name, error, wait_s)
-        else:
-            self.delivered += 1
-            self._outbox.delivered(due.number)
+            next_ns = self._clock.now_ns() + round(wait_s * NS_PER_S)
+            return partial(self._outbox.failed, due.number, str(error), next_ns)
+        self.delivered += 1
+        return partial(self._outbox.delivered, due.number)
 
 
 def backoff_s(config: AlertAction, attempts: int, key: str) -> float:

@@ -149,7 +149,7 @@ class Mqtt:
                     _log.info("%s: connected to %s:%d", self._setting.place, self._host, self._port)
                     wait_s = FIRST_WAIT_S
                     await self._until_disconnected(client, ready)
-            except self._aiomqtt.MqttError as error:
+            except Exception as error:  # noqa: BLE001  # libraries below raise others, too: for a host that is no name
                 if str(error) != self._problem:
                     _log.warning("%s: %s:%d: %s; trying again", self._setting.place, self._host, self._port, error)
                 self._problem = str(error)

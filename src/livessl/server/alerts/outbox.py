@@ -144,7 +144,7 @@ class Outbox:
                 if not added:
                     continue
                 new.append(alert)
-                for action in actions:
+                for action in dict.fromkeys(actions):
                     self._enqueue(db, alert["key"], action, now_ns)
             if new:
                 db.execute("DELETE FROM alerts WHERE number <= (SELECT max(number) FROM alerts) - ?", (MAX_ALERTS,))
