@@ -102,7 +102,7 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
 def _of_clocks(site: Site, events: Sequence[Event]) -> Iterator[Finding]:
     """Compare when the clocks of the nodes, or of arrays without a node, show the sounds."""
     starts_s: dict[str, list[float]] = {}
-    for event in events:
+    for event in (event for event in events if event.source == 1):
         for clock in {site.node_of(array) or array for array in event.heard_by}:
             starts_s.setdefault(clock, []).append(event.start_ns / 1e9)
     return find_clock_faults(starts_s)

@@ -44,7 +44,8 @@ def joined(arrays: Sequence[ArraySpec], clocks: Mapping[str, str], name: str) ->
         )
     microphones_m = np.ascontiguousarray(np.vstack([spec.microphones_m for spec in arrays]))  # sums depend on the order
     worst = Uncertainty(*np.max([astuple(spec.uncertainty) for spec in arrays], axis=0).tolist())
-    return ArraySpec(name, microphones_m, bands_hz.pop(), worst)
+    parts = tuple(len(spec.microphones_m) for spec in arrays)
+    return ArraySpec(name, microphones_m, bands_hz.pop(), worst, parts)
 
 
 def require_one_clock(name: str, clocks: Mapping[str, str | None]) -> None:

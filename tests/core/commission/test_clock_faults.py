@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,16 @@ def test_clocks_that_differ_are_named_with_the_difference(seed: int, off_s: floa
 def test_clocks_that_agree_are_not_named(seed: int, off_s: float, count: int) -> None:
     sounds_s = starts_s(seed, count)
     assert list(find_clock_faults({"hall-pc": sounds_s.tolist(), "lab-pc": (sounds_s + off_s).tolist()})) == []
+
+
+def test_a_long_session_takes_little_memory_and_its_sounds_are_counted_once() -> None:
+    sounds_s = np.cumsum(0.3 + np.random.default_rng(1).exponential(1.5, 20_000))
+    tracemalloc.start()
+    [finding] = find_clock_faults({"hall-pc": sounds_s.tolist(), "lab-pc": (sounds_s + 1.0).tolist()})
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100e6
+    assert "20000 sounds come again" in finding.message
 
 
 @given(seed=st.integers(0, 10_000), one=st.integers(0, 12), other=st.integers(0, 12))

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from free_field import BAND_HZ, C_M_S, tetra, true_lags_s
 from livessl.core.geometry import posed
+from livessl.core.joint_array import joined
 from livessl.core.locate.set_up_error import set_up_covariance_m2
 from livessl.core.types import ArraySpec, FloatArray, Uncertainty
 
@@ -81,6 +82,32 @@ def test_errors_are_as_large_as_predicted(
     assert np.trace(measured_m2) == pytest.approx(np.trace(predicted_m2), rel=0.45)
     inside = np.einsum("ni,ij,nj->n", errors, np.linalg.pinv(predicted_m2, rcond=1e-6, hermitian=True), errors)
     assert np.mean(inside <= 6.25) > 0.75
+
+
+@pytest.mark.parametrize("source_m", [[4.0, 6.0, 1.2], [3.0, 4.0, 2.0]])
+def test_members_of_a_joint_array_stand_on_frames_of_their_own(source_m: list[float]) -> None:
+    """Otherwise their distance, which decides how far the source is, would be exact."""
+    members = [
+        known_to(tetra(str(n), at_m, 0.2), 0.02, 1.5) for n, at_m in enumerate(([2.0, 2.0, 1.2], [6.0, 2.0, 1.2]))
+    ]
+    joint = joined(members, {"0": "node", "1": "node"}, "both")
+    at_m, rng = np.array(source_m), np.random.default_rng(3)
+    errors = []
+    for _ in range(200):
+        placed_m = []
+        for spec in members:
+            turn = Rotation.from_rotvec(1.5 * rng.standard_normal(3), degrees=True).as_matrix()
+            shifted_m = spec.centre_m + 0.02 * rng.standard_normal(3)
+            placed_m.append((spec.microphones_m - spec.centre_m) @ turn.T + shifted_m)
+        errors.append(found_m([joint], [true_lags_s(np.vstack(placed_m), at_m)], at_m) - at_m)
+    predicted_m = np.sqrt(np.diag(set_up_covariance_m2([joint], at_m, ALL)))
+    assert np.sqrt(np.mean(np.square(errors), axis=0)) == pytest.approx(predicted_m, rel=0.35)
+
+
+def test_an_array_around_the_source_shifts_it_as_far_as_itself() -> None:
+    spec = known_to(tetra("north", [1.0, 1.0, 1.5], 0.2), 0.02)
+    std_m = np.sqrt(np.diag(set_up_covariance_m2([spec], spec.centre_m, ALL)))
+    assert std_m == pytest.approx(0.02, rel=0.1)
 
 
 def test_one_array_knows_directions_as_well_as_its_own_orientation() -> None:

@@ -1130,3 +1130,16 @@ def test_updates_hold_a_second_source_where_the_site_asks_for_it() -> None:
     (other,) = update.others
     np.testing.assert_array_equal(other.position_m, OTHER_M)
     assert {output.id for output in outputs if isinstance(output, Track)} == {1, 2}
+
+
+@pytest.mark.parametrize(("position", "variance"), [(1.0, np.nan), (np.nan, 0.01), (1.0, np.inf)])
+def test_an_answer_that_is_not_finite_is_refused(position: float, variance: float) -> None:
+    class Odd(Scripted):
+        def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+            found = super().locate(sounds)
+            return replace(found, position_m=np.full(3, position), covariance_m2=np.full((3, 3), variance))
+
+    arrivals = node("north", range(10, 16), range(50)) + node("south", range(10, 16), range(50))
+    event = only_event(play(fusion_of(Odd(), updates=True), arrivals, 50))
+    assert event.status is Status.REFUSED
+    assert event.reason == "method 'scripted' answered with a position or covariance that is not finite"

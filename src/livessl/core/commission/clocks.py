@@ -61,14 +61,25 @@ def _difference(one_s: FloatArray, other_s: FloatArray) -> tuple[float, int] | N
     fewer = min(len(one_s), len(other_s))
     if fewer < LEAST_MATCHES:
         return None
-    later_s = np.sort((other_s[None, :] - one_s[:, None]).ravel())
-    later_s = later_s[np.abs(later_s) <= MOST_OFF_S]
+    begin, end = (np.searchsorted(other_s, one_s + reach_s) for reach_s in (-MOST_OFF_S, MOST_OFF_S))
+    later_s = np.sort(np.concatenate([other_s[i:k] - at_s for at_s, i, k in zip(one_s, begin, end, strict=True)]))
     counts = np.searchsorted(later_s, later_s + SAME_S, side="right") - np.arange(len(later_s))
-    if not len(counts) or (matches := int(counts.max())) < max(LEAST_MATCHES, LEAST_SHARE * fewer):
+    if not len(counts):
         return None
-    first = int(counts.argmax())
-    off_s = float(np.median(later_s[first : first + matches]))
+    first, most = int(counts.argmax()), int(counts.max())
+    off_s = float(np.median(later_s[first : first + most]))
+    matches = _matches(one_s, other_s - off_s)
     rivals = counts[np.abs(later_s - off_s) > 2.0 * SAME_S]
-    if abs(off_s) < LEAST_OFF_S or rivals.max(initial=0) > MOST_RIVAL * matches:
+    if matches < max(LEAST_MATCHES, LEAST_SHARE * fewer) or abs(off_s) < LEAST_OFF_S:
         return None
-    return off_s, matches
+    return None if rivals.max(initial=0) > MOST_RIVAL * most else (off_s, matches)
+
+
+def _matches(one_s: FloatArray, other_s: FloatArray) -> int:
+    """Return how many sounds have one of the other clock, at most as many as those have of this one."""
+
+    def with_another(these_s: FloatArray, those_s: FloatArray) -> int:
+        near = np.searchsorted(those_s, these_s + SAME_S / 2.0) - np.searchsorted(those_s, these_s - SAME_S / 2.0)
+        return int(np.count_nonzero(near))
+
+    return min(with_another(one_s, other_s), with_another(other_s, one_s))

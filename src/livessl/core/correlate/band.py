@@ -72,6 +72,6 @@ def dead_channels(segments: Sequence[Float32Array]) -> BoolArray:
     Channels are compared with the second loudest, because the loudest may be broken and crackle. In silence, and with
     sound on one channel alone, none is called dead. A constant offset does not count as sound.
     """
-    powers = [np.einsum("kn,kn->k", each, each) - each.shape[1] * each.mean(axis=1) ** 2 for each in segments]
-    power = np.sum(powers, axis=0, dtype=np.float64)
+    centred = [each - each.mean(axis=1, keepdims=True) for each in segments]  # the difference of squares would cancel
+    power = np.sum([np.einsum("kn,kn->k", each, each) for each in centred], axis=0, dtype=np.float64)
     return np.asarray(power < DEAD * np.sort(power)[-2])

@@ -1,8 +1,9 @@
 """The part of a position's error that comes from the set-up: arrays that stand or point elsewhere than the site says.
 
-Each array's delays tell a place relative to the array. An array that is shifted and turned tells another place, off by
-d_a; of the places that the arrays tell, the position is the mean, weighted with what each array knows of it:
-dp = (sum I_a)^-1 sum I_a d_a, I_a the information of its delays. A wrong speed of sound scales all delays alike.
+The position is where the delays fit best: a displacement d_m of microphone m moves it by
+dp = (sum g g^T / s^2)^-1 sum_m G_m d_m, g the slopes of the path differences with the position, and G_m the pull of
+that microphone. The microphones of one frame are displaced together, by a shift and a turn of the frame. A wrong speed
+of sound scales all path differences alike.
 This error is the same for all sounds from one place, so it says nothing about how positions scatter.
 """
 
@@ -38,20 +39,23 @@ def set_up_covariance_m2(arrays: Sequence[ArraySpec], position_m: FloatArray, ax
     axes : sequence of int
         Axes along which the position was searched for; along the others it has no error.
     """
-    to_m = [position_m - spec.centre_m for spec in arrays]
-    farthest_m = max(float(np.linalg.norm(each)) for each in to_m)
-    information, spread, by_speed = np.eye(3) / max(farthest_m, 1e-3) ** 2, np.zeros((3, 3)), np.zeros(3)
+    distances_m = [float(np.linalg.norm(position_m - spec.centre_m)) for spec in arrays]
+    unknown_m = max(*distances_m, *(spec.aperture_m for spec in arrays))
+    information, spread, by_speed = np.eye(3) / unknown_m**2, np.zeros((3, 3)), np.zeros(3)
     bandwidths = np.array([mean_square_angular_frequency(spec.band_hz) for spec in arrays])
-    for spec, offset_m, share in zip(arrays, to_m, bandwidths / bandwidths.mean(), strict=True):
-        own, late_m = _slopes(spec, position_m)
-        weight = pair_weight(len(spec.microphones_m)) * share / _DELAY_M**2
-        of_array = weight * own.T @ own
-        across = offset_m @ offset_m * np.eye(3) - np.outer(offset_m, offset_m)
-        known = spec.uncertainty
-        moved_m2 = known.position_m**2 * np.eye(3) + np.radians(known.orientation_deg) ** 2 * across
-        information += of_array
-        spread += of_array @ moved_m2 @ of_array
-        by_speed += weight * own.T @ late_m
+    for spec, share in zip(arrays, bandwidths / bandwidths.mean(), strict=True):
+        from_m = position_m - spec.microphones_m
+        distance_m = np.maximum(np.linalg.norm(from_m, axis=1), 1e-3)
+        toward = from_m / distance_m[:, None]
+        first, second = microphone_pairs(len(distance_m)).T
+        slopes = toward[second] - toward[first]
+        weighted = pair_weight(len(distance_m)) * share / _DELAY_M**2 * slopes
+        information += weighted.T @ slopes
+        by_speed += weighted.T @ (distance_m[second] - distance_m[first])
+        pulls = np.zeros_like(toward)  # sum over the pairs of a microphone, with its sign in each
+        np.add.at(pulls, second, weighted)
+        np.subtract.at(pulls, first, weighted)
+        spread += _by_frames(spec, pulls[:, :, None] * toward[:, None, :])
     speed_share = max(spec.uncertainty.temperature_c for spec in arrays) / (2.0 * _KELVIN)
     spread += speed_share**2 * np.outer(by_speed, by_speed)
     free = np.ix_(list(axes), list(axes))
@@ -61,10 +65,14 @@ def set_up_covariance_m2(arrays: Sequence[ArraySpec], position_m: FloatArray, ax
     return covariance_m2
 
 
-def _slopes(spec: ArraySpec, position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how the path differences of an array's pairs change with the position (P, 3), and the differences (P,)."""
-    from_m = position_m - spec.microphones_m
-    distance_m = np.maximum(np.linalg.norm(from_m, axis=1), 1e-3)
-    first, second = microphone_pairs(len(spec.microphones_m)).T
-    toward = from_m / distance_m[:, None]
-    return toward[second] - toward[first], distance_m[second] - distance_m[first]
+def _by_frames(spec: ArraySpec, pulls: FloatArray) -> FloatArray:
+    """Return what shifts and turns of an array's frames add to the spread (3, 3); `pulls` (K, 3, 3) of microphones."""
+    known, spread, begin = spec.uncertainty, np.zeros((3, 3)), 0
+    for count in spec.parts or (len(pulls),):
+        own = slice(begin, begin + count)
+        arm_m = spec.microphones_m[own] - spec.microphones_m[own].mean(axis=0)
+        shift = pulls[own].sum(axis=0)
+        turn = np.einsum("mab,mbc->ac", pulls[own], np.cross(np.eye(3)[None], arm_m[:, None, :]).swapaxes(1, 2))
+        spread += known.position_m**2 * shift @ shift.T + np.radians(known.orientation_deg) ** 2 * turn @ turn.T
+        begin += count
+    return spread

@@ -123,7 +123,7 @@ class Verdicts:
         first = self._refused(event, excerpt, now_ns, _joined(few, faults))
         if len(used.sounds) < least:
             return Verdict([replace(first, received=self._received(None, received, faults))], None)
-        found = self._state.estimator.locate(used.sounds)
+        found = self._located(used)
         estimate = self._estimate(found, used)
         status, reason = self._judged(estimate, found)
         heard = self._received(found, received, faults)
@@ -184,7 +184,7 @@ class Verdicts:
 
     def locate_window(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
         """Locate a window of an event that goes on; return the update, and the location that it was made from."""
-        found = self._state.estimator.locate(excerpt.sounds)
+        found = self._located(excerpt)
         estimate = self._estimate(found, excerpt)
         status, _ = self._judged(estimate, found)
         return Update(
@@ -205,6 +205,22 @@ class Verdicts:
     def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Localization, ...]:
         """Return those further sources of the same sound that are positions."""
         return tuple(o for o in found.others if self._judged(self._estimate(o, excerpt), o)[0] is Status.LOCATED)
+
+    def _located(self, excerpt: Excerpt) -> Localization:
+        """Locate, and refuse an answer of numbers that are none, as methods of others may give."""
+        estimator = self._state.estimator
+        found = estimator.locate(excerpt.sounds)
+        if np.isfinite(found.position_m).all() and np.isfinite(found.covariance_m2).all():
+            return found
+        return replace(
+            found,
+            position_m=np.where(np.isfinite(found.position_m), found.position_m, 0.0),
+            covariance_m2=np.zeros((3, 3)),
+            refused=f"method {estimator.name!r} answered with a position or covariance that is not finite",
+            others=(),
+            candidates=(),
+            ambiguity=None,
+        )
 
     def _estimate(self, found: Localization, excerpt: Excerpt) -> Estimate:
         arrays = _used(found, excerpt.sounds)

@@ -243,17 +243,20 @@ class ArraySpec:
         Lowest and highest frequency used.
     uncertainty : Uncertainty
         How well its set-up is known.
+    parts : tuple of int
+        Numbers of microphones that stand on one frame each, in the order of the channels; empty if all do.
 
     Raises
     ------
     ValueError
-        If the number of microphones or the band is out of range.
+        If the number of microphones or the band is out of range, or the parts are not all microphones.
     """
 
     name: str
     microphones_m: FloatArray
     band_hz: tuple[float, float]
     uncertainty: Uncertainty = Uncertainty()
+    parts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         count, *rest = self.microphones_m.shape
@@ -265,6 +268,8 @@ class ArraySpec:
         low, high = self.band_hz
         if not 0 <= low < high:
             raise ValueError(f"array {self.name!r}: expected a band 0 <= low < high in Hz, got {self.band_hz}")
+        if self.parts and sum(self.parts) != count:
+            raise ValueError(f"array {self.name!r}: expected parts of {count} microphones in all, got {self.parts}")
         read_only(self.microphones_m)
 
     @property
