@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 import yaml
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from browser import visit
+from browser import INTERFACES_CHANGED, visit
 from conftest import require
 from livessl.clock import utc_text
 from livessl.lab import demo
@@ -77,6 +77,11 @@ class LiveRun:
     javascript_client: list[list[Any]] = field(default_factory=list)
     curl_clients: dict[str, str] = field(default_factory=dict)
     after_the_end: str = ""
+
+    def note_error(self, message: ConsoleMessage) -> None:
+        """Note what the browser's console calls an error, but for interfaces that tests of cables take away."""
+        if message.type == "error" and INTERFACES_CHANGED not in message.text:
+            self.problems.append(message.text)
 
     @property
     def events(self) -> list[dict[str, Any]]:
@@ -163,7 +168,7 @@ def browser_page(session: Session, seen: LiveRun) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET_BROWSER)
         page = browser.new_page(viewport={"width": 1440, "height": 900})
-        page.on("console", lambda message: seen.problems.append(message.text) if message.type == "error" else None)
+        page.on("console", seen.note_error)
         page.on("pageerror", lambda error: seen.problems.append(str(error)))
         visit(page, session.url)
         start_javascript_client(page, session)
