@@ -75,12 +75,14 @@ def distances_m(events: Sequence[Event]) -> list[float]:
 
 
 def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
-    """Return all fields of an event as exact values."""
+    """Return all fields of an event as exact values; the covariance is rounded and without the set-up."""
     told: list[tuple[Any, ...]] = []
     for event in events:
         assert event.estimate is not None
         estimate = event.estimate
-        bits = (estimate.position_m.tobytes(), estimate.covariance_m2.tobytes(), estimate.confidence)
+        # the frames of joint arrays may be off each by itself, those of one array only together
+        covariance_m2 = np.round(estimate.sound_covariance_m2, 12) + 0.0
+        bits = (estimate.position_m.tobytes(), covariance_m2.tobytes(), estimate.confidence)
         told.append((*bits, replace(event, estimate=None)))
     return told
 

@@ -50,6 +50,10 @@ def test_no_span_is_always_and_several_add_up() -> None:
     assert [is_open(both, ns(f"2026-11-27T{hour}:30"), ZONE) for hour in ("08", "12", "23")] == [True, False, True]
 
 
+def clock(minutes: int) -> str:
+    return f"{minutes // 60:02d}:{minutes % 60:02d}"
+
+
 @given(
     begin=st.integers(0, 1439),
     length=st.integers(1, 1439),
@@ -60,7 +64,7 @@ def test_open_for_its_length_from_the_begin_of_each_of_its_days(
     begin: int, length: int, days: set[str], minute: int
 ) -> None:
     end = (begin + length) % 1440
-    span = ScheduleSpan(days=tuple(days), begin=begin, end=end or 1440)
+    span = ScheduleSpan(days=tuple(days), begin=clock(begin), end=clock(end or 1440))
     monday = datetime(2026, 11, 23, tzinfo=UTC)
     now_ns = round((monday + timedelta(minutes=minute)).timestamp()) * 10**9
     starts = [1440 * (DAYS.index(day) + 7 * week) + begin for day in days for week in (-1, 0)]
