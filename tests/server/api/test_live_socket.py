@@ -6,6 +6,7 @@ import json
 import re
 from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 import httpx
 import pytest
@@ -108,7 +109,9 @@ def test_stages_of_the_latency_add_up() -> None:
     """With one clock every stage is positive, and their sum is at most the delay that the client sees."""
     with running_server(site_of()) as server, live(server, "?kinds=event,update") as socket:
         capture_scene(server)
-        messages = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(8)]
+        messages: list[dict[str, Any]] = []
+        while sum(message["kind"] == "event" for message in messages) < 2:  # a busy machine leaves out some updates
+            messages.append(json.loads(socket.recv(timeout=HANG_S)))
         now_ns = CLOCK.now_ns()
         metrics = httpx.get(f"{server.url}/metrics").text
     answers = [message for message in messages if message["kind"] in ("event", "update")]
