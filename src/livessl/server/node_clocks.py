@@ -1,4 +1,4 @@
-"""How far the nodes' clocks are behind the server's, from the times at which their messages were sent and received.
+"""Measures how far nodes' clocks are behind the server's, from when their messages were sent and received.
 
 A message that was sent by a clock that is behind seems to have taken that long. A real delay varies, so the least one
 of some seconds is taken; it is the clock's, or that of a network which never is faster.

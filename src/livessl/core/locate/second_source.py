@@ -246,7 +246,7 @@ class SecondSourceSearch:
         return TwoSources(first, second, features)
 
     def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, SecondSourceFeatures]:
-        """Most likely other place once the source at `place` is removed, and what shows whether it is a source.
+        """Return the most likely other place with the source at `place` removed, and what shows whether it is a source.
 
         Of the candidates with the highest power, the one with the highest product of power and prominence wins.
         """

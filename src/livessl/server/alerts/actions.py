@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import ssl
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
+from importlib import import_module
 from pkgutil import resolve_name
-from typing import Final, Protocol, TypeVar, cast
+from typing import Any, Final, Protocol, TypeVar, cast
 
 from livessl.clock import Clock
+from livessl.errors import ConfigError, Fault
 from livessl.server.api.encode import JsonObject
 from livessl.site.alert_models import AlertAction
 from livessl.site.models import Site
@@ -95,6 +98,43 @@ class ActionSetting:
     def place(self) -> str:
         """Place of its settings in the site file."""
         return f"alerts.actions.{self.name}.{self.config.kind}"
+
+
+def optional_library(setting: ActionSetting, name: str) -> Any:
+    """Return a module of the extra `alerts` that an action needs.
+
+    Raises
+    ------
+    ConfigError
+        If it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        what = f"needs the package {name}; pip install 'livessl[alerts]'"
+        raise ConfigError([Fault(setting.place, what)]) from error
+
+
+def client_tls(setting: ActionSetting, certificates: str | None) -> ssl.SSLContext:
+    """Return what an action needs to connect by TLS.
+
+    Parameters
+    ----------
+    setting : ActionSetting
+    certificates : str or None
+        PEM file of the authorities to trust, as the site file names it; None for those of the system.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read.
+    """
+    file = None if certificates is None else setting.site.file(certificates)
+    try:
+        return ssl.create_default_context(cafile=file)
+    except (OSError, ssl.SSLError) as error:
+        what = f"cannot read certificates from {file}: {error}; name a PEM file"
+        raise ConfigError([Fault(f"{setting.place}.ca", what)]) from error
 
 
 def make_action(setting: ActionSetting) -> Action:

@@ -104,7 +104,7 @@ class Courier:
             self._outcome = None
 
     async def _deliver(self, alert: JsonObject) -> None:
-        """Deliver an alert; a fault of the action that nobody expected is a failed attempt like any other."""
+        """Deliver an alert; an unexpected fault of the action is a failed attempt like any other."""
         try:
             await self._action.deliver(alert)
         except DeliveryError:

@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import logging
 import re
-import ssl
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final
@@ -14,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import orjson
 
 from livessl import __version__
-from livessl.errors import ConfigError, Fault
-from livessl.server.alerts.actions import ActionSetting, DeliveryError
+from livessl.server.alerts.actions import ActionSetting, DeliveryError, client_tls, optional_library
 from livessl.server.api.encode import JsonObject
 from livessl.site.secret_files import read_secret
 
@@ -55,12 +53,7 @@ class Mqtt:
     def __init__(self, setting: ActionSetting) -> None:
         config = setting.config.mqtt
         assert config is not None
-        try:
-            import aiomqtt
-        except ImportError as error:
-            what = "needs the package aiomqtt; pip install 'livessl[alerts]'"
-            raise ConfigError([Fault(setting.place, what)]) from error
-        self._aiomqtt = aiomqtt
+        self._aiomqtt = optional_library(setting, "aiomqtt")
         self._setting = setting
         self._discovery = config.discovery
         self._topic = config.topic or f"livessl/{setting.site.site}"
@@ -70,14 +63,7 @@ class Mqtt:
         self._password = None
         if config.password is not None:
             self._password = read_secret(setting.site.file(config.password), "write the password into it").strip()
-        self._tls = None
-        if config.tls:
-            ca = None if config.ca is None else setting.site.file(config.ca)
-            try:
-                self._tls = ssl.create_default_context(cafile=ca)
-            except (OSError, ssl.SSLError) as error:
-                what = f"cannot read certificates from {ca}: {error}; name a PEM file"
-                raise ConfigError([Fault(f"{setting.place}.ca", what)]) from error
+        self._tls = client_tls(setting, config.ca) if config.tls else None
         self._client: aiomqtt.Client | None = None
         self._problem = "not connected yet"
 
@@ -157,7 +143,7 @@ class Mqtt:
             wait_s = min(2.0 * wait_s, LONGEST_WAIT_S)
 
     def _new_client(self) -> aiomqtt.Client:
-        return self._aiomqtt.Client(
+        client: aiomqtt.Client = self._aiomqtt.Client(
             self._host,
             self._port,
             username=self._username,
@@ -166,6 +152,7 @@ class Mqtt:
             timeout=self._setting.config.timeout_s,
             will=self._aiomqtt.Will(self.availability_topic, OFFLINE, qos=1, retain=True),
         )
+        return client
 
     async def _introduce(self, client: aiomqtt.Client) -> None:
         """Publish that the server is there, and for each rule how Home Assistant shows it; the broker keeps both.

@@ -6,8 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from livessl.errors import ConfigError, Fault
-from livessl.server.alerts.actions import ActionSetting, DeliveryError, in_daemon_thread
+from livessl.server.alerts.actions import ActionSetting, DeliveryError, in_daemon_thread, optional_library
 from livessl.server.alerts.message import body, title
 from livessl.server.api.encode import JsonObject
 from livessl.site.secret_files import fault, read_secret
@@ -29,11 +28,7 @@ class Notification:
     def __init__(self, setting: ActionSetting) -> None:
         config = setting.config.apprise
         assert config is not None
-        try:
-            import apprise
-        except ImportError as error:
-            what = "needs the package apprise; pip install 'livessl[alerts]'"
-            raise ConfigError([Fault(setting.place, what)]) from error
+        apprise = optional_library(setting, "apprise")
         path = setting.site.file(config.url)
         lines = read_secret(path, "write one URL of Apprise into it").split()
         service = apprise.Apprise.instantiate(lines[0]) if len(lines) == 1 else None

@@ -17,8 +17,7 @@ from urllib.parse import urlsplit
 import orjson
 
 from livessl import __version__
-from livessl.errors import ConfigError, Fault
-from livessl.server.alerts.actions import ActionSetting, DeliveryError
+from livessl.server.alerts.actions import ActionSetting, DeliveryError, client_tls
 from livessl.server.api.encode import JsonObject
 from livessl.site.secret_files import fault, read_secret
 
@@ -57,14 +56,7 @@ class Webhook:
         self._target = (url.path or "/") + (f"?{url.query}" if url.query else "")
         self._clock = setting.clock
         self._timeout_s = setting.config.timeout_s
-        self._tls = None
-        if self._is_tls:
-            ca = None if config.ca is None else setting.site.file(config.ca)
-            try:
-                self._tls = ssl.create_default_context(cafile=ca)
-            except (OSError, ssl.SSLError) as error:
-                what = f"cannot read certificates from {ca}: {error}; name a PEM file"
-                raise ConfigError([Fault(f"{setting.place}.ca", what)]) from error
+        self._tls = client_tls(setting, config.ca) if self._is_tls else None
         self._key = None
         if config.secret is not None:
             path = setting.site.file(config.secret)
