@@ -134,7 +134,7 @@ def test_page_claims_no_state_while_the_server_is_unreachable(browser: Browser) 
 
 @pytest.mark.parametrize("name", ["app.js", "model.js", "base.css"])
 def test_page_loads_again_if_a_file_of_it_did_not_arrive(browser: Browser, replayed: Server, name: str) -> None:
-    """A browser that asks for a style sheet early asks for it again by itself; for a module the page must be loaded again."""
+    """A browser may ask for a style sheet again by itself; for a module the page must be loaded again."""
     failed: list[str] = []
 
     def fail(route: Route) -> None:
