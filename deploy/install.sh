@@ -135,6 +135,9 @@ say "installing $what as release $number in $release"
 trap 'exit 130' INT TERM
 run mkdir -p "$prefix/releases"
 run python3 -m venv "$release"
+if [ "$extras" = fast ] && [ -f "$source/deploy/requirements.lock" ]; then # versions that were tested, by their checksums
+    run "$release/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes -r "$source/deploy/requirements.lock"
+fi
 run "$release/bin/python" -m pip install --quiet --disable-pip-version-check "$what"
 run "$release/bin/livessl" check "$site" >&2 || fail "the new release does not accept $site; nothing was changed"
 [ -z "$last" ] || [ -n "$dry_run" ] || printf '%s\n' "$last" >"$release/before"

@@ -1,15 +1,21 @@
-"""The installer for Debian: releases side by side, one link to the one in use, and back again if the new one fails."""
+"""The installer for Debian: releases side by side, one link to the one in use, and back again if the new one fails.
+
+And the versions that it installs.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 INSTALLER = ROOT / "deploy" / "install.sh"
@@ -151,3 +157,17 @@ def test_installation_by_hand_is_left_alone(machine: Machine) -> None:
     done = machine.install("--server", "--version", "9.9.9")
     assert done.returncode == 1
     assert f"expected {machine.prefix}/bin to be a link that this installer made, got a folder" in done.stderr
+
+
+def test_lock_has_what_the_project_needs_with_checksums() -> None:
+    """If this fails, run scripts/lock."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "deploy" / "requirements.lock").read_text(encoding="utf-8").replace("\\\n", "").splitlines()
+    locked = {}
+    for line in lines[1:]:
+        pinned, *checksums = line.split()
+        name, _, locked[name] = pinned.partition("==")
+        assert checksums
+        assert all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", each) for each in checksums), line
+    for requirement in map(Requirement, [*project["dependencies"], *project["optional-dependencies"]["fast"]]):
+        assert requirement.specifier.contains(locked[requirement.name.lower()]), requirement
