@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.locate.estimator import Course, Estimator
-from livessl.core.stream.evidence import BackfilledSound
+from livessl.core.stream.excerpt import BackfilledSound
 from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.stream.site_state import SiteState
