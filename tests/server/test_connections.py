@@ -18,7 +18,7 @@ MOST = 6
 SHORT_S = 0.3
 """Time for a whole request, in the tests of it."""
 
-GET = b"GET /api/v1/health HTTP/1.1\r\nHost: x\r\n\r\n"
+GET = b"GET /api/v1/health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 
 
 def opened(server: Server) -> socket.socket:
@@ -46,8 +46,10 @@ def health(server: Server) -> int:
 @pytest.fixture
 def limited(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     monkeypatch.setattr(http, "MAX_CONNECTIONS", MOST)
+    monkeypatch.setattr(connections, "REQUEST_S", 10.0 * HANG_S)
     with running_server(site_of()) as server:
         wait_until(lambda: health(server) == 200, "the server")
+        wait_until(lambda: not server.uvicorn.server_state.connections, "the end of that request's connection")
         yield server
 
 
@@ -106,7 +108,7 @@ SLOW: dict[str, Callable[[socket.socket], None]] = {
     "a byte now and then": drip,
     "half a second request": answered_then_partial,
     "half a body": lambda client: client.sendall(
-        b"PUT /api/v1/arrays/north HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n{"
+        b"PUT /api/v1/arrays/north HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n{"
     ),
 }
 
