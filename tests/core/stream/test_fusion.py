@@ -1210,6 +1210,7 @@ def test_confidence_falls_with_the_error_of_the_set_up_and_the_reason_says_so(
     _, worse = located_with(Sure(), orientation_deg + further_deg)
     assert event.status is Status.LOCATED
     assert worse.confidence <= estimate.confidence <= 0.95
+    assert estimate.sound_confidence == worse.sound_confidence == 0.95
     within = probability_within(NEAR_M, estimate.covariance_m2)
     assert estimate.confidence == pytest.approx(0.95 * within, rel=1e-6)
     is_limited = half_axis_m(estimate.set_up_covariance_m2) > NEAR_M

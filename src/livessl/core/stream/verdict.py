@@ -243,6 +243,7 @@ class Verdicts:
             arrays,
             found.candidates,
             of_set_up_m2,
+            found.confidence,
         )
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:

@@ -71,6 +71,8 @@ class Estimate:
     set_up_covariance_m2 : (3, 3) float64
         The part of `covariance_m2` that comes from poses and the speed of sound, as uncertain as the site file says.
         All sounds from one place have this error in common.
+    confidence_of_sound : float or None
+        The confidence with an exact set-up; None if it is `confidence`.
 
     Raises
     ------
@@ -85,6 +87,12 @@ class Estimate:
     arrays: tuple[str, ...]
     candidates: tuple[Candidate, ...] = ()
     set_up_covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    confidence_of_sound: float | None = None
+
+    @property
+    def sound_confidence(self) -> float:
+        """The confidence that does not count the error of the set-up."""
+        return self.confidence if self.confidence_of_sound is None else self.confidence_of_sound
 
     @property
     def sound_covariance_m2(self) -> FloatArray:
