@@ -68,9 +68,9 @@ class Alternative:
     speed_off_m_s: float = 0.0
 
     @property
-    def concerns(self) -> tuple[str | None, str | None]:
-        """The arrays that it is about: alternatives of the same arrays are no rivals of each other."""
-        return self.array, self.other
+    def concerns(self) -> tuple[str | None, str | None, int | None]:
+        """The arrays and the channel that it is about: alternatives of the same ones are no rivals of each other."""
+        return self.array, self.other, self.channel
 
     @property
     def is_large(self) -> bool:
