@@ -45,6 +45,7 @@ class SetUpWatch:
         self._sounds: Sequence[Sequence[Observation]] = ()
         self._run = 0  # number of times that all sounds were forgotten
         self._findings: tuple[Finding, ...] = ()
+        self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
         self._by_array: Mapping[str, str] = {}
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -54,7 +55,7 @@ class SetUpWatch:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Faults of the set-up, errors first."""
-        return self._findings
+        return tuple(sorted((*self._findings, *self._reported), key=lambda one: list(Severity).index(one.severity)))
 
     @property
     def sounds(self) -> int:
@@ -70,6 +71,14 @@ class SetUpWatch:
         if event.source == 1 and len(event.received) > 0:
             with self._lock:
                 self._new.append(event.received)
+
+    def note_reports(self, findings: Sequence[Finding]) -> None:
+        """Take in what the reports of the nodes show now; new faults are logged."""
+        known = {_subject(one) for one in self._reported}
+        for finding in findings:
+            if _subject(finding) not in known:
+                _log.warning("%s; %s", finding.message, finding.cure)
+        self._reported = tuple(findings)
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
@@ -129,3 +138,8 @@ class SetUpWatch:
             self.failure = error
             _log.exception("the examination of the set-up has failed; the server ends")
             raise
+
+
+def _subject(finding: Finding) -> tuple[str, str | None, int | None]:
+    """Return what a finding of a report is about; its figures change all the time."""
+    return finding.fault, finding.array or finding.message.partition(":")[0], finding.channel
