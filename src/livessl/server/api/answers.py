@@ -139,7 +139,8 @@ class Finding(BaseModel):
     kind: Literal["finding"]
     fault: str = Field(
         description="Code of the fault: `dead`, `deaf`, `level`, `inverted`, `duplicate`, `swapped`, `mirrored`, "
-        "`exchanged`, `late_channel`, `geometry`, `turned`, `moved` or `temperature`; others may be added.",
+        "`exchanged`, `late_channel`, `geometry`, `turned`, `moved`, `temperature`, `clipping`, `dc`, `hum`, `noisy`, "
+        "`ntp` or `cpu`; others may be added.",
         examples=["swapped"],
     )
     array: str | None = Field(description="The array; null for the whole site.", examples=["south"])

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, Field
 
 from livessl.core.types import ClockState, Status, TrackState
+from livessl.server.api.report_schema import Channel, Host
 
 Version = Annotated[
     Literal[1],
@@ -328,4 +329,11 @@ class Array(BaseModel):
     agreement: Agreement
     clock_offset: ClockOffset | None = Field(description="Null until three sounds have been measured.")
     counters: Counters
+    channels: list[Channel] = Field(
+        description="Level of each channel in the site file's order; empty until its node has reported them."
+    )
+    channels_age_s: float | None = Field(
+        ge=0, description="Seconds since that report; null if there is none.", examples=[0.6]
+    )
+    host: Host | None = Field(description="State of its node's machine; null if it is not reported.")
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])
