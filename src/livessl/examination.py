@@ -23,7 +23,7 @@ from livessl.site.models import Site
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What recordings say about a set-up.
+    """Findings about a set-up, and the number of sounds behind them.
 
     Parameters
     ----------

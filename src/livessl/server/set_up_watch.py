@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
-from livessl.core.commission.steady import SteadyFindings, identity
+from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation, Received
 from livessl.server.overload import Overload
 from livessl.site.build.layout import layout_findings
@@ -70,6 +70,8 @@ class SetUpWatch:
         self._run = 0  # number of times that all sounds were forgotten
         self._steady = SteadyFindings()
         self._of_layout = layout_findings(site)
+        self._of_sounds: tuple[Finding, ...] = ()
+        self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
         self.state = SetUpState(findings=self._of_layout)
         """The latest state. Read it once for values that belong together."""
         self._stop = threading.Event()
@@ -87,6 +89,13 @@ class SetUpWatch:
             with self._lock:
                 self._new.append(event.received)
 
+    def note_reports(self, findings: Sequence[Finding]) -> None:
+        """Take in what the reports of the nodes show now; new faults are logged."""
+        with self._lock:
+            self._log_new(self._reported, findings)
+            self._reported = tuple(findings)
+            self._publish()
+
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
         with self._lock:
@@ -94,7 +103,7 @@ class SetUpWatch:
             self._sounds, self._unjudged = (), 0
             self._run += 1
             self._steady = SteadyFindings()
-            self._publish(())
+            self._note(())
 
     def start(self) -> None:
         """Begin to examine."""
@@ -125,25 +134,34 @@ class SetUpWatch:
             self._sounds = sounds
             self._unjudged += len(new)
             if findings is None:
-                self._publish(())
+                self._note(())
             else:
-                self._publish(self._steady.note(findings, self._unjudged))
+                self._note(self._steady.note(findings, self._unjudged))
                 self._unjudged = 0
 
-    def _publish(self, findings: Sequence[Finding]) -> None:
-        """Replace the state, and log the findings that are new in it."""
-        known = {identity(finding) for finding in self.state.findings}
-        for finding in findings:
-            if identity(finding) not in known:
-                _log.warning("%s; %s", finding.message, finding.cure)
+    def _note(self, findings: Sequence[Finding]) -> None:
+        self._log_new(self._of_sounds, findings)
+        self._of_sounds = tuple(findings)
+        self._publish()
+
+    def _publish(self) -> None:
+        """Replace the state."""
         all_arrays = [spec.name for spec in self._site.processed]
         errors = {
             array: f"{finding.message}; {finding.cure}"
-            for finding in reversed(findings)
+            for finding in reversed(self._of_sounds)
             if finding.severity is Severity.ERROR
             for array in ([finding.array] if finding.array is not None else all_arrays)
         }
-        self.state = SetUpState(len(self._sounds), tuple(in_order([*findings, *self._of_layout])), errors)
+        findings = in_order([*self._of_sounds, *self._reported, *self._of_layout])
+        self.state = SetUpState(len(self._sounds), tuple(findings), errors)
+
+    @staticmethod
+    def _log_new(known: Sequence[Finding], findings: Sequence[Finding]) -> None:
+        before = {_subject(finding) for finding in known}
+        for finding in findings:
+            if _subject(finding) not in before:
+                _log.warning("%s; %s", finding.message, finding.cure)
 
     def _work(self) -> None:
         try:
@@ -154,3 +172,8 @@ class SetUpWatch:
             self.failure = error
             _log.exception("the examination of the set-up has failed; the server ends")
             raise
+
+
+def _subject(finding: Finding) -> tuple[str, str | None, int | None]:
+    """Return what a finding of a report is about; its figures change all the time."""
+    return finding.fault, finding.array or finding.message.partition(":")[0], finding.channel

@@ -74,7 +74,7 @@ class Alternative:
 
     @property
     def is_large(self) -> bool:
-        """Whether it differs from what is filed by more than a careful set-up may."""
+        """True if it differs from what is filed by more than a careful set-up may."""
         if self.fault == "turned":
             return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
         if self.fault in ("moved", "height", "geometry"):

@@ -38,7 +38,7 @@ MIN_RATIO: Final = 1.3
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the delays of some sounds say about the set-up.
+    """The diagnosis of a set-up from the delays of some sounds.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is wrong with a set-up, as a value."""
+"""A fault of a set-up, as a value."""
 
 from __future__ import annotations
 

@@ -216,7 +216,7 @@ def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 
 def _words(alternative: Alternative) -> tuple[str, str]:
-    """What an alternative is, and its cure."""
+    """Describe an alternative and its cure."""
     array = alternative.array
     if alternative.fault == "swapped":
         moved = [index for index, channel in enumerate(alternative.order) if channel != index + 1]

@@ -87,16 +87,16 @@ class SteadyFindings:
         return tuple(in_order(finding for state in self._questions.values() for finding in state.published))
 
 
-def identity(finding: Finding) -> tuple[str, str | None, int | None]:
+def _identity_of(finding: Finding) -> tuple[str, str | None, int | None]:
     """Return what makes two findings the same although their numbers differ."""
     return finding.fault, finding.array, finding.channel
 
 
 def _identity(findings: Sequence[Finding]) -> frozenset[tuple[str, str | None, int | None]]:
-    return frozenset(identity(finding) for finding in findings)
+    return frozenset(_identity_of(finding) for finding in findings)
 
 
 def _question(finding: Finding) -> Hashable:
     if finding.fault in _SIGNAL:
         return finding.array, finding.channel
-    return identity(finding) if finding.fault in _OF_CHANNELS else "set-up"
+    return _identity_of(finding) if finding.fault in _OF_CHANNELS else "set-up"

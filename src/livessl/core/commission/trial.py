@@ -43,7 +43,7 @@ RISE_STEP_M: Final = 0.02
 _TURNED: Final = (0.02, 180.0)
 _MOVED: Final = (1.0, 1.5)
 _SPEED_STD_M_S: Final = 20.0
-"""What an alternative leaves free: standard deviations in metres, degrees and m/s."""
+"""Quantities that an alternative leaves free: standard deviations in metres, degrees and m/s."""
 
 
 class Trial:
