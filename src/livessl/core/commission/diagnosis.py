@@ -130,7 +130,9 @@ def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
     rivals = sorted(tried, key=lambda one: one.criterion)
     best, gained = rivals[0], filed - rivals[0].criterion
     contradicts = gained > least
-    if judge is None:
+    if judge is not None:
+        contradicts &= best.is_large  # smaller errors are those of a careful set-up
+    else:
         contradicts &= trial.filed.misfit_s > MIN_RATIO * max(best.misfit_s, trial.floor_s)
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
