@@ -187,7 +187,7 @@ def test_older_event_that_is_missed_later_alerts_as_well(tmp_path: Path, monkeyp
     desk = Desk(site(tmp_path))
     messages = Messages(desk.site, 0, utc=True)
     for step, number in enumerate((3, 5, 1, 7)):  # the third one is of a node that was away
-        desk.log.add_final(FinalResults([sound(number)], after(sound(8 + step))), messages, {})
+        desk.log.add_final(FinalResults((sound(number),), after(sound(8 + step))), messages, {})
     desk.alerts.take_final([], after(sound(20)))  # quiet goes on
     desk.alerts.start()
     wait_until(lambda: len(alerted(desk)) == 4, "all alerts")

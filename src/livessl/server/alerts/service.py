@@ -31,7 +31,7 @@ from livessl.server.array_states import ArrayStates
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.alert_checks import outbox_file
 from livessl.site.models import Site
 
@@ -111,8 +111,7 @@ class Alerts:
         self._judges_early = any(rule.events and rule.events.early for rule in self._config.rules.values())
         self._judges_tracks = "tracks" in kinds
         self._judges_conditions = not kinds.isdisjoint(("arrays", "findings"))
-        of_site = ZoneMap(site)
-        self._zones = (lambda: of_site) if zones is None else zones
+        self._zones = fixed_zones(site) if zones is None else zones
         self.outbox = Outbox(_outbox_path(site))
         """Alerts, deliveries and the rules' states."""
         base = self._config.url or url + site.server.http.root_path

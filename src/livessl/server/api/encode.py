@@ -13,7 +13,7 @@ from livessl.clock import utc_text
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.models import Site
 
 API_VERSION: Final = 1
@@ -68,8 +68,7 @@ class Messages:
     """
 
     def __init__(self, site: Site, origin_ns: int, *, utc: bool, zones: Callable[[], ZoneMap] | None = None) -> None:
-        of_site = ZoneMap(site)
-        self._zones = (lambda: of_site) if zones is None else zones
+        self._zones = fixed_zones(site) if zones is None else zones
         self._origin_ns = origin_ns
         self._utc = utc
 

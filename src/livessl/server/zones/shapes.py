@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -69,6 +69,12 @@ class ZoneMap:
             for name, zone in self.zones.items()
             if zone.exclude and (name in holding or memberships.get(name, 0.0) >= EXCLUDED)
         ]
+
+
+def fixed_zones(site: Site) -> Callable[[], ZoneMap]:
+    """Return what always returns the zones that a site was loaded with."""
+    zones = ZoneMap(site)
+    return lambda: zones
 
 
 def _prism(zone: Zone) -> Prism:
