@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from matplotlib.path import Path
 from scipy.stats import multivariate_normal
 
+from livessl.server.zones import membership
 from livessl.server.zones.membership import Prism, box_prism, probability_in
 
 ANYWHERE = np.array([[-1e3, 1e3]] * 3)
@@ -149,6 +151,23 @@ def test_parts_of_a_polygon_have_probabilities_that_add_up(
         for corners in (whole, left, right)
     ]
     assert found[0] == pytest.approx(found[1] + found[2], abs=TOLERANCE)
+
+
+@settings(max_examples=40)
+@given(
+    place=st.tuples(st.floats(0.1, 3.9), st.floats(0.1, 4.9), st.floats(0.1, 2.9)),
+    std_m=st.floats(0.01, 0.2),
+    seed=st.integers(0, 10**6),
+)
+def test_shortcut_of_sure_positions_agrees_with_the_integral(place, std_m: float, seed: int) -> None:  # type: ignore[no-untyped-def]
+    """The zone is concave and reaches to a wall; without the shortcut, all is integrated."""
+    zone = Prism(np.array([[0.0, 1.0], [3.0, 1.0], [3.0, 2.0], [2.0, 2.0], [2.0, 4.0], [0.0, 4.0]]), 0.5, 9.0)
+    axes = rotation(seed)
+    covariance = axes @ np.diag([0.2 * std_m**2, 0.5 * std_m**2, std_m**2]) @ axes.T
+    found = probability_in(np.array(place), covariance, zone, ROOM)
+    with patch.object(membership, "_certain", return_value=None):
+        integrated = probability_in(np.array(place), covariance, zone, ROOM)
+    assert found == pytest.approx(integrated, abs=TOLERANCE)
 
 
 def test_zone_far_from_a_sure_position_has_no_probability() -> None:

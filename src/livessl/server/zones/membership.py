@@ -9,11 +9,11 @@ from scipy.special import ndtr, ndtri
 
 from livessl.core.types import FloatArray
 
-HEIGHT_NODES: Final = 48
+HEIGHT_NODES: Final = 40
 """Nodes of the quadrature over the height."""
 
-SLAB_NODES: Final = 16
-"""Nodes of the quadrature across each slab between neighbouring corners of a polygon, from its least probable side."""
+SLAB_NODES: Final = 12
+"""Nodes of the quadrature across each slab between neighbouring corners of a polygon."""
 
 LEAST_STD_M: Final = 1e-3
 """Least standard deviation in any direction, in metres: covariances are singular in a flat search volume, and published
@@ -22,7 +22,7 @@ ones are rounded, which can make them slightly indefinite."""
 LEAST_INSIDE: Final = 1e-3
 """Least probability of the search volume; below it the position is outside, and in none of its parts."""
 
-FAR: Final = 6.0
+FAR: Final = 4.5
 """Distance on an axis, in standard deviations, beyond which the probability of a zone counts as zero."""
 
 _EDGE: Final = 1e-15
@@ -76,29 +76,49 @@ def probability_in(position_m: FloatArray, covariance_m2: FloatArray, zone: Pris
     if flat[2]:
         low, high = volume_m[2]
     covariance_m2 = _positive_definite(covariance_m2)
-    if _is_far(position_m, covariance_m2, zone, volume_m):
-        return 0.0
-    whole = box_prism(volume_m)
-    inside = _in_prism(position_m, covariance_m2, whole)
+    zone = Prism(zone.corners_m, low, high)
+    certain = _certain(position_m, covariance_m2, zone, volume_m)
+    if certain is not None:
+        return certain
+    reach_m = FAR * np.sqrt(np.diag(covariance_m2))
+    is_amid = ((position_m - volume_m[:, 0] > reach_m) & (volume_m[:, 1] - position_m > reach_m)).all()
+    inside = 1.0 if is_amid else _in_prism(position_m, covariance_m2, box_prism(volume_m))
     if inside < LEAST_INSIDE:
         return 0.0
-    part = Prism(_clipped(zone.corners_m, volume_m), low, high)
+    part = zone._replace(corners_m=_clipped(zone.corners_m, volume_m))
     if len(part.corners_m) < 3:
         return 0.0
     return min(1.0, max(0.0, _in_prism(position_m, covariance_m2, part) / inside))
 
 
-def _is_far(position_m: FloatArray, covariance_m2: FloatArray, zone: Prism, volume_m: FloatArray) -> bool:
-    """Return whether both zone and position are such that nearly nothing of the distribution is in the zone.
+def _certain(position_m: FloatArray, covariance_m2: FloatArray, zone: Prism, volume_m: FloatArray) -> float | None:
+    """Return 0 or 1 for a position whose zone has no boundary within `FAR` standard deviations, otherwise None.
 
-    A position beyond the search volume is judged by its tail, which may be anywhere.
+    Walls of the search volume are no boundaries. A position beyond them is judged by its tail, which may be anywhere.
     """
     if ((position_m < volume_m[:, 0]) | (position_m > volume_m[:, 1])).any():
-        return False
-    low = np.array([*zone.corners_m.min(axis=0), zone.low_m])
-    high = np.array([*zone.corners_m.max(axis=0), zone.high_m])
-    away = np.maximum(np.maximum(low - position_m, position_m - high), 0.0)
-    return bool((away > FAR * np.sqrt(np.diag(covariance_m2))).any())
+        return None
+    begins = zone.corners_m - position_m[:2]
+    along = np.roll(begins, -1, axis=0) - begins
+    shares = np.clip(-(begins * along).sum(axis=1) / np.maximum((along * along).sum(axis=1), _EDGE), 0.0, 1.0)
+    off_edges_m = float(np.hypot(*(begins + shares[:, None] * along).T).min())
+    reach_m = FAR * float(np.sqrt(np.linalg.eigvalsh(covariance_m2[:2, :2])[1]))
+    height_m = FAR * float(np.sqrt(covariance_m2[2, 2]))
+    below_m = position_m[2] - zone.low_m if zone.low_m > volume_m[2, 0] else np.inf
+    above_m = zone.high_m - position_m[2] if zone.high_m < volume_m[2, 1] else np.inf
+    within_m = min(below_m, above_m)
+    is_around = _winds_around(begins)
+    if within_m < -height_m or (off_edges_m > reach_m and not is_around):
+        return 0.0
+    return 1.0 if off_edges_m > reach_m and within_m > height_m else None
+
+
+def _winds_around(corners_m: FloatArray) -> bool:
+    """Return whether a polygon holds the origin, by the edges that cross the axis to the right of it."""
+    ends = np.roll(corners_m, -1, axis=0)
+    crossing = (corners_m[:, 1] > 0.0) != (ends[:, 1] > 0.0)
+    (x0, y0), (x1, y1) = corners_m[crossing].T, ends[crossing].T
+    return bool((x0 - y0 * (x1 - x0) / (y1 - y0) > 0.0).sum() % 2)
 
 
 def _in_prism(mean_m: FloatArray, covariance_m2: FloatArray, prism: Prism) -> float:
