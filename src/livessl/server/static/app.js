@@ -12,6 +12,7 @@ import { Live } from "./live.js";
 import { MapPanel } from "./map-panel.js";
 import { Model, OLD_MS } from "./model.js";
 import { drawTogether, Plan } from "./plan.js";
+import { ZoneEditor } from "./plan-zones-editor.js";
 import { readColours } from "./theme.js";
 
 const API = new URL("api/v1/", document.baseURI);
@@ -60,6 +61,7 @@ const alertsPanel = new AlertsPanel(find("alerts-panel"), {
     put(address, { armed }).catch((error) => console.warn(`livessl: rule ${name}:`, error.message)).finally(loadAlerts);
   },
 });
+const zoneEditor = new ZoneEditor(API, plans[0], redraw);
 const mapPanel = new MapPanel(API, plans, redraw);
 const light = matchMedia("(prefers-color-scheme: light)");
 
@@ -82,6 +84,7 @@ const HANDLERS = {
     header.showSite(message.site, message.mode);
     arraysPanel.mayChange = message.role !== "viewer";
     alertsPanel.mayChange = message.role !== "viewer";
+    zoneEditor.mayChange = message.role !== "viewer";
     HANDLERS.arrays(message);
     loadSite();
     loadEvents();
@@ -112,6 +115,11 @@ const HANDLERS = {
   alert() {
     loadAlerts();
   },
+  zones({ by_name: zones }) {
+    if (model.site === null) return; // it is loaded with the zones
+    model.site.zones = zones;
+    zoneEditor.show(zones, model.site.can_draw);
+  },
   gap(message) {
     header.showGap(message);
     loadAlerts();
@@ -129,7 +137,7 @@ const live = new Live(liveUrl(), {
 });
 
 function liveUrl() {
-  const url = new URL("live?kinds=update,event,track,arrays,alert", API);
+  const url = new URL("live?kinds=update,event,track,arrays,alert,zones", API);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   return url;
 }
@@ -182,10 +190,27 @@ function loadSite() {
     model.site = site;
     header.showSite(site.site, model.mode);
     header.showPrivacy(site.privacy);
+    zoneEditor.show(site.zones, site.can_draw);
+    if (site.floor_plan !== null) loadFloorPlan(site.floor_plan);
     const [x, y, z] = site.room.size_m;
     find("floor-frame").style.setProperty("--aspect", String(x / y));
     find("side-frame").style.setProperty("--aspect", String(y / z));
     find("floor-empty").hidden = true;
+  });
+}
+
+/** Load the picture under the floor plan; as data in its address, for an element's request would have no token. */
+function loadFloorPlan({ bounds_m: bounds }) {
+  retrying(async () => {
+    const response = await get(new URL("floor-plan", API));
+    if (!response.ok) throw new Error(`floor-plan: the server answered ${response.status}`);
+    const reader = new FileReader();
+    reader.readAsDataURL(await response.blob());
+    await new Promise((resolve, reject) => Object.assign(reader, { onload: resolve, onerror: reject }));
+    const image = new Image();
+    image.src = reader.result;
+    await image.decode();
+    model.floorPlan = { image, bounds };
   });
 }
 
@@ -294,7 +319,7 @@ function redraw() {
 function draw(now) {
   if (model.site === null) return;
   dirty = false;
-  drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images), colours);
+  drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images, zoneEditor.draft), colours);
 }
 
 function applyTheme() {
