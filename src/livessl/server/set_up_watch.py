@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
-from livessl.core.types import Event, Observation, Received
+from livessl.core.types import Event, Observation
+from livessl.server.heard_sounds import HeardSounds
 from livessl.server.overload import Overload
 from livessl.site.models import Site
 
@@ -41,7 +41,9 @@ class SetUpWatch:
         self._site = site
         self._overload = overload
         self._lock = threading.Lock()
-        self._new: deque[Sequence[Received]] = deque(maxlen=KEPT_SOUNDS)
+        self.heard = HeardSounds()
+        """The last sounds, for whoever calibrates."""
+        self._examined = 0  # number of the last sound that was examined
         self._sounds: Sequence[Sequence[Observation]] = ()
         self._run = 0  # number of times that all sounds were forgotten
         self._findings: tuple[Finding, ...] = ()
@@ -68,13 +70,12 @@ class SetUpWatch:
     def take(self, event: Event) -> None:
         """Take in a final event."""
         if event.source == 1 and len(event.received) > 0:
-            with self._lock:
-                self._new.append(event.received)
+            self.heard.take(event)
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
+        self.heard.forget()
         with self._lock:
-            self._new.clear()
             self._sounds = ()
             self._run += 1
             self._note(())
@@ -93,14 +94,16 @@ class SetUpWatch:
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
-            new, known, run = list(self._new), list(self._sounds), self._run
-            self._new.clear()
+            known, run = list(self._sounds), self._run
+        new = self.heard.after(self._examined)
         if not new:
             return
-        from livessl.core.commission.observe import observe  # scipy's optimizer takes memory, and no event needs it
-        from livessl.site.build.set_up import find_set_up_faults
+        from livessl.site.build.set_up import (
+            find_set_up_faults,
+        )  # scipy's optimizer takes memory, and no event needs it
 
-        sounds = [*known, *(observe(received) for received in new)][-KEPT_SOUNDS:]
+        self._examined = new[-1].number
+        sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
         findings = tuple(find_set_up_faults(self._site, sounds)) if len(sounds) >= LEAST_SOUNDS else ()
         with self._lock:
             if run == self._run:

@@ -2,7 +2,7 @@
 
 The unknowns are the turn and the shift of each array that may move, the speed of sound if it may differ, and the places
 of the sounds. Places that are known, and poses as far as they are known, enter as priors. The arrays need no common
-clock, for only delays within an array are used.
+clock; where some have one, the times between them may be used as well.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from livessl.core.commission.arrivals import ARRIVAL_STD_S, Arrivals
 from livessl.core.commission.places import Delays, Microphones, contradictions_s, slopes_s_m
 from livessl.core.types import FloatArray
 
@@ -120,6 +121,8 @@ def adjust(
     c_m_s: float,
     freedom: Freedom,
     place_std_m: float = UNKNOWN_M,
+    delay_std_s: float = DELAY_STD_S,
+    arrivals: Arrivals | None = None,
 ) -> Adjusted:
     """Find the poses, the speed of sound and the places that explain delays best.
 
@@ -136,8 +139,12 @@ def adjust(
     freedom : Freedom
     place_std_m : float
         Standard deviation of the given places along each axis, metres.
+    delay_std_s : float
+        Standard deviation of the delays, seconds.
+    arrivals : Arrivals or None
+        Times between arrays that share a clock.
     """
-    problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m)
+    problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m, delay_std_s, arrivals)
     solved = least_squares(
         problem.residuals,
         problem.start,
@@ -163,9 +170,12 @@ class _Problem:
         c_m_s: float,
         freedom: Freedom,
         place_std_m: float,
+        delay_std_s: float,
+        arrivals: Arrivals | None,
     ) -> None:
         self._microphones, self._delays, self._places_m = microphones, delays, places_m
         self._c_m_s, self._freedom, self._place_std_m = c_m_s, freedom, place_std_m
+        self._delay_std_s, self._arrivals = delay_std_s, arrivals
         self._free = [name for name in microphones if name in freedom.arrays]
         count = len(self._free) * _UNKNOWNS + (freedom.speed_std_m_s > 0.0)
         self.start = np.concatenate([np.zeros(count), places_m.ravel()])
@@ -178,12 +188,15 @@ class _Problem:
     def residuals(self, unknowns: FloatArray) -> FloatArray:
         """Delays and priors, in standard deviations."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
-        parts = [self._off(poses, speed_m_s, places_m).ravel() / DELAY_STD_S]
+        parts = [self._off(poses, speed_m_s, places_m).ravel() / self._delay_std_s]
         for name, (shift_m, turn) in poses.items():
             position_std_m, orientation_std_deg = self._freedom.arrays[name]
             parts += [shift_m / position_std_m, turn / np.radians(orientation_std_deg)]
         if self._freedom.speed_std_m_s > 0.0:
             parts.append(np.array([(speed_m_s - self._c_m_s) / self._freedom.speed_std_m_s]))
+        if self._arrivals is not None:
+            off_s = self._arrivals.contradictions_s(self._moved(poses), places_m, speed_m_s)
+            parts.append(off_s.ravel() / ARRIVAL_STD_S)
         parts.append(((places_m - self._places_m) / self._place_std_m).ravel())
         return np.concatenate(parts)
 
@@ -199,10 +212,15 @@ class _Problem:
             slopes[:, column] = (self.residuals(moved) - here) / step
         poses, speed_m_s, places_m = self._unpack(unknowns)
         sounds = np.arange(len(places_m))
-        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / DELAY_STD_S
+        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / self._delay_std_s
         rows = of_places.shape[1]
         blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
         blocks[sounds, :, sounds] = of_places
+        if self._arrivals is not None:
+            of_times = self._arrivals.slopes_s_m(self._moved(poses), places_m, speed_m_s) / ARRIVAL_STD_S
+            count = of_times.shape[0] * of_times.shape[1]
+            rows_of_times = slopes[-places_m.size - count : -places_m.size, few:]
+            rows_of_times.reshape(len(sounds), -1, len(sounds), 3)[sounds, :, sounds] = of_times
         slopes[-places_m.size :, few:] = np.eye(places_m.size) / self._place_std_m
         return slopes
 
