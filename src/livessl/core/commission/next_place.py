@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 
 from livessl.core.commission.places import Microphones
-from livessl.core.commission.poses import DELAY_STD_S
+from livessl.core.commission.poses import MICROPHONE_STD_M
+from livessl.core.commission.resection import CLAP_STD_S
 from livessl.core.types import FloatArray
 
 AIM_M: Final = 0.03
@@ -112,7 +113,9 @@ def _information(microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, 
     slopes -= slopes.mean(axis=1, keepdims=True)
     of_place = unit / c_m_s
     of_place = of_place - of_place.mean(axis=1, keepdims=True)
-    covariance = DELAY_STD_S**2 * np.eye(len(microphones_m)) + place_std_m**2 * of_place @ of_place.swapaxes(1, 2)
+    covariance = (CLAP_STD_S**2 + (MICROPHONE_STD_M / c_m_s) ** 2) * np.eye(
+        len(microphones_m)
+    ) + place_std_m**2 * of_place @ of_place.swapaxes(1, 2)
     return np.asarray(slopes.swapaxes(1, 2) @ np.linalg.solve(covariance, slopes))
 
 

@@ -8,6 +8,7 @@ clock; where some have one, the times between them may be used as well.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,6 +22,10 @@ from livessl.core.types import FloatArray
 
 DELAY_STD_S: Final = 20e-6
 """Standard deviation of a measured delay in a room, seconds."""
+
+MICROPHONE_STD_M: Final = 0.002
+"""Standard deviation of each microphone's place within its array, metres: arrays are built to some millimetres. It is
+the same in all sounds, and more of them do not average it out."""
 
 UNKNOWN_M: Final = 100.0
 UNKNOWN_DEG: Final = 360.0
@@ -228,6 +233,8 @@ class _Problem:
         """The unknowns as a result, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
+        bias = covariance @ jacobian.T @ self._slopes_by_microphones(unknowns)
+        covariance += MICROPHONE_STD_M**2 * bias @ bias.T
         off = self._off(poses, speed_m_s, places_m)
         count = sum(np.isfinite(one).sum(axis=1) - 1 for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
@@ -239,6 +246,19 @@ class _Problem:
         at = len(self._free) * _UNKNOWNS
         c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
         return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
+
+    def _slopes_by_microphones(self, unknowns: FloatArray) -> FloatArray:
+        """Slope of the residuals by the places of all microphones along each axis, per metre."""
+        here, columns = self.residuals(unknowns), []
+        filed = self._microphones
+        for name in self._delays:
+            for entry in range(filed[name].size):
+                off_m = np.zeros(filed[name].size)
+                off_m[entry] = _STEP
+                others = copy(self)
+                others._microphones = dict(filed) | {name: filed[name] + off_m.reshape(-1, 3)}
+                columns.append((others.residuals(unknowns) - here) / _STEP)
+        return np.stack(columns, axis=1)
 
     def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
         poses, at = {}, 0

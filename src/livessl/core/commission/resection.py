@@ -25,6 +25,9 @@ STEPS_M: Final = (1.0, 0.25)
 NEAREST_M: Final = 0.1
 """Least distance of an array from a sound, metres."""
 
+CLAP_STD_S: Final = 12e-6
+"""Standard deviation of the delays of a clap, seconds: it is short and loud, and its delays are sharper than others."""
+
 SPEED_STD_M_S: Final = 3.0
 """Standard deviation of the filed speed of sound, m/s: five degrees of temperature."""
 
@@ -106,7 +109,7 @@ def measure_pose(
     for shift_m, rotvec in starts:
         rough_m = moved(microphones_m, shift_m, rotvec)
         freedom = Freedom({"array": (UNKNOWN_M, UNKNOWN_DEG)})
-        adjusted = adjust({"array": rough_m}, {"array": delays_s}, places_m, c_m_s, freedom, place_std_m)
+        adjusted = adjust({"array": rough_m}, {"array": delays_s}, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
         misfit_s = _misfit_s(adjusted)
         if best is None or misfit_s < best[0]:
             best = misfit_s, adjusted.poses["array"], adjusted.poses["array"].applied(rough_m)
@@ -173,7 +176,7 @@ def measure_poses(
         for name, measured in enough.items()
     }
     freedom = Freedom(dict.fromkeys(rough, (UNKNOWN_M, UNKNOWN_DEG)), SPEED_STD_M_S)
-    adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m)
+    adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
     known = KnownPlaces(places_m, adjusted.c_m_s)
     poses = {
         name: _against_filed(
