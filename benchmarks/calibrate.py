@@ -27,6 +27,7 @@ from livessl.calibration import HeardSound, sounds_of
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.finding import Severity
 from livessl.core.commission.findings import set_up_findings, sharp_delays
+from livessl.core.commission.next_place import proposed_place
 from livessl.core.commission.refine import refine
 from livessl.core.commission.resection import MeasuredSetUp, measure_poses
 from livessl.core.types import Float32Array, FloatArray
@@ -83,9 +84,14 @@ def clap(seed: int) -> Float32Array:
 
 
 def heard(
-    site: Site, placed: Arrays, sounds: Sequence[NamedSound], count: int, seed: int
+    site: Site,
+    placed: Arrays,
+    sounds: Sequence[NamedSound],
+    count: int,
+    seed: int,
+    at_m: FloatArray | None = None,
 ) -> tuple[list[HeardSound], FloatArray, list[AssignedRecording]]:
-    """What the arrays observed of sounds at random places, and these places; sounds that made no event are left out."""
+    """What the arrays observed of sounds at random or given places, and the places; sounds without event are left out."""
     scene = make_scene(
         site.room.size_m,
         rt60_s=RT60_S[seed % len(RT60_S)],
@@ -96,14 +102,17 @@ def heard(
         keep_away_m=[spec.centre_m for spec in site.specs],
         seed=seed + 100,
     )
+    if at_m is not None:
+        moved = (replace(source, position_m=place_m) for source, place_m in zip(scene.sources, at_m, strict=True))
+        scene = replace(scene, sources=tuple(moved))
     parts = [
         AssignedRecording(
             name,
-            MemoryRecording(name, RATE_HZ, render(scene, at_m, seed=seed + number)),
+            MemoryRecording(name, RATE_HZ, render(scene, microphones_m, seed=seed + number)),
             0,
-            tuple(range(1, len(at_m) + 1)),
+            tuple(range(1, len(microphones_m) + 1)),
         )
-        for number, (name, at_m) in enumerate(placed.items())
+        for number, (name, microphones_m) in enumerate(placed.items())
     ]
     return *_matched(scene, sounds_of(site, parts)), parts
 
@@ -118,6 +127,16 @@ def _matched(scene: Scene, sounds: Sequence[HeardSound]) -> tuple[list[HeardSoun
             found.append(own[0])
             places_m.append(source.position_m)
     return found, np.array(places_m)
+
+
+def proposed(filed: Arrays, site: Site, rng: np.random.Generator) -> FloatArray:
+    """The places that livessl proposes with the set-up as filed; a person is there to 10 cm, and then measures."""
+    bounds_m, places_m = np.array([[0.0, size] for size in site.room.size_m]), np.zeros((0, 3))
+    for _ in range(CLAPS):
+        place_m = proposed_place(filed, places_m, bounds_m, site.c_m_s, PLACE_STD_M)
+        assert place_m is not None
+        places_m = np.vstack([places_m, place_m])
+    return places_m + rng.normal(0.0, 0.1, places_m.shape)
 
 
 def wrong(placed: Arrays, rng: np.random.Generator, position_std_m: float, orientation_std_deg: float) -> Arrays:
@@ -163,6 +182,12 @@ def one_room(arrays: int, seed: int) -> Iterator[dict[str, Any]]:
         measured = measure_poses(filed, some, known_m[:count], c_m_s, PLACE_STD_M)
         for row in errors(measured, placed, site.c_m_s):
             yield {"task": f"{count} claps", "arrays": arrays, "seed": seed} | row
+    true_m = proposed(filed, site, rng)
+    claps, at_m, _ = heard(site, placed, [("clap", clap(seed))], CLAPS, seed, true_m)
+    told_m = at_m + rng.normal(0.0, PLACE_STD_M, at_m.shape)
+    at_proposed = sharp_delays(shape, [sound.observations for sound in claps], [])
+    for row in errors(measure_poses(filed, at_proposed, told_m, c_m_s, PLACE_STD_M), placed, site.c_m_s):
+        yield {"task": f"{CLAPS} claps at proposed places", "arrays": arrays, "seed": seed} | row
     few = {name: measured[:FEW_CLAPS] for name, measured in delays.items()}
     careful = wrong(shape, rng, CAREFUL_STD_M, CAREFUL_STD_DEG)
     for fault in FAULTS:
