@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,7 +91,7 @@ def heard(
     seed: int,
     at_m: FloatArray | None = None,
 ) -> tuple[list[HeardSound], FloatArray, list[AssignedRecording]]:
-    """What the arrays observed of sounds at random or given places, and the places; sounds without event are left out."""
+    """What the arrays observed of sounds at random or given places, and the places; without events, none."""
     scene = make_scene(
         site.room.size_m,
         rt60_s=RT60_S[seed % len(RT60_S)],
