@@ -1,4 +1,4 @@
-"""Sounds at places that somebody measured, or at unknown ones: how right a site is, and where its arrays really are."""
+"""Verifies a site by sounds at measured places, and measures the poses of its arrays by such or by unknown sounds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from livessl.site.build.set_up import verify_set_up
 from livessl.site.models import Site
 
 MOST_CLAPS: Final = 64
-"""Most known places: nobody claps at more, and a list of thousands is a mistake."""
+"""Most known places of one calibration; a longer list is a mistake."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What `livessl calibrate` prints of claps, poses and the speed of sound: as lines, or as JSON objects."""
+"""Claps, poses and the speed of sound as `livessl calibrate` prints them: as lines, or as JSON objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibration with a running server: it asks for a clap at each place, and says what it heard."""
+"""Calibration with a running server: it asks for a clap at each place, and prints how far off each was located."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def is_good(site: Site, measured: MeasuredSetUp) -> bool:
 
 
 def next_place(site: Site, places_m: FloatArray, place_std_m: float) -> FloatArray | None:
-    """Return the place at which another clap would tell most, metres; None if no place is free."""
+    """Return the place at which another clap would improve the poses most, metres; None if no place is free."""
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
     return proposed_place(microphones, places_m, np.array(search_grid(site).bounds_m), site.c_m_s, place_std_m)
 

@@ -23,8 +23,8 @@ POLL_S: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """What a server has heard: its time, the number of its last sound, and sounds with their begin in nanoseconds."""
+class Answer:
+    """An answer of the server: its time, the number of its last sound, and sounds with their starts in nanoseconds."""
 
     now_ns: int
     last: int
@@ -89,9 +89,9 @@ class ServerSounds:
         ask_user()
         number, deadline_ns = begin.last, self._clock.monotonic_ns() + round(1e9 * self._wait_s)
         while self._clock.monotonic_ns() < deadline_ns:
-            heard = self._after(number)
-            number = heard.last
-            for start_ns, sound in heard.sounds:
+            answer = self._after(number)
+            number = answer.last
+            for start_ns, sound in answer.sounds:
                 if start_ns >= begin.now_ns and accepts(sound):
                     return sound
             self._clock.sleep_until_ns(self._clock.now_ns() + round(1e9 * POLL_S))
@@ -100,10 +100,10 @@ class ServerSounds:
             "that the microphones receive it, clap louder, or give a longer --wait"
         )
 
-    def _after(self, number: int) -> Heard:
+    def _after(self, number: int) -> Answer:
         answer = ask(self._url, f"sounds?after={number}", self._token_file)
         sounds = [(utc_ns(one["time_utc"]), _sound(one)) for one in answer["sounds"]]
-        return Heard(utc_ns(answer["now_utc"]), answer["last"], sounds)
+        return Answer(utc_ns(answer["now_utc"]), answer["last"], sounds)
 
 
 def _sound(one: dict[str, Any]) -> HeardSound:

@@ -11,7 +11,7 @@ from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 
 KEPT: Final = 64
-"""Number of sounds that are kept: nobody claps at more places, and twenty unknown sounds refine a set-up."""
+"""Number of sounds that are kept: more than a calibration needs, by claps (12) or by unknown sounds (20)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Times at which arrays that share a clock received the same sounds: they tell distances, which directions do not."""
+"""Times at which arrays that share a clock received the same sounds: they determine distances; directions do not."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Arrivals:
         return Arrivals(self.arrays, self.times_s[used])
 
     def contradictions_s(self, microphones: Microphones, positions_m: FloatArray, c_m_s: float) -> FloatArray:
-        """What the times of sounds at places (S, 3) are off by, (S, A) seconds."""
+        """Return the differences (S, A) between predicted and measured times of sounds at places (S, 3), seconds."""
         predicted = mean_times_s([microphones[name] for name in self.arrays], positions_m, c_m_s)
         there = np.isfinite(self.times_s)
         return centred(np.where(there, predicted, np.nan)) - centred(self.times_s)

@@ -1,4 +1,4 @@
-"""Says where a clap at a known place would tell most about the poses of arrays, and how well some claps tell them."""
+"""Proposes places for claps that determine poses best, and predicts how well some claps determine them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _ROUGH_DEG: Final = 60.0
 def proposed_place(
     microphones: Microphones, places_m: FloatArray, bounds_m: FloatArray, c_m_s: float, place_std_m: float
 ) -> FloatArray | None:
-    """Find the place at which the next clap tells most about the worst-known pose.
+    """Find the place at which the next clap improves the worst-known pose most.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def proposed_place(
 def expected_stds(
     microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float
 ) -> tuple[float, float]:
-    """Predict the largest standard deviations, in metres and degrees, of a pose that claps at places (S, 3) tell."""
+    """Predict the largest standard deviations, in metres and degrees, of a pose that is measured by claps (S, 3)."""
     information = _information(microphones_m, places_m, c_m_s, place_std_m).sum(axis=0)
     position_m, orientation_deg = _stds((information + _rough())[None])
     return float(position_m[0]), float(orientation_deg[0])

@@ -1,8 +1,8 @@
 """Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
-no common clock. Where some have one, the times between them tell distances better. The sounds do not tell where the
-whole is in the room, and so one array stays as it is filed.
+no common clock. Where some have one, the times between them determine distances. Where the whole set-up is in the
+room cannot be determined so, and one array stays as it is filed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LEAST_UNKNOWN: Final = 10
 """Fewest sounds at unknown places from which an array is refined: each brings three unknowns of its own."""
 
 POSITION_STD_M: Final = 0.5
-"""Standard deviation of a filed position that is refined, metres: pacing tells it to half a metre."""
+"""Standard deviation of a filed position that is refined, metres: as exact as one that is paced out."""
 
 OUTLIER: Final = 3.5
 """Misfit of a sound, in medians of all, from which it does not count: an array received an echo or another sound."""

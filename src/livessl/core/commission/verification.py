@@ -1,4 +1,4 @@
-"""What sounds at known places say about a set-up, in one word."""
+"""The verdict on a set-up by sounds at known places."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LARGE_ERROR_M: Final = 0.3
 
 
 class SetUpVerdict(StrEnum):
-    """What sounds at known places say about a set-up.
+    """Verdict on a set-up by sounds at known places.
 
     `ok`: every sound was located near its place. `wrong`: a finding explains what is wrong. `unexplained`: a sound was
     located far from its place or not at all, and no finding explains it.

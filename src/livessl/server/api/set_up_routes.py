@@ -44,7 +44,7 @@ def set_up_routes(parts: Parts) -> APIRouter:
     def post_verify(request: set_up_schema.VerifyRequest) -> Response:
         """Compare sounds with the places where they were made, and explain the errors; changes nothing. For operators.
 
-        One sound shows that something is wrong; four tell what.
+        One sound shows that something is wrong; four usually show what.
         """
         from livessl.site.build.set_up import verify_set_up  # scipy's optimizer takes memory, and no event needs it
 

@@ -30,7 +30,7 @@ def _whole(value: object) -> object:
 
 
 class ObservedDelays(BaseModel):
-    """What the channels of one array received of a sound, measured without knowing where the microphones are."""
+    """Delays and levels of one sound at the channels of one array, measured without any geometry."""
 
     array: str = Field(description="Name of the array.", examples=["north"])
     delays_us: list[float | None] = Field(
@@ -80,7 +80,7 @@ class ClapRequest(BaseModel):
 
 
 class VerifyRequest(BaseModel):
-    """Sounds at places that somebody measured."""
+    """Request to verify the set-up by sounds at measured places."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -88,7 +88,7 @@ class VerifyRequest(BaseModel):
 
 
 class VerifiedClap(BaseModel):
-    """Where a sound was located, and how far that is from where it was made."""
+    """One sound at a measured place, with the error of its position."""
 
     number: Number
     place_m: PlaceM
@@ -99,7 +99,7 @@ class VerifiedClap(BaseModel):
 
 
 class Verified(BaseModel):
-    """What the sounds say about the set-up."""
+    """Result of the verification."""
 
     v: Version
     verdict: SetUpVerdict
