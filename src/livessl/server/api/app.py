@@ -26,6 +26,7 @@ from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.set_up_routes import set_up_routes
 from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
 
@@ -83,6 +84,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         alert_routes(parts),
         dead_letter_routes(parts),
         zone_routes(parts),
+        set_up_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))
