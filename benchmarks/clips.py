@@ -196,7 +196,7 @@ def gains_db(scene: Scene, kind: str, snr_db: float, rng: np.random.Generator) -
     sounds = array_sounds(mixture, scene, CLOCK_STD_S * rng.standard_normal())
     early, late, quiet = (in_band_power(part, scene.sound_s) for part in (scene.early, scene.late, hiss))
     best = {"SNR": ratio_db(early, quiet).max(), "SNIR": ratio_db(early, quiet + late).max()}
-    found = {}
+    found: dict[str, dict[str, float]] = {}
     for method in METHODS:
         made = plan(sounds, place_m, C_M_S, method)
         early, late, quiet = (_power_of(made, part, scene) for part in (scene.early, scene.late, hiss))

@@ -55,7 +55,7 @@ def power(signal: FloatArray) -> float:
 
 
 def as_float32(parts: dict[str, FloatArray]) -> dict[str, np.ndarray[tuple[int, int], np.dtype[np.float32]]]:
-    return {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}  # type: ignore[misc]
+    return {name: np.asarray(part, dtype=np.float32) for name, part in parts.items()}
 
 
 def snr_db(sound: FloatArray, noise: FloatArray) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 import numpy as np
@@ -21,7 +21,7 @@ from livessl.site.tokens import Role, add_token
 from small_site import RATE_HZ, Changes, heard, running_server, scene, site_of, wait_until
 
 CLIPS: Changes = {"server.clips": {"folder": "clips", "pre_s": 0.6, "post_s": 0.2}}
-ROLES = ("viewer", "operator")
+ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
 
 
 class Desk:
@@ -58,7 +58,7 @@ class Desk:
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     directory = tmp_path_factory.mktemp("site")
-    tokens = {role: add_token(directory / "tokens.yaml", role, role) for role in ROLES}
+    tokens: dict[str, str] = {role: add_token(directory / "tokens.yaml", role, role) for role in ROLES}
     site = site_of({**CLIPS, "server.http.tokens": "tokens.yaml"}, directory)
     with running_server(site) as server:
         capture_scene(server)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Dialog, Page, expect
 from scene_server import capture_scene
 
 from browser import faultless_page, running_browser, visit
@@ -33,7 +33,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def tokens(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
     directory = tmp_path_factory.mktemp("site")
-    return directory, {role: add_token(directory / "tokens.yaml", role, role) for role in ("viewer", "operator")}  # type: ignore[arg-type]
+    return directory, {role: add_token(directory / "tokens.yaml", role, role) for role in ("viewer", "operator")}
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,12 @@ def test_operator_listens_keeps_and_deletes(
         kept = page.get_by_role("button", name="Keep no longer")
         expect(kept).to_have_attribute("aria-pressed", "true", timeout=1000 * HANG_S)
         asked: list[str] = []
-        page.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+
+        def refuse(dialog: Dialog) -> None:
+            asked.append(dialog.message)
+            dialog.dismiss()
+
+        page.once("dialog", refuse)
         page.get_by_role("button", name="Delete the recordings").click()
         assert asked == ["Delete the recordings of this event? The event itself stays."]
         expect(kept).to_be_visible()

@@ -19,9 +19,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from livessl.core.enhance.stft import Stft
+from livessl.core.enhance.stft import Spectra, Stft
 from livessl.core.steering import NEAREST_M
-from livessl.core.types import ArraySpec, BoolArray, ComplexArray, Float32Array, FloatArray, read_only
+from livessl.core.types import ArraySpec, BoolArray, Float32Array, FloatArray, read_only
 
 Method = Literal["delay-and-sum", "mvdr"]
 
@@ -103,7 +103,7 @@ class Beam:
     """
 
     stft: Stft
-    weights: ComplexArray
+    weights: Spectra
     noise_is_known: bool
 
     def apply(self, samples: Float32Array) -> FloatArray:
@@ -112,7 +112,7 @@ class Beam:
         return self.stft.inverse(np.einsum("fk,ktf->tf", self.weights.conj(), spectra), samples.shape[1])
 
 
-def steering_vector(spec: ArraySpec, position_m: FloatArray, frequencies_hz: FloatArray, c_m_s: float) -> ComplexArray:
+def steering_vector(spec: ArraySpec, position_m: FloatArray, frequencies_hz: FloatArray, c_m_s: float) -> Spectra:
     """Return the responses d (F, K) of an array's microphones to a sound at a position, relative to its centre.
 
     Parameters
@@ -154,21 +154,21 @@ def steer(sound: ArraySound, position_m: FloatArray, c_m_s: float, method: Metho
     return Beam(stft, np.asarray(weights, dtype=np.complex64), is_known)
 
 
-def covariance(spectra: ComplexArray, windows: FloatArray | BoolArray) -> ComplexArray:
+def covariance(spectra: Spectra, windows: FloatArray | BoolArray) -> Spectra:
     """Return the covariance (F, K, K) of spectra (K, T, F) over windows with these weights (T,)."""
     weighted = spectra * windows[:, None]
     sums = np.matmul(weighted.transpose(2, 0, 1), spectra.transpose(2, 1, 0).conj())
     return np.asarray(sums / max(float(windows.sum()), 1e-9), dtype=np.complex128)
 
 
-def loaded(noise: ComplexArray, loading: float) -> ComplexArray:
+def loaded(noise: Spectra, loading: float) -> Spectra:
     """Return a covariance (F, K, K) with a share of its mean power added to the diagonal."""
     count = noise.shape[1]
     mean = np.trace(noise, axis1=1, axis2=2).real / count
     return np.asarray(noise + (loading * mean + _LEAST_POWER)[:, None, None] * np.eye(count))
 
 
-def passing(both: ComplexArray, noise: ComplexArray, towards: ComplexArray, windows: float) -> ComplexArray:
+def passing(both: Spectra, noise: Spectra, towards: Spectra, windows: float) -> Spectra:
     """Return the weights (F, K) that pass a sound as delay-and-sum does and minimize the noise.
 
     Parameters

@@ -24,8 +24,8 @@ from livessl.core.enhance.align import (
     shifted_mask,
 )
 from livessl.core.enhance.beam import INSIDE, ArraySound, Beam, Method, covariance, passing, steer
-from livessl.core.enhance.stft import Stft
-from livessl.core.types import BoolArray, ComplexArray, Float32Array, FloatArray
+from livessl.core.enhance.stft import Spectra, Stft
+from livessl.core.types import BoolArray, Float32Array, FloatArray
 
 MOST_ARRAYS: Final = 8
 """Most arrays that are combined, those of the greatest signal-to-noise ratio: more add less than a decibel."""
@@ -75,7 +75,7 @@ class Part:
     snr_db: float | None
     shares: FloatArray
     first: float
-    weights: ComplexArray
+    weights: Spectra
     known: BoolArray
 
     @property
@@ -222,7 +222,7 @@ class _Aligned:
         return replace(self, is_used=False)
 
 
-def _powers(spectra: ComplexArray, quiet: FloatArray, during: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _powers(spectra: Spectra, quiet: FloatArray, during: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the mean powers (F,) of windows (T, F) in the quiet, 0 without any, and in the sound."""
     power, before = np.square(np.abs(spectra)).astype(np.float64), quiet > INSIDE
     noise = power[before].mean(axis=0) if before.any() else np.zeros(power.shape[1])
@@ -251,7 +251,7 @@ def _aligned(one: _Beamed, axis: _Axis, lag_s: float) -> _Aligned:
     return _Aligned(shifted(signal, first, axis.length), known, quiet, sound, first, lag_s)
 
 
-def _combination(beams: Sequence[_Aligned], rate_hz: float) -> tuple[ComplexArray, FloatArray]:
+def _combination(beams: Sequence[_Aligned], rate_hz: float) -> tuple[Spectra, FloatArray]:
     """Return the weights and the shares of aligned beams in each bin, (F, A) each."""
     stft = Stft.of(rate_hz)
     spectra = np.stack([stft.forward(one.signal) for one in beams])
@@ -274,7 +274,7 @@ def _combination(beams: Sequence[_Aligned], rate_hz: float) -> tuple[ComplexArra
 
 
 def _parts(
-    beams: Sequence[_Beamed], placed: Sequence[_Aligned], weights: ComplexArray, shares: FloatArray
+    beams: Sequence[_Beamed], placed: Sequence[_Aligned], weights: Spectra, shares: FloatArray
 ) -> Iterator[Part]:
     """Yield the parts of all arrays; those that are left out have no share."""
     number = 0

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 
-from livessl.core.types import BoolArray, ComplexArray, FloatArray, RealArray
+from livessl.core.types import BoolArray, FloatArray, RealArray
+
+Spectra = NDArray[np.complexfloating[Any, Any]]
+"""Complex arrays of either precision."""
 
 WINDOW_S: Final = 0.064
 """Length of a window, in seconds: long against the delays within an array and its early reflections, short enough for
@@ -42,25 +46,25 @@ class Stft:
     @property
     def window(self) -> FloatArray:
         """The square root of a Hann window (size,)."""
-        return np.sin(np.pi * (np.arange(self.size) + 0.5) / self.size)
+        return np.asarray(np.sin(np.pi * (np.arange(self.size) + 0.5) / self.size), dtype=np.float64)
 
     def frequencies_hz(self, sample_rate_hz: float) -> FloatArray:
         """Frequencies (F,) of the bins, hertz."""
-        return np.fft.rfftfreq(self.size, 1.0 / sample_rate_hz)
+        return np.asarray(np.fft.rfftfreq(self.size, 1.0 / sample_rate_hz))
 
-    def forward(self, samples: RealArray) -> ComplexArray:
+    def forward(self, samples: RealArray) -> Spectra:
         """Return the spectra (..., T, F) of samples (..., n); the first and the last window are half outside."""
         windows = self._cut(samples) * self.window.astype(np.float32)
         return np.asarray(scipy.fft.rfft(windows, axis=-1), dtype=np.complex64)
 
-    def inverse(self, spectra: ComplexArray, length: int) -> FloatArray:
+    def inverse(self, spectra: Spectra, length: int) -> FloatArray:
         """Return the samples (length,) of spectra (T, F)."""
         windows = scipy.fft.irfft(spectra, self.size, axis=-1) * self.window
         halves = windows.reshape(-1, 2, self.hop)
         padded = np.zeros((len(halves) + 1, self.hop))
         padded[:-1] += halves[:, 0]
         padded[1:] += halves[:, 1]
-        return padded.ravel()[self.hop : self.hop + length]
+        return np.asarray(padded.ravel()[self.hop : self.hop + length])
 
     def share(self, mask: BoolArray) -> FloatArray:
         """Return the share (T,) of each window's energy in which a mask (n,) is true; outside it counts as false."""

@@ -49,7 +49,7 @@ class Cut:
     @property
     def duration_s(self) -> float:
         """Length in seconds."""
-        return self.samples.shape[1] / self.sample_rate_hz
+        return float(self.samples.shape[1] / self.sample_rate_hz)
 
     def sound(self, start_ns: int, end_ns: int) -> ArraySound:
         """Return it for the enhancement of an event, given the span of the event's active frames in site time."""
