@@ -29,7 +29,7 @@ LOADING: Final = 1.0
 """Power that is added to the diagonal of the noise covariance, as a share of its mean: it keeps the beam's white-noise
 gain near that of delay-and-sum where few windows of quiet are known or the microphones are not quite in place."""
 
-PRIOR: Final = 0.75
+PRIOR: Final = 0.5
 """Weight of the direct sound in the estimate of the response, in units of the standard deviation by which a covariance
 of noise from as many windows errs."""
 
