@@ -3,6 +3,7 @@
 import { get, onTokenNeeded, post, put, useToken } from "./access.js";
 import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
+import { Clips } from "./clips.js";
 import { find, write } from "./dom.js";
 import { Readout } from "./estimate.js";
 import { EventList } from "./events.js";
@@ -45,9 +46,11 @@ const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name,
   const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
   put(address, { enabled }).catch((error) => console.warn(`livessl: array ${name}:`, error.message));
 });
+const clips = new Clips(API);
 const eventList = new EventList(find("events"), {
   empty: find("events-empty"),
   count: find("events-count"),
+  onOpen: (event, details) => clips.show(event, details),
   onMark: (event) => {
     model.setHighlight(event, event && when(event, model.serverNow()));
     redraw();
@@ -87,6 +90,7 @@ const HANDLERS = {
     alertsPanel.mayChange = message.role !== "viewer";
     zoneEditor.mayChange = message.role !== "viewer";
     setUp.mayChange = message.role !== "viewer";
+    clips.mayListen = message.role !== "viewer";
     HANDLERS.arrays(message);
     loadSite();
     loadEvents();
