@@ -223,7 +223,7 @@ def _localizer_settings(arguments: argparse.Namespace) -> Any:
         return noise.NoiseSettings(
             positions=arguments.positions or noise.POSITIONS,
             snrs_db=snrs_db or noise.SNRS_DB,
-            spacing_m=arguments.grid or noise.SPACING_M,
+            spacing_m=arguments.grid or localizer.SPACING_M,
             **common,
         )
     if names[0] in SESSIONS:
