@@ -213,10 +213,10 @@ def test_lasting_fault_of_a_channel_becomes_a_finding_and_shows_at_the_channel(
             desk.report("north", replace(hums, hum_dbfs=-50.0 - turn % 3))
     assert [channel["faults"] for channel in desk.array("north")["channels"]] == [[], ["hum"], [], []]
     assert desk.array("north")["state"] == desk.array("south")["state"]  # a warning: positions are as before
-    [finding] = desk.watch.findings
+    [finding] = desk.watch.state.findings
     assert (finding.fault, finding.array, finding.channel, finding.input) == ("hum", "north", 2, 2)
     assert caplog.text.count("channel 2 of 'north' hums at 50 Hz") == 1  # its figures change, and it is one fault
     for _ in range(10):
         desk.report("north", QUIET)
-    assert desk.watch.findings == ()
+    assert desk.watch.state.findings == ()
     assert desk.array("north")["channels"][1]["faults"] == []

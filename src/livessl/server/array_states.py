@@ -163,7 +163,7 @@ class ArrayStates:
     def _faults_of(self, array: str) -> dict[int, list[str]]:
         """Return the codes of the faults of each channel, from 1, of an array."""
         faults: dict[int, list[str]] = {}
-        for finding in self._set_up_watch.findings:
+        for finding in self._set_up_watch.state.findings:
             if finding.array == array and finding.channel is not None:
                 faults.setdefault(finding.channel, []).append(finding.fault)
         return faults

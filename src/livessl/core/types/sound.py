@@ -319,7 +319,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What the channels of one array received of one sound, measured without knowing where the microphones are.
+    """Delays and levels of one sound in the channels of one array, measured without knowing where the microphones are.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What one array received of one sound, from which an `Observation` is made when it is needed.
+    """One array's reception of one sound, from which an `Observation` is made when it is needed.
 
     Parameters
     ----------

@@ -200,7 +200,7 @@ class Refused(BaseModel):
 
 
 class LoadState(StrEnum):
-    """Whether the server keeps up with the sound: `normal`, or `overloaded` while it sheds work."""
+    """State of the server: `normal` while it keeps up with the sound, `overloaded` while it sheds work."""
 
     NORMAL = "normal"
     OVERLOADED = "overloaded"

@@ -59,8 +59,9 @@ def server_metrics(parts: Parts) -> Iterator[Metric]:
     findings = GaugeMetricFamily(
         "livessl_findings", "Faults of the set-up that sounds and nodes show.", labels=["severity"]
     )
+    found = parts.set_up_watch.state.findings
     for severity in Severity:
-        findings.add_metric([severity], sum(one.severity is severity for one in parts.set_up_watch.findings))
+        findings.add_metric([severity], sum(one.severity is severity for one in found))
     yield findings
     yield GaugeMetricFamily("livessl_websocket_clients", "Connected live subscribers.", parts.fanout.clients)
     yield GaugeMetricFamily("livessl_map_watchers", "Connected subscribers to power maps.", parts.maps.watchers)

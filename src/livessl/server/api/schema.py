@@ -201,7 +201,9 @@ class Event(BaseModel):
         examples=[None],
     )
     heard_by: ArrayNames = Field(description="Arrays that detected the sound by themselves.")
-    level_dbfs: LevelDbfs | None = Field(description="Level of the loudest 50 ms; null for digital silence.")
+    level_dbfs: LevelDbfs | None = Field(
+        description="Level of the loudest 50 ms; null for digital silence, and for a second source of unknown share."
+    )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
