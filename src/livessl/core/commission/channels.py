@@ -218,7 +218,7 @@ def steady_faults(
 
 def _mean_square(frames: Float32Array) -> FloatArray:
     """Mean square of each frame (K, F, n) -> (K, F)."""
-    return np.asarray(np.einsum("kfi,kfi->kf", frames, frames), dtype=np.float64) / frames.shape[2]
+    return np.asarray(np.einsum("kfi,kfi->kf", frames, frames) / frames.shape[2], dtype=np.float64)
 
 
 def _line(spectrum: FloatArray, at_hz: float) -> FloatArray:
