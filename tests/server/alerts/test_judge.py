@@ -32,6 +32,7 @@ from livessl.core.types import Event, Track, TrackState
 from livessl.server.alerts import backlog, history
 from livessl.server.alerts.outbox import DeliveryState, OutboxError
 from livessl.server.api.encode import JsonObject, Messages
+from livessl.server.set_up_watch import SetUpState
 from livessl.server.store import Store, StoreError
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
@@ -328,7 +329,7 @@ def test_finding_alerts_by_severity() -> None:
         "swaps": {"findings": {"severity": "info", "faults": ["turned"]}},
     }
     with running_desk(site(None, **rules)) as desk:
-        desk.findings.findings, desk.findings.sounds = tuple(faults), 3
+        desk.findings.state = SetUpState(3, tuple(faults))
         wait_until(lambda: len(desk.published) == 3, "the alerts")
     found = sorted((alert["rule"], alert["finding"]["fault"]) for alert in desk.published)
     assert found == [("all", "swapped"), ("all", "temperature"), ("errors", "swapped")]
