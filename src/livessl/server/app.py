@@ -17,6 +17,7 @@ from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.service import Clips
 from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
@@ -77,8 +78,8 @@ def assemble(
 
     Raises
     ------
-    BindError, ConfigError
-        See `Receiver` and `Alerts`.
+    BindError, ConfigError, ClipsError
+        See `Receiver`, `Alerts` and `Clips`.
     """
 
     def publish_event(event: JsonObject) -> None:
@@ -111,11 +112,15 @@ def assemble(
 
         presence = Presence(zones, publish_change)
         tracks = Tracks(presence)
+        kept = site.server.clips
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch
+            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
-        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones)
+        engine = Engine(
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, clips
+        )
         floor_plan = read_floor_plan(site)
         undo.pop_all()
     return Parts(
@@ -128,6 +133,7 @@ def assemble(
         array_states=array_states,
         event_log=event_log,
         alerts=alerts,
+        clips=clips,
         tracks=tracks,
         maps=maps,
         latency=latency,
@@ -164,8 +170,8 @@ class Server:
         If an address is taken.
     ConfigError
         If the server would be open to the network, or keys, tokens or certificate cannot be used.
-    StoreError, SinkError, OutboxError
-        If the event database, a sink or the outbox of the alerts cannot be used.
+    StoreError, SinkError, OutboxError, ClipsError
+        If the event database, a sink, the outbox of the alerts or the folder of clips cannot be used.
     """
 
     def __init__(
@@ -229,6 +235,8 @@ class Server:
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
             self.parts.alerts.stop()
+            if self.parts.clips is not None:
+                self.parts.clips.stop()
             self.parts.receiver.stop()
             self.parts.store.close()
             self.parts.sinks.close()
@@ -250,6 +258,8 @@ class Server:
         self.parts.maps.start()
         self.parts.set_up_watch.start()
         self.parts.alerts.start()
+        if self.parts.clips is not None:
+            self.parts.clips.start()
         if not self._stepped:
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)

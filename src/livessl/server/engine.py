@@ -11,6 +11,7 @@ from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -47,6 +48,8 @@ class Engine:
     overload : Overload
     zones : callable
         Returns the zones that are in force.
+    clips : Clips or None
+        Gets every frame, for what is kept of events.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class Engine:
         publisher: Publisher,
         overload: Overload,
         zones: Callable[[], ZoneMap],
+        clips: Clips | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
@@ -72,6 +76,7 @@ class Engine:
         self._publisher = publisher
         self._overload = overload
         self._zones = zones
+        self._clips = clips
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -206,6 +211,8 @@ class Engine:
             run.begin(origin_ns, self._zones)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
+        if self._clips is not None:
+            self._clips.take(batch, run.fusion.settled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

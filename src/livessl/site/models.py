@@ -114,12 +114,15 @@ class CalibratedArray(Model):
     position_std_m: Annotated[float, Field(ge=0)] = 0.0
     orientation_std_deg: Annotated[float, Field(ge=0)] = 0.0
     misfit_us: list[Annotated[float, Field(ge=0)]] = Field(default_factory=list)
+    covariance: list[list[float]] = Field(default_factory=list)
 
 
 class CalibrationFile(Model):
     """A file that `livessl calibrate` writes: it takes the place of the site file's positions of these arrays."""
 
     measured_utc: str = ""
+    method: str = ""
+    speed_of_sound_m_s: Annotated[float, Field(ge=0)] = 0.0
     sounds: Annotated[int, Field(ge=0)] = 0
     arrays: Annotated[dict[str, CalibratedArray], Field(min_length=1)]
 

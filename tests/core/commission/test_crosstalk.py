@@ -78,7 +78,7 @@ def test_channel_that_receives_all_others_is_named_alone() -> None:
     samples[1] += np.float32(0.1) * samples[[0, 2, 3]].sum(axis=0)
     (found,) = faults_of(samples)
     assert found.channel == 2
-    assert "channels 1 and 3 and 4" in found.message
+    assert "channels 1, 3 and 4 leak" in found.message
 
 
 def test_same_signal_is_another_fault() -> None:

@@ -166,7 +166,7 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
-    problems = parts.alerts.problems
+    problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if problems and status == "ok":
         status = "degraded"
     reasons += problems

@@ -1,8 +1,9 @@
 // The page's start: connects the messages of the server to the model, and the model to the panels and plans.
 
-import { get, onTokenNeeded, put, useToken } from "./access.js";
+import { get, onTokenNeeded, post, put, useToken } from "./access.js";
 import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
+import { Clips } from "./clips.js";
 import { find, write } from "./dom.js";
 import { Readout } from "./estimate.js";
 import { EventList } from "./events.js";
@@ -13,6 +14,7 @@ import { MapPanel } from "./map-panel.js";
 import { Model, OLD_MS } from "./model.js";
 import { drawTogether, Plan } from "./plan.js";
 import { ZoneEditor } from "./plan-zones-editor.js";
+import { SetUp } from "./set-up.js";
 import { readColours } from "./theme.js";
 
 const API = new URL("api/v1/", document.baseURI);
@@ -44,9 +46,11 @@ const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name,
   const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
   put(address, { enabled }).catch((error) => console.warn(`livessl: array ${name}:`, error.message));
 });
+const clips = new Clips(API);
 const eventList = new EventList(find("events"), {
   empty: find("events-empty"),
   count: find("events-count"),
+  onOpen: (event, details) => clips.show(event, details),
   onMark: (event) => {
     model.setHighlight(event, event && when(event, model.serverNow()));
     redraw();
@@ -85,6 +89,8 @@ const HANDLERS = {
     arraysPanel.mayChange = message.role !== "viewer";
     alertsPanel.mayChange = message.role !== "viewer";
     zoneEditor.mayChange = message.role !== "viewer";
+    setUp.mayChange = message.role !== "viewer";
+    clips.mayListen = message.role !== "viewer";
     HANDLERS.arrays(message);
     loadSite();
     loadEvents();
@@ -97,6 +103,7 @@ const HANDLERS = {
     header.showOverload(message.overload);
     arraysPanel.show(model.arrays, Date.now(), "live");
     mapPanel.offer(model.arrays.map(({ array }) => array.name));
+    setUp.showArrays(model.arrays, "live");
   },
   update(message) {
     model.takeUpdate(message);
@@ -169,6 +176,12 @@ async function refusal(response) {
 
 async function getJson(path) {
   const response = await get(new URL(path, API));
+  if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
+  return response.json();
+}
+
+async function postJson(path, value) {
+  const response = await post(new URL(path, API), value);
   if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
   return response.json();
 }
@@ -320,6 +333,7 @@ function draw(now) {
   if (model.site === null) return;
   dirty = false;
   drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images, zoneEditor.draft), colours);
+  setUp.place();
 }
 
 function applyTheme() {
@@ -330,6 +344,7 @@ function applyTheme() {
 
 // --- start ----------------------------------------------------------------------------------------------------
 
+const setUp = new SetUp({ load: getJson, send: postJson, plan: plans[0], redraw });
 applyTheme();
 light.addEventListener("change", applyTheme);
 const sizes = new ResizeObserver(redraw);
