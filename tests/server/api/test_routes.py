@@ -42,10 +42,15 @@ ROUTES = {
     "/api/v1/access",
     "/api/v1/alerts",
     "/api/v1/alerts/dead-letters",
+    "/api/v1/alerts/dead-letters/{number}",
     "/api/v1/alerts/dead-letters/{number}/resend",
     "/api/v1/alerts/rules",
     "/api/v1/alerts/rules/{name}/armed",
     "/api/v1/alerts/rules/{name}/dry-run",
+    "/api/v1/zones",
+    "/api/v1/zones/{name}",
+    "/api/v1/zone-changes",
+    "/api/v1/floor-plan",
     "/metrics",
 }
 """Every promised path but the WebSockets, which OpenAPI cannot describe."""
