@@ -12,6 +12,7 @@ import pytest
 
 from alert_desk import START, refused, sound
 from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.load_policy import LEVELS, NOTHING_SHED
 from livessl.core.types import FRAME_NS, Event, Frame, Status
 from livessl.server.clips import service
 from livessl.server.clips.service import SETTLE_NS, Clips
@@ -41,7 +42,7 @@ class Switches:
     """Stands in for site time and overload."""
 
     is_replay = False
-    message: str | None = None
+    relief = NOTHING_SHED
 
 
 class Desk:
@@ -166,10 +167,14 @@ def test_replay_gives_neither_frames_nor_events(tmp_path: Path) -> None:
     assert desk.clips.counts.without_sound == 1
 
 
-def test_overloaded_server_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
+def test_server_that_gives_up_arrays_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
     desk = Desk(tmp_path)
     desk.clips.take(heard(range(-8, 16)), None)
-    desk.switches.message = "overloaded"
+    desk.switches.relief = LEVELS[1]  # updates are given up, and clips are still cut
+    desk.finish(event(1))
+    desk.work()
+    assert (desk.clips.counts.shed, desk.clips.counts.without_sound) == (0, 1)
+    desk.switches.relief = next(relief for relief in LEVELS if relief.arrays is not None)
     desk.finish(event())
     desk.work()
     assert (desk.clips.counts.shed, desk.clips.counts.written, desk.clips.waiting) == (1, 0, 0)
@@ -216,12 +221,12 @@ def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
     worker = threading.Thread(target=desk.work)
     worker.start()
     assert reached.wait(60)
-    desk.finish(*(event(number) for number in range(1, 6)))  # returns at once: the disk still hangs
+    desk.finish(*(event(number) for number in range(11, 16)))  # returns at once: the disk still hangs
     assert (desk.clips.waiting, desk.clips.counts.shed) == (3, 3)
     release.set()
     worker.join(60)
     assert not worker.is_alive()
-    assert desk.clips.counts.written == 1
+    assert (desk.clips.counts.written, desk.clips.counts.without_sound) == (1, 2)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ class Clips:
     site_time : SiteTime
         Knows whether a replay runs; its events get no clips.
     overload : Overload
-        No clip is cut while sound arrives faster than it is located.
+        No clip is cut while whole arrays are given up for the load: their frames have no samples then.
 
     Raises
     ------
@@ -209,7 +209,7 @@ class Clips:
             job = self._waiting[0] if self._waiting else None
         if job is None or job.due_ns > self._clock.monotonic_ns():
             return False
-        if self._overload.message is None:
+        if self._overload.relief.arrays is None:
             self._write(job)
         else:
             self.counts.shed += 1
