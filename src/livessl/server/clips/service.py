@@ -169,7 +169,14 @@ class Clips:
     @property
     def problems(self) -> list[str]:
         """Sentences for the reasons of `health`."""
-        return [] if self._trouble is None else [self._trouble]
+        found = [] if self._trouble is None else [self._trouble]
+        kept, most = self.folder.kept_bytes, self._config.max_bytes
+        if kept > most:
+            found.append(
+                f"server.clips.max_bytes: clips that are kept for ever take {kept / 1e6:.1f} MB of {most / 1e6:.1f} MB, "
+                "so that new ones are deleted; keep fewer, or raise it"
+            )
+        return found
 
     def is_waiting(self, event_id: str) -> bool:
         """Return whether an event waits for its clip."""
