@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Iterable, Sequence
+from typing import Final, Protocol
 
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
-from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -31,6 +30,14 @@ BATCH: Final = 200
 _log = logging.getLogger(__name__)
 
 
+class SoundTaker(Protocol):
+    """Takes in the sound of the arrays, on the fusion thread, which it must not hold up."""
+
+    def take(self, messages: Iterable[Message], settled: int | None) -> None:
+        """Take in messages, and the frame index before which all results are final."""
+        ...
+
+
 class Engine:
     """Everything between the receiver and the publisher, in one thread.
 
@@ -45,8 +52,8 @@ class Engine:
     maps : Maps
     publisher : Publisher
     overload : Overload
-    clips : Clips or None
-        Gets every frame, for what is kept of events.
+    sound_takers : sequence of SoundTaker
+        Get every frame: for those who listen, and for what is kept of events.
     """
 
     def __init__(
@@ -60,7 +67,7 @@ class Engine:
         maps: Maps,
         publisher: Publisher,
         overload: Overload,
-        clips: Clips | None = None,
+        sound_takers: Sequence[SoundTaker] = (),
     ) -> None:
         self._site = site
         self._clock = clock
@@ -71,7 +78,7 @@ class Engine:
         self._maps = maps
         self._publisher = publisher
         self._overload = overload
-        self._clips = clips
+        self._sound_takers = sound_takers
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -206,8 +213,8 @@ class Engine:
             run.begin(origin_ns)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
-        if self._clips is not None:
-            self._clips.take(batch, run.fusion.settled)
+        for taker in self._sound_takers:
+            taker.take(batch, run.fusion.settled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)
