@@ -36,7 +36,11 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.zones.book import ZoneBook
+from livessl.server.zones.presence import Presence
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
+from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
 
 SWITCH_S: Final = 0.0005
@@ -90,12 +94,25 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
-        latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
+        zone_book = ZoneBook(site, publish)
+
+        def zones() -> ZoneMap:
+            return zone_book.current
+
+        latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
         overload = Overload(clock)
         set_up_watch = SetUpWatch(site, overload)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
         undo.callback(alerts.stop)
+
+        def publish_change(change: JsonObject, time_ns: int) -> None:
+            if not site_time.is_replay:
+                alerts.take_change(change, time_ns)
+            publish(change)
+
+        presence = Presence(zones, publish_change)
+        tracks = Tracks(presence)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
@@ -103,7 +120,10 @@ def assemble(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
-        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, sound)
+        engine = Engine(
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
+        )
+        floor_plan = read_floor_plan(site)
         undo.pop_all()
     return Parts(
         site=site,
@@ -125,6 +145,9 @@ def assemble(
         store=store,
         sinks=sinks,
         fanout=fanout,
+        zone_book=zone_book,
+        presence=presence,
+        floor_plan=floor_plan,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
 from livessl import wire
@@ -19,6 +19,7 @@ from livessl.server.publisher import Publisher
 from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
@@ -52,6 +53,8 @@ class Engine:
     maps : Maps
     publisher : Publisher
     overload : Overload
+    zones : callable
+        Returns the zones that are in force.
     sound_takers : sequence of SoundTaker
         Get every frame: for those who listen, and for what is kept of events.
     """
@@ -67,6 +70,7 @@ class Engine:
         maps: Maps,
         publisher: Publisher,
         overload: Overload,
+        zones: Callable[[], ZoneMap],
         sound_takers: Sequence[SoundTaker] = (),
     ) -> None:
         self._site = site
@@ -78,6 +82,7 @@ class Engine:
         self._maps = maps
         self._publisher = publisher
         self._overload = overload
+        self._zones = zones
         self._sound_takers = sound_takers
         self._parallel = Parallel()
         self._stop = threading.Event()
@@ -210,7 +215,7 @@ class Engine:
                 return
             recorded_ns = min(message.frame_index for message in batch) * FRAME_NS
             origin_ns = recorded_ns if self._site_time.is_replay else self._site_time.started_ns
-            run.begin(origin_ns)
+            run.begin(origin_ns, self._zones)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
         for taker in self._sound_takers:

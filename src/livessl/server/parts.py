@@ -22,6 +22,9 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.zones.book import ZoneBook
+from livessl.server.zones.presence import Presence
+from livessl.site.floor_plan import FloorPicture
 from livessl.site.models import Site
 
 
@@ -48,6 +51,9 @@ class Parts:
     store: Store
     sinks: Sinks
     fanout: Fanout
+    zone_book: ZoneBook
+    presence: Presence
+    floor_plan: FloorPicture | None
 
     @property
     def failure(self) -> BaseException | None:

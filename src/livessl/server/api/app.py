@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
 from livessl.server.api import documentation, routes
-from livessl.server.api.alert_routes import alert_routes
+from livessl.server.api.alert_routes import alert_routes, dead_letter_routes
 from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
@@ -27,6 +27,8 @@ from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.set_up_routes import set_up_routes
+from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
 
 STATIC: Final = Path(__file__).parents[1] / "static"
@@ -81,6 +83,9 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.event_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
+        dead_letter_routes(parts),
+        zone_routes(parts),
+        set_up_routes(parts),
         clip_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))

@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
     """The WebSockets of messages, of power maps, and of sound."""
     site, fanout, router = parts.site, parts.fanout, APIRouter()
+    book = parts.zone_book
 
     @router.websocket(LIVE)
     async def live(
@@ -54,7 +55,7 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
         try:
             _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.LiveParameters)
-            wanted = queries.live_filter(site, kinds, min_confidence, zone)
+            wanted = queries.live_filter(book.current.zones, kinds, min_confidence, zone)
             since = queries.message_number("since_seq", since_seq)
         except ValueError as error:
             await _refuse(socket, error)

@@ -32,6 +32,10 @@ export const put = (url, value) =>
 /** Delete a resource. */
 export const remove = (url) => request(url, { method: "DELETE" });
 
+/** Send `value` as JSON, for an answer. */
+export const post = (url, value) =>
+  request(url, { method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
