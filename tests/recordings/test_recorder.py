@@ -158,6 +158,8 @@ class Ailing:
     sample_rate_hz = float(RATE_HZ)
     channels = 8
     problem: str | None = None
+    lost_blocks = 0
+    through_sound_server = False
 
     def __enter__(self) -> Self:
         return self

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, Field
 
 from livessl.core.types import ClockState, Status, TrackState
-from livessl.server.api.report_schema import Channel, Host
+from livessl.server.api.report_schema import Channel, DriftState, Host
 
 Version = Annotated[
     Literal[1],
@@ -175,6 +175,18 @@ Candidates = Annotated[
 ]
 
 
+class Membership(BaseModel):
+    """A zone, and the probability that the sound came from it."""
+
+    name: str = Field(description="Name of the zone.", examples=["door"])
+    probability: float = Field(
+        ge=0,
+        le=1,
+        description="Probability by the event's covariance, given that the sound came from the search volume.",
+        examples=[0.97],
+    )
+
+
 class Event(BaseModel):
     """A finished sound: the accurate answer."""
 
@@ -206,6 +218,13 @@ class Event(BaseModel):
     )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
+    membership: list[Membership] = Field(description="Zones from which it came with a probability of at least 0.05.")
+    excluded: bool = Field(
+        description="Whether its position lies in an excluded zone, or does with a probability of at least 0.5. It "
+        "alerts nobody.",
+        examples=[False],
+    )
+    excluded_by: list[str] = Field(description="Names of these zones.", examples=[[]])
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
     latency_s: LatencyS
     latency_stages_s: StagesOrNull
@@ -335,5 +354,6 @@ class Array(BaseModel):
     channels_age_s: float | None = Field(
         ge=0, description="Seconds since that report; null if there is none.", examples=[0.6]
     )
+    drift: DriftState | None = Field(description="How well `drift_ppm` is known; null if its node does not report it.")
     host: Host | None = Field(description="State of its node's machine; null if it is not reported.")
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])
