@@ -75,7 +75,7 @@ def distances_m(events: Sequence[Event]) -> list[float]:
 
 
 def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
-    """Return all fields of an event as exact values; covariance and confidence are those of the sound, the former rounded."""
+    """Return all fields of an event as exact values; covariance, rounded, and confidence are those of the sound."""
     told: list[tuple[Any, ...]] = []
     for event in events:
         assert event.estimate is not None
