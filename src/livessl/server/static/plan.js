@@ -104,11 +104,6 @@ export class Plan {
     return [(px - this.left) / this.scale, (this.bottom - py) / this.scale];
   }
 
-  /** Metres at a pixel of the canvas, or null outside the room. */
-  metresAt(px, py) {
-    return this.#under(px, py);
-  }
-
   // What the layers draw with.
 
   /** Pixels of a position in metres. */
