@@ -79,6 +79,7 @@ class ServerConfig(Model):
     events_db: str | None = None
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
+    listen: bool = False
 
     @field_validator("bind")
     @classmethod
