@@ -21,6 +21,16 @@ class Device(Protocol):
         """The present problem of the device, in words; None if there is none."""
         ...
 
+    @property
+    def lost_blocks(self) -> int:
+        """Blocks that were lost since the start because this machine did not keep up."""
+        ...
+
+    @property
+    def through_sound_server(self) -> bool:
+        """Whether samples come through a sound server or plug-in, whose times do not show the device's clock."""
+        ...
+
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /

@@ -6,19 +6,20 @@ import asyncio
 import gc
 import logging
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
 from livessl.clock import Clock
-from livessl.core.locate.peak_search import warm_up
 from livessl.errors import ConfigError
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.listeners import Listeners
+from livessl.server.clips.service import Clips
+from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
@@ -35,15 +36,16 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.zones.book import ZoneBook
+from livessl.server.zones.presence import Presence
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
+from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
 releases it thousands of times a second; by Python's default it would wait 5 ms each time to get it back."""
-
-NOTICE_S: Final = 2.0
-"""Time, in seconds, that the kernels may take to load before the log says that they are being compiled."""
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
@@ -77,8 +79,8 @@ def assemble(
 
     Raises
     ------
-    BindError, ConfigError
-        See `Receiver` and `Alerts`.
+    BindError, ConfigError, ClipsError
+        See `Receiver`, `Alerts` and `Clips`.
     """
 
     def publish_event(event: JsonObject) -> None:
@@ -92,17 +94,36 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
-        latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
+        zone_book = ZoneBook(site, publish)
+
+        def zones() -> ZoneMap:
+            return zone_book.current
+
+        latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
         overload = Overload(clock)
         set_up_watch = SetUpWatch(site, overload)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
         undo.callback(alerts.stop)
+
+        def publish_change(change: JsonObject, time_ns: int) -> None:
+            if not site_time.is_replay:
+                alerts.take_change(change, time_ns)
+            publish(change)
+
+        presence = Presence(zones, publish_change)
+        tracks = Tracks(presence)
+        kept, listeners = site.server.clips, Listeners()
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch
+            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
-        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload)
+        sound = (listeners,) if clips is None else (listeners, clips)
+        engine = Engine(
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
+        )
+        floor_plan = read_floor_plan(site)
         undo.pop_all()
     return Parts(
         site=site,
@@ -114,6 +135,8 @@ def assemble(
         array_states=array_states,
         event_log=event_log,
         alerts=alerts,
+        clips=clips,
+        listeners=listeners,
         tracks=tracks,
         maps=maps,
         latency=latency,
@@ -122,6 +145,9 @@ def assemble(
         store=store,
         sinks=sinks,
         fanout=fanout,
+        zone_book=zone_book,
+        presence=presence,
+        floor_plan=floor_plan,
     )
 
 
@@ -147,8 +173,8 @@ class Server:
         If an address is taken.
     ConfigError
         If the server would be open to the network, or keys, tokens or certificate cannot be used.
-    StoreError, SinkError, OutboxError
-        If the event database, a sink or the outbox of the alerts cannot be used.
+    StoreError, SinkError, OutboxError, ClipsError
+        If the event database, a sink, the outbox of the alerts or the folder of clips cannot be used.
     """
 
     def __init__(
@@ -183,7 +209,9 @@ class Server:
             undo.callback(sinks.close)
             store = Store(site.file(site.server.events_db) if site.server.events_db else None)
             undo.callback(store.close)
-            _compile_kernels()
+            self._compiler = load_kernels()
+            if self._compiler is not None:
+                undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
@@ -204,10 +232,14 @@ class Server:
             asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
+            if self._compiler is not None:
+                self._compiler.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
             self.parts.alerts.stop()
+            if self.parts.clips is not None:
+                self.parts.clips.stop()
             self.parts.receiver.stop()
             self.parts.store.close()
             self.parts.sinks.close()
@@ -229,6 +261,8 @@ class Server:
         self.parts.maps.start()
         self.parts.set_up_watch.start()
         self.parts.alerts.start()
+        if self.parts.clips is not None:
+            self.parts.clips.start()
         if not self._stepped:
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
@@ -257,13 +291,3 @@ class Server:
             loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed, and no subscriber is left
             _log.debug("a message was published after the event loop had closed")
-
-
-def _compile_kernels() -> None:
-    """Compile the kernels before anybody waits for a result; reading them from numba's cache takes a moment only."""
-    notice = threading.Timer(NOTICE_S, _log.info, ["First start: compiling kernels. This can take a minute."])
-    notice.start()
-    try:
-        warm_up()
-    finally:
-        notice.cancel()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final, Protocol
 
 from livessl import wire
 from livessl.clock import Clock
@@ -19,6 +19,7 @@ from livessl.server.publisher import Publisher
 from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
@@ -28,6 +29,14 @@ BATCH: Final = 200
 """Most messages taken in before the fusion is stepped: one second of ten arrays."""
 
 _log = logging.getLogger(__name__)
+
+
+class SoundTaker(Protocol):
+    """Takes in the sound of the arrays, on the fusion thread, which it must not hold up."""
+
+    def take(self, messages: Iterable[Message], settled: int | None) -> None:
+        """Take in messages, and the frame index before which all results are final."""
+        ...
 
 
 class Engine:
@@ -44,6 +53,10 @@ class Engine:
     maps : Maps
     publisher : Publisher
     overload : Overload
+    zones : callable
+        Returns the zones that are in force.
+    sound_takers : sequence of SoundTaker
+        Get every frame: for those who listen, and for what is kept of events.
     """
 
     def __init__(
@@ -57,6 +70,8 @@ class Engine:
         maps: Maps,
         publisher: Publisher,
         overload: Overload,
+        zones: Callable[[], ZoneMap],
+        sound_takers: Sequence[SoundTaker] = (),
     ) -> None:
         self._site = site
         self._clock = clock
@@ -67,6 +82,8 @@ class Engine:
         self._maps = maps
         self._publisher = publisher
         self._overload = overload
+        self._zones = zones
+        self._sound_takers = sound_takers
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -198,9 +215,11 @@ class Engine:
                 return
             recorded_ns = min(message.frame_index for message in batch) * FRAME_NS
             origin_ns = recorded_ns if self._site_time.is_replay else self._site_time.started_ns
-            run.begin(origin_ns)
+            run.begin(origin_ns, self._zones)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
+        for taker in self._sound_takers:
+            taker.take(batch, run.fusion.settled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

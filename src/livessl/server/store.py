@@ -56,7 +56,7 @@ class Cursor(NamedTuple):
 class Query:
     """A search for events: times in nanoseconds since the epoch, both ends included.
 
-    `before` is the cursor of the page before.
+    `before` is the cursor of the page before. Events come newest first unless `oldest_first` is set.
     """
 
     since_ns: int | None = None
@@ -65,6 +65,7 @@ class Query:
     min_confidence: float | None = None
     limit: int = 50
     before: Cursor | None = None
+    oldest_first: bool = False
 
 
 class Finalized(NamedTuple):
@@ -262,17 +263,19 @@ class Store:
         return dict(json.loads(rows[0][0])) if rows else None
 
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
-        """Return events, newest first by their time, and the cursor of the next page or None."""
+        """Return events, newest first by their time unless asked otherwise, and the cursor of the next page or None."""
+        beyond, order = (">", "ASC") if query.oldest_first else ("<", "DESC")
         conditions: dict[str, tuple[Any, ...]] = {
             "time_ns >= ?": (query.since_ns,),
             "time_ns <= ?": (query.until_ns,),
             "confidence >= ?": (query.min_confidence,),
-            "(time_ns, number) < (?, ?)": query.before or (None,),
+            f"(time_ns, number) {beyond} (?, ?)": query.before or (None,),
             "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": (query.zone,),
         }
         used = {text: values for text, values in conditions.items() if values != (None,)}
         where = f"WHERE {' AND '.join(used)} " if used else ""
-        sql = f"SELECT time_ns, number, json FROM events {where}ORDER BY time_ns DESC, number DESC LIMIT ?"  # noqa: S608 - fixed texts
+        ordered = f"ORDER BY time_ns {order}, number {order} LIMIT ?"
+        sql = f"SELECT time_ns, number, json FROM events {where}{ordered}"  # noqa: S608 - fixed texts
         rows = self._reading.rows(sql, (*(value for values in used.values() for value in values), query.limit + 1))
         page = rows[: query.limit]
         next_page = Cursor(*page[-1][:2]) if len(rows) > query.limit else None

@@ -25,12 +25,15 @@ from livessl.site.guesses import box_cure, position_cure, rate_cure, unlikely
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 from livessl.site.place import Finding, Place
+from livessl.site.zone_models import Zone
 
 COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
 
 SAMPLED_GRID_POINTS: Final = 500
-"""Approximate number of grid points at which `_wide_arrays` compares the grid with an array: enough for a median."""
+"""Approximate number of grid points at which `wide_arrays` compares the grid with an array: enough for a median."""
+
+BAD_NAME: Final = "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -51,9 +54,12 @@ def cross_faults(site: Site) -> Iterator[Finding]:
             f"expected at most the number of arrays, {count}{' (joint ones are one)' if site.joint else ''}, "
             f"got {site.fusion.min_arrays}",
         )
-    boxes = {("zones", name, "bounds_m"): zone.bounds_m for name, zone in site.zones.items()}
-    for place, bounds in ((("grid", "bounds_m"), site.grid.bounds_m), *boxes.items()):
-        yield from ((place, what) for what in _outside(site, bounds))
+    yield from ((("grid", "bounds_m"), what) for what in _outside(site, site.grid.bounds_m))
+    for name, zone in site.zones.items():
+        yield from zone_faults(site, name, zone)
+    for name in site.drawn_zones:
+        if name in site.zones:
+            yield ("zones", name), f"{site.zones_file} has a drawn zone of the same name; rename one of them"
     for spec in site.specs:
         yield from ((("arrays", spec.name), what) for what in _array_faults(site, spec))
     for one, other in combinations(site.specs, 2):
@@ -62,6 +68,24 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
     yield from alert_faults(site)
+    if site.privacy == "positions-only" and site.server.listen:
+        yield (
+            ("server", "listen"),
+            "with privacy: positions-only nobody may listen; remove it, or set privacy: recording",
+        )
+    if site.privacy == "positions-only" and site.server.clips is not None:
+        yield (
+            ("server", "clips"),
+            "with privacy: positions-only no sound may be stored on a disk; remove it, or set privacy: recording",
+        )
+
+
+def zone_faults(site: Site, name: str, zone: Zone) -> Iterator[Finding]:
+    """Yield faults of a zone that only show beside its name and the room."""
+    if not _NAME.fullmatch(name):
+        yield ("zones", name), BAD_NAME
+    key = "bounds_m" if zone.polygon_m is None else "polygon_m"
+    yield from ((("zones", name, key), what) for what in _outside(site, zone.box_m(site.room.size_m[2])))
 
 
 def warnings_of(site: Site) -> tuple[str, ...]:
@@ -101,10 +125,10 @@ def unprotected_addresses(site: Site) -> list[Fault]:
 
 
 def _name_faults(site: Site) -> Iterator[Finding]:
-    for kind, names in (("arrays", site.arrays), ("joint", site.joint), ("nodes", site.nodes), ("zones", site.zones)):
+    for kind, names in (("arrays", site.arrays), ("joint", site.joint), ("nodes", site.nodes)):
         for name in names:
             if not _NAME.fullmatch(name):
-                yield (kind, name), "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
+                yield (kind, name), BAD_NAME
             elif name == "fused" and kind in ("arrays", "joint"):
                 yield (kind, name), "expected another name: 'fused' is the map of all arrays together; rename it"
 
@@ -190,8 +214,8 @@ def _capture_faults(node: NodeConfig, spec: ArraySpec, channels: Sequence[int]) 
         )
 
 
-def _wide_arrays(site: Site) -> Iterator[str]:
-    """Yield a warning for each array whose peaks are narrower than the grid.
+def wide_arrays(site: Site) -> Iterator[tuple[ArraySpec, float]]:
+    """Yield each array whose peaks are narrower than the grid, and the frequency up to which they are not, in hertz.
 
     These are arrays for which, at half of all grid points and pairs or more, the delay changes by over half a period
     from a grid point to a corner of its cell.
@@ -202,15 +226,22 @@ def _wide_arrays(site: Site) -> Iterator[str]:
     for spec in site.processed:
         if reach_m == 0.0 or uses_envelope(spec.band_hz):
             continue
-        pairs, high = microphone_pairs(len(spec.microphones_m)), spec.band_hz[1]
-        kept = float(np.median(alias_free_hz(points_m, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        pairs = microphone_pairs(len(spec.microphones_m))
+        kept_hz = float(np.median(alias_free_hz(points_m, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        if kept_hz < spec.band_hz[1]:
+            yield spec, kept_hz
+
+
+def _wide_arrays(site: Site) -> Iterator[str]:
+    """Yield a warning for each array whose peaks are narrower than the grid."""
+    for spec, kept_hz in wide_arrays(site):
+        spacing_m, high_hz = site.grid.spacing_m, spec.band_hz[1]
         cure = f"take joint.{spec.name} away" if spec.name in site.joint else "make arrays smaller"
-        if kept < high:
-            yield (
-                f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high:g} Hz needs a "
-                f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
-                f"wrong: lower the array's band_hz, or {cure}"
-            )
+        yield (
+            f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high_hz:g} Hz needs a "
+            f"spacing of about {spacing_m * kept_hz / high_hz:.2g} m, got {spacing_m:g}; positions may be "
+            f"wrong: lower the array's band_hz, or {cure}"
+        )
 
 
 def _near_arrays(site: Site) -> Iterator[str]:

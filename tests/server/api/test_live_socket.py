@@ -38,7 +38,7 @@ def test_first_message_is_hello(server: Server) -> None:
         assert [array["name"] for array in hello["arrays"]] == ["north", "south"]
         socket.send("messages of clients are ignored")
         following = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(2)]
-        assert {message["kind"] for message in following} <= {"arrays", "track"}
+        assert {message["kind"] for message in following} <= {"arrays", "track", "zone"}
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 
@@ -58,7 +58,7 @@ def test_client_that_returns_gets_what_it_missed(server: Server) -> None:
 @pytest.mark.parametrize(
     ("query", "reason"),
     [
-        ("?kinds=events", "kinds: expected some of alert, arrays, event, track, update, got 'events'"),
+        ("?kinds=events", "kinds: expected some of alert, arrays, event, track, update, zone, zones, got 'events'"),
         ("?since_seq=-1", "since_seq: expected the seq of a message, got '-1'"),
         ("?since_seq=x", "since_seq: expected the seq of a message, got 'x'"),
         ("?zone=hall", "zone: no zone 'hall'; zones are door, room"),

@@ -17,7 +17,7 @@ from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
 from livessl.site.models import Site
 
-KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert"})
+KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "zone", "zones"})
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
 
 
@@ -26,7 +26,8 @@ class LiveParameters(BaseModel):
 
     kinds: str | None = Field(
         default=None,
-        description="Message kinds, separated by commas: alert, arrays, event, track, update. All if absent.",
+        description="Message kinds, separated by commas: alert, arrays, event, track, update, zone, zones. All if "
+        "absent.",
         examples=["event,track"],
     )
     min_confidence: float = Field(
@@ -34,7 +35,7 @@ class LiveParameters(BaseModel):
     )
     zone: str | None = Field(
         default=None,
-        description="Only events, updates, tracks and alerts inside this zone are sent.",
+        description="Only events, updates, tracks, changes and alerts inside this zone are sent.",
         examples=["door"],
     )
     since_seq: int | None = Field(
@@ -52,6 +53,13 @@ class MapParameters(BaseModel):
     views: str = Field(
         default="floor", description="Views, separated by commas: floor, side, front.", examples=["floor,side"]
     )
+
+
+class ListenParameters(BaseModel):
+    """Query parameters of the WebSocket of sound."""
+
+    array: str = Field(description="Name of an array.", examples=["north"])
+    channel: int = Field(default=1, ge=1, description="Microphone of the array, from 1.", examples=[1])
 
 
 async def refuse_unknown_parameters(request: Request) -> None:
@@ -129,8 +137,8 @@ def page_cursor(text: str | None) -> Cursor | None:
         raise unprocessable("cursor", f"cursor: {error}") from error
 
 
-def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
-    """Filter of a live subscriber.
+def live_filter(zones: Collection[str], kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
+    """Filter of a live subscriber, on a site with these zones.
 
     Raises
     ------
@@ -146,8 +154,8 @@ def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | 
         least = float("nan")
     if not 0.0 <= least <= 1.0:
         raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
-    if zone is not None and zone not in site.zones:
-        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+    if zone is not None and zone not in zones:
+        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
     return Filter(chosen, least, zone)
 
 
@@ -172,6 +180,24 @@ def array_names(site: Site) -> list[str]:
 def map_names(site: Site) -> list[str]:
     """Names of the power maps: `fused`, and one for each array."""
     return [FUSED, *array_names(site)]
+
+
+def chosen_microphone(site: Site, array: str, channel: str) -> int:
+    """Channel that a listener has chosen, from 1.
+
+    Raises
+    ------
+    ValueError
+        If the site permits nobody to listen, or the array or the channel does not exist.
+    """
+    if not site.server.listen:
+        raise ValueError("listen: the site file does not permit it; set server.listen: true")
+    if array not in array_names(site):
+        raise ValueError(f"array: no array {array!r}; there are {', '.join(array_names(site))}")
+    count = len(site.array(array).microphones_m)
+    if not channel.isascii() or not channel.isdigit() or not 1 <= int(channel) <= count:
+        raise ValueError(f"channel: expected a number from 1 to {count}, got {channel!r}")
+    return int(channel)
 
 
 def chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:

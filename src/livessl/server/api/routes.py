@@ -52,14 +52,15 @@ def as_json(found: JsonObject, status: int = 200) -> Response:
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
-def describe_site(site: Site, mode: str) -> JsonObject:
+def describe_site(parts: Parts) -> JsonObject:
     """Geometry and settings, for clients that draw."""
+    site, picture = parts.site, parts.floor_plan
     grid = search_grid(site)
     return {
         "v": API_VERSION,
         "site": site.site,
         "version": __version__,
-        "mode": mode,
+        "mode": parts.site_time.mode,
         "room": {"size_m": list(site.room.size_m)},
         "grid": {"bounds_m": [list(b) for b in grid.bounds_m], "spacing_m": grid.spacing_m, "shape": list(grid.shape)},
         "speed_of_sound_m_s": site.c_m_s,
@@ -76,7 +77,9 @@ def describe_site(site: Site, mode: str) -> JsonObject:
             for spec in site.processed
         },
         "joint": {name: list(members) for name, members in site.joint.items()},
-        "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
+        "zones": parts.zone_book.describe(),
+        "can_draw": site.zones_file is not None,
+        "floor_plan": None if picture is None else {"bounds_m": [list(b) for b in picture.bounds_m]},
         "privacy": _privacy(site),
     }
 
@@ -100,7 +103,7 @@ def state_routes(parts: Parts) -> APIRouter:
     @router.get("/api/v1/site", tags=["state"], response_model=answers.Site)
     def get_site() -> Response:
         """Room, grid, arrays and settings."""
-        return as_json(describe_site(site, parts.site_time.mode))
+        return as_json(describe_site(parts))
 
     @router.get("/api/v1/arrays", tags=["state"], response_model=answers.Arrays)
     def get_arrays() -> Response:
@@ -111,9 +114,9 @@ def state_routes(parts: Parts) -> APIRouter:
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
         """Faults of the set-up that the last sounds show, errors first."""
-        watch = parts.set_up_watch
-        findings = [{"kind": "finding", **asdict(finding)} for finding in watch.findings]
-        return as_json({"v": API_VERSION, "sounds": watch.sounds, "findings": findings})
+        state = parts.set_up_watch.state
+        findings = [{"kind": "finding", **asdict(finding)} for finding in state.findings]
+        return as_json({"v": API_VERSION, "sounds": state.sounds, "findings": findings})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:
@@ -163,7 +166,7 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
     if (unkept or unsaved) and status == "ok":
         status = "degraded"
-    problems = parts.alerts.problems
+    problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if problems and status == "ok":
         status = "degraded"
     reasons += problems
@@ -223,7 +226,7 @@ def access_route(parts: Parts, access: Access) -> APIRouter:
 
 def event_routes(parts: Parts) -> APIRouter:
     """The history of events."""
-    site, store, router = parts.site, parts.store, APIRouter()
+    store, router = parts.store, APIRouter()
 
     @router.get(
         "/api/v1/events",
@@ -242,8 +245,9 @@ def event_routes(parts: Parts) -> APIRouter:
         cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page, unchanged")] = None,
     ) -> Response:
         """Finished events, newest first."""
-        if zone is not None and zone not in site.zones:
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+        zones = parts.zone_book.current.zones
+        if zone is not None and zone not in zones:
+            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
         query = EventQuery(
             instant("since", since), instant("until", until), zone, min_confidence, limit, page_cursor(cursor)
         )

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, Field
 
 from livessl.core.types import ClockState, Status, TrackState
+from livessl.server.api.report_schema import Channel, DriftState, Host
 
 Version = Annotated[
     Literal[1],
@@ -174,6 +175,18 @@ Candidates = Annotated[
 ]
 
 
+class Membership(BaseModel):
+    """A zone, and the probability that the sound came from it."""
+
+    name: str = Field(description="Name of the zone.", examples=["door"])
+    probability: float = Field(
+        ge=0,
+        le=1,
+        description="Probability by the event's covariance, given that the sound came from the search volume.",
+        examples=[0.97],
+    )
+
+
 class Event(BaseModel):
     """A finished sound: the accurate answer."""
 
@@ -200,9 +213,18 @@ class Event(BaseModel):
         examples=[None],
     )
     heard_by: ArrayNames = Field(description="Arrays that detected the sound by themselves.")
-    level_dbfs: LevelDbfs | None = Field(description="Level of the loudest 50 ms; null for digital silence.")
+    level_dbfs: LevelDbfs | None = Field(
+        description="Level of the loudest 50 ms; null for digital silence, and for a second source of unknown share."
+    )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
+    membership: list[Membership] = Field(description="Zones from which it came with a probability of at least 0.05.")
+    excluded: bool = Field(
+        description="Whether its position lies in an excluded zone, or does with a probability of at least 0.5. It "
+        "alerts nobody.",
+        examples=[False],
+    )
+    excluded_by: list[str] = Field(description="Names of these zones.", examples=[[]])
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
     latency_s: LatencyS
     latency_stages_s: StagesOrNull
@@ -326,4 +348,12 @@ class Array(BaseModel):
     agreement: Agreement
     clock_offset: ClockOffset | None = Field(description="Null until three sounds have been measured.")
     counters: Counters
+    channels: list[Channel] = Field(
+        description="Level of each channel in the site file's order; empty until its node has reported them."
+    )
+    channels_age_s: float | None = Field(
+        ge=0, description="Seconds since that report; null if there is none.", examples=[0.6]
+    )
+    drift: DriftState | None = Field(description="How well `drift_ppm` is known; null if its node does not report it.")
+    host: Host | None = Field(description="State of its node's machine; null if it is not reported.")
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])

@@ -29,11 +29,19 @@ export const get = (url) => request(url, {});
 export const put = (url, value) =>
   request(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
 
+/** Delete a resource. */
+export const remove = (url) => request(url, { method: "DELETE" });
+
+/** Send `value` as JSON, for an answer. */
+export const post = (url, value) =>
+  request(url, { method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
   const signal = AbortSignal.timeout(TIMEOUT_MS);
   const response = await fetch(url, { ...options, cache: "no-store", headers, signal });
-  if (response.status === 401) tokenNeeded(token !== null);
+  const isCurrent = token === sessionStorage.getItem(STORAGE_KEY); // it may have been entered since the request was sent
+  if (response.status === 401 && isCurrent) tokenNeeded(token !== null);
   return response;
 }
