@@ -137,7 +137,7 @@ def test_power_that_noise_reaches_by_chance_has_no_weight(kernels: ModuleType, r
     for level in levels:
         state = fresh_state()
         weights, noises = np.empty((2, 20, BINS), np.float32)
-        spectra = np.full((20, 2, LOW + BINS + 5), np.sqrt(power), np.complex64)
+        spectra = np.full((20, 3, LOW + BINS + 5), np.sqrt(power), np.complex64)
         kernels.onset_weights(spectra, LOW, LEARNED, True, parameters, state, weights, noises)
         louder = np.sqrt(np.float32(level)) * spectra[:1]
         kernels.onset_weights(louder, LOW, LEARNED, False, parameters, state, weights[:1], noises[:1])
