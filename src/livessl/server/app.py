@@ -181,7 +181,7 @@ class Server:
             undo.callback(self._listener.close)
             sinks = Sinks([sink.model_copy(update={"path": str(site.file(sink.path))}) for sink in site.server.sinks])
             undo.callback(sinks.close)
-            store = Store(site.file(site.server.events_db) if site.server.events_db else None)
+            store = Store.of(site)
             undo.callback(store.close)
             _compile_kernels()
             url = url_of(self._listener, tls=certificate is not None)
@@ -230,6 +230,7 @@ class Server:
         self.parts.set_up_watch.start()
         self.parts.alerts.start()
         if not self._stepped:
+            self.parts.store.backlog.start()
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]

@@ -48,5 +48,5 @@ class Parts:
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        threads = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts)
+        threads = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.store.backlog)
         return next((thread.failure for thread in threads if thread.failure is not None), None)

@@ -29,11 +29,14 @@ export const get = (url) => request(url, {});
 export const put = (url, value) =>
   request(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
 
+/** Read a resource whose answer may take long. */
+export const getStream = (url) => request(url, { signal: null });
+
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
   const signal = AbortSignal.timeout(TIMEOUT_MS);
-  const response = await fetch(url, { ...options, cache: "no-store", headers, signal });
+  const response = await fetch(url, { signal, ...options, cache: "no-store", headers });
   if (response.status === 401) tokenNeeded(token !== null);
   return response;
 }
