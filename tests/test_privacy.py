@@ -46,7 +46,7 @@ def test_a_running_system_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: p
         written = {path.name for path in tmp_path.rglob("*")}
         assert {name.partition("-")[0] for name in written} == {"events.db"}
     with closing(sqlite3.connect(tmp_path / "events.db")) as db:
-        texts = [text for (text,) in db.execute("SELECT json FROM events")]
+        texts = [text for (text,) in db.execute("SELECT body FROM events")]
     assert len(texts) == 2
     assert max(map(len, texts)) < 2 * 4 * 0.05 * 16000  # 16 bit, four channels
 

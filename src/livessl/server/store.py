@@ -98,6 +98,11 @@ class Store:
         return cls(history_place(site))
 
     @property
+    def problem(self) -> str | None:
+        """Why a database cannot be used that has not been usable since the start, as PostgreSQL can be; else None."""
+        return self._database.problem
+
+    @property
     def cure(self) -> str:
         """What to do if the database cannot be written."""
         return self._database.cure

@@ -160,7 +160,7 @@ def _add_exports(router: APIRouter, parts: Parts, searched: Any) -> None:
             description="All events that the filters admit, newest first, as a stream.",
             response_class=Response,
             responses={
-                200: {"description": "The events.", "content": {media_type.partition(";")[0]: _BINARY}},
+                200: {"description": "The events.", "content": {media_type: _BINARY}},
                 **_NAMES,
                 **(errors(501, texts={501: "pyarrow is not installed."}) if form == "parquet" else {}),
             },

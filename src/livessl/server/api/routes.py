@@ -160,7 +160,9 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(f"server.events_db: {unkept} events were not stored; {parts.store.cure}")
     if unsaved:
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {parts.store.cure}")
-    if (unkept or unsaved) and status == "ok":
+    if parts.store.problem is not None:
+        reasons.append(parts.store.problem)
+    if (unkept or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems
     if problems and status == "ok":

@@ -64,6 +64,7 @@ class Backlog:
         self._prepare = prepare
         self._waiting: deque[Write] = deque()
         self._changed = threading.Condition()
+        self._draining = threading.Lock()  # a caller may still be at work when the thread starts
         self._thread: threading.Thread | None = None
         self._is_ending = self._is_writing = False
         self._put = self._done = 0
@@ -138,7 +139,8 @@ class Backlog:
     def _work(self) -> None:
         try:
             while True:
-                self._drain()
+                with self._draining:
+                    self._drain()
                 with self._changed:
                     if self._is_ending:
                         return
@@ -153,7 +155,8 @@ class Backlog:
 
     def _try(self, now_ns: int) -> None:
         self._tried_ns = now_ns
-        self._drain()
+        with self._draining:
+            self._drain()
 
     def _drain(self) -> None:
         """Write what waits until it is done or the database fails."""

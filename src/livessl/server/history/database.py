@@ -92,6 +92,11 @@ class Database:
         """True once the tables are known to be there."""
         return self._is_prepared
 
+    @property
+    def problem(self) -> str | None:
+        """Why the tables could not be prepared yet; None if they are."""
+        return None if self._is_prepared else self._problem
+
     def prepare(self) -> bool:
         """Make or migrate the tables, once, before anything else; return True if this call has done it.
 

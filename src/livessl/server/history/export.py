@@ -102,10 +102,10 @@ def flat(event: JsonObject) -> JsonObject:
 
 FORMATS: Final[dict[str, tuple[str, Callable[[Pages], Iterator[bytes]]]]] = {
     "csv": ("text/csv; charset=utf-8", csv_lines),
-    "jsonl": ("application/x-ndjson", json_lines),
-    "parquet": ("application/vnd.apache.parquet", parquet),
+    "jsonl": ("application/octet-stream", json_lines),
+    "parquet": ("application/octet-stream", parquet),
 }
-"""Media type and encoder of each format."""
+"""Media type and encoder of each format; generators of clients do not know the types of JSON Lines and Parquet."""
 
 
 def _cell(value: Any) -> Any:
