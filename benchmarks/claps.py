@@ -119,7 +119,7 @@ def clap(name: str, arrays: Site, method: str | None = None) -> Clap:
     """Locate one clap: its first source is the loudest event's."""
     truth_m = placed_m(json.loads((FOLDER / "truth.json").read_text())["source_m"])
     events = heard(name, arrays, method)
-    first = max((event for event in events if event.source == 1), key=lambda event: event.power)
+    first = max((event for event in events if event.source == 1), key=lambda event: event.power or 0.0)
     further = [event for event in events if event is not first and event.status is Status.LOCATED]
     estimate, error_m, inside = first.estimate, None, None
     if estimate is not None:

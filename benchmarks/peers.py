@@ -37,8 +37,7 @@ from livessl.core.correlate.band import band_bins
 from livessl.core.correlate.gcc_phat import GCCPhat, correlated
 from livessl.core.correlate.spectra import Spectra, whole_segment
 from livessl.core.geometry import Grid, microphone_pairs, pair_weight, posed, tetrahedron
-from livessl.core.kernels import with_numba, with_numpy
-from livessl.core.locate import peak_search, srp
+from livessl.core.kernels import kernels, with_numba, with_numpy
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.refine import Peak
 from livessl.core.locate.srp import SRPMapper
@@ -221,15 +220,13 @@ PEERS: Final[dict[str, Callable[[Sequence[ArraySpec], FloatArray], Power]]] = {
 
 @contextmanager
 def using(form: ModuleType) -> Iterator[None]:
-    """Build and run with one form of the kernels, `compiled` or `vectorised`."""
-    before = vars(peak_search)["kernels"]
-    for module in (peak_search, srp):
-        setattr(module, "kernels", form)  # noqa: B010 - it is not exported, and mypy would say so
+    """Build and run with one form of the kernels."""
+    before = kernels.in_use
+    kernels.use(form)
     try:
         yield
     finally:
-        for module in (peak_search, srp):
-            setattr(module, "kernels", before)  # noqa: B010
+        kernels.use(before)
 
 
 class Ours:

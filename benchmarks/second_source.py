@@ -98,7 +98,7 @@ def outcome(case: Case) -> dict[str, Any]:
     Recorder.judged.clear()
     events = events_in(case.site, parts, "observed")
     located = [event for event in events if event.status is Status.LOCATED]
-    first = max((event for event in events if event.source == 1), key=lambda event: event.power, default=None)
+    first = max((event for event in events if event.source == 1), key=lambda event: event.power or 0.0, default=None)
     found_m = [event.estimate.position_m for event in located if event.estimate is not None]
     errors_m = [[apart_m(place_m, truth_m) for truth_m in case.truths_m] for place_m in found_m]
     pairs = [_judged(pair, case.truths_m) for pair in Recorder.judged]

@@ -61,5 +61,5 @@ else
 fi
 rm -f "$stamp"
 say "setup: installing livessl${extras:+ with $extras} and its dependencies into .venv"
-.venv/bin/python -m pip install --quiet --quiet --disable-pip-version-check -e ".${extras:+[$extras]}"
+.venv/bin/python -m pip install --quiet --quiet --no-compile --disable-pip-version-check -e ".${extras:+[$extras]}"
 printf '%s\n' "$checksum [$extras]" > "$stamp"

@@ -37,7 +37,9 @@ export PATH
 set -x
 ruff check
 ruff format --check
+python -m livessl.server.compiling & # once, not in every worker; meanwhile:
+compiling=$!
 mypy
 lint-imports
-python -c 'from livessl.core.locate.peak_search import warm_up; warm_up()' # compile once, not in every worker
+wait "$compiling"
 pytest -n 4 --dist loadfile --no-loadscope-reorder "$@"

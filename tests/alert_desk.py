@@ -17,6 +17,7 @@ from livessl.server.alerts.service import Alerts
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.event_log import EventLog
 from livessl.server.latency import Arrivals, Latency
+from livessl.server.set_up_watch import SetUpState
 from livessl.server.store import Store
 from livessl.site.models import Site
 from small_site import Changes, site_of
@@ -97,8 +98,7 @@ class NoFindings:
     """Stands in for the examination of the set-up."""
 
     def __init__(self) -> None:
-        self.findings: tuple[Any, ...] = ()
-        self.sounds = 0
+        self.state = SetUpState()
 
 
 class LiveTime:

@@ -208,7 +208,9 @@ def test_nothing_is_requested_for_a_sure_event() -> None:
         outputs += fusion.step(batch, now_ns)
     events = [output for output in outputs if isinstance(output, Event)]
     assert events
-    assert all(event.estimate is not None and event.estimate.confidence >= SURE_WITHOUT_BACKFILL for event in events)
+    assert all(
+        event.estimate is not None and event.estimate.sound_confidence >= SURE_WITHOUT_BACKFILL for event in events
+    )
     assert not [output for output in outputs if isinstance(output, BackfillRequest)]
 
 

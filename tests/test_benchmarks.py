@@ -18,10 +18,9 @@ import peers
 import performance
 import startup
 from livessl.clock import SystemClock
-from livessl.core import kernels as kernels_in_use
 from livessl.core.geometry import Grid
+from livessl.core.kernels import kernels as kernels_in_use
 from livessl.core.kernels import with_numba, with_numpy
-from livessl.core.locate import peak_search, srp
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.refine import FindPeaks
 from livessl.core.types import Evidence
@@ -65,7 +64,7 @@ def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds)
     power = ours.power(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.999
     assert ours.peak(sounds) == power.argmax() == truth.argmax()
-    assert vars(peak_search)["kernels"] is vars(srp)["kernels"] is kernels_in_use.kernels  # used for that alone
+    assert kernels_in_use.in_use is with_numba  # the form was used for that alone
 
 
 def test_fused_maps_are_what_the_search_is_held_against() -> None:

@@ -7,6 +7,7 @@ import json
 import math
 import random
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
 from livessl import wire
-from livessl.core.types import MAX_SAMPLE, ClockState, Frame, Mark
-from livessl.wire import Ack, Bye, Hello, Request, WireError, WireMessage, decode, encode
+from livessl.core.types import MAX_SAMPLE, ChannelLevel, ClockState, Frame, HostState, Mark
+from livessl.wire import Ack, Bye, Hello, Request, Welcome, WireError, WireMessage, decode, encode
 from small_site import frame, mark
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=16)
@@ -53,6 +54,29 @@ FRAMES = st.builds(
     active=st.booleans(),
     requested=st.just(True),
 )
+DECIBELS = st.floats(-1000.0, 1000.0)
+LEVELS = st.builds(
+    ChannelLevel,
+    peak_dbfs=DECIBELS,
+    rms_dbfs=DECIBELS,
+    clipped=st.integers(0, 2**64 - 1),
+    mean=st.none() | st.floats(-MAX_SAMPLE, MAX_SAMPLE),
+    hum_hz=st.none() | st.floats(0.0, 1e6),
+    hum_dbfs=st.none() | DECIBELS,
+    noise_dbfs=st.none() | DECIBELS,
+    noise_over_db=st.none() | DECIBELS,
+)
+WORDS = st.text(st.characters(exclude_categories=["Cs"]), max_size=60)
+HOSTS = st.builds(
+    HostState,
+    synchronized=st.sampled_from([True, False, None]),
+    service=WORDS,
+    reference=WORDS,
+    error_s=st.none() | st.floats(0.0, 1e9),
+    lost_blocks=st.integers(0, 2**64 - 1),
+    load=st.none() | st.floats(0.0, 1e9),
+    machine=WORDS,
+)
 MARKS = st.builds(
     Mark,
     array=NAMES,
@@ -65,6 +89,8 @@ MARKS = st.builds(
     lost_frames=st.integers(0, 2**64 - 1),
     drift_ppm=st.floats(allow_nan=False, allow_infinity=False),
     clock=st.sampled_from(ClockState),
+    levels=st.lists(LEVELS, max_size=16).map(tuple),
+    host=st.none() | HOSTS,
 )
 HELLOS = st.builds(
     Hello,
@@ -94,6 +120,11 @@ REQUESTS = st.builds(
     ),
 )
 BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
+WELCOMES = st.builds(Welcome, run_id=NAMES, reads=st.lists(NAMES, max_size=8).map(tuple))
+
+QUIET = ChannelLevel(-40.5, -52.25, 3, 0.001, 50.0, -61.0, -70.5, 2.5)
+HOST = HostState(True, "chrony", "ntp.example", 0.0021, 4, 0.75, "a1b2")
+REPORT = replace(mark(), levels=(QUIET, replace(QUIET, hum_hz=None, hum_dbfs=None, mean=None)), host=HOST)
 
 EXAMPLES: list[WireMessage] = [
     frame(),
@@ -102,6 +133,8 @@ EXAMPLES: list[WireMessage] = [
     Ack("run", {"north": 7}, 5),
     Bye("lab-pc", "run"),
     Request("run", {"north": (7, 9)}),
+    Welcome("run", ("mark-sections",)),
+    REPORT,
 ]
 
 
@@ -122,7 +155,7 @@ def refusal(data: bytes) -> str:
     return str(caught.value)
 
 
-@given(FRAMES | MARKS | HELLOS | ACKS | BYES | REQUESTS)
+@given(FRAMES | MARKS | HELLOS | ACKS | BYES | REQUESTS | WELCOMES)
 @settings(deadline=None)
 def test_round_trip(message: WireMessage) -> None:
     data = encode(message)
@@ -133,8 +166,12 @@ def test_round_trip(message: WireMessage) -> None:
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
 def test_every_truncation_is_refused(message: WireMessage) -> None:
     data = encode(message)
+    whole = []
+    if isinstance(message, Mark):  # sections are optional, so a mark without the last ones is whole
+        whole = [len(encode(replace(message, levels=(), host=None))), len(encode(replace(message, host=None)))]
     for length in [*range(min(len(data), 200)), len(data) - 1]:
-        refusal(data[:length])
+        if length not in whole:
+            refusal(data[:length])
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
@@ -163,7 +200,7 @@ def test_mutated_messages_raise_only_wire_errors(message: WireMessage) -> None:
     assert refused > 400
 
 
-@given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 77]))
+@given(st.binary(max_size=400), st.sampled_from([1, 2, 3, 4, 5, 6, 7, 77]))
 @settings(max_examples=500, deadline=None)
 def test_random_bodies_raise_only_wire_errors(body: bytes, kind: int) -> None:
     for data in (body, struct.pack("<4sBBq", b"LSSL", wire.VERSION, kind, 0) + body):
@@ -381,3 +418,46 @@ def test_greeting_without_answers_omits_the_field() -> None:
     assert b'"answers":true' in encode(Hello("lab-pc", "run", {"north": 16000.0}, answers=True))
     with pytest.raises(WireError, match="hello: field 'answers' has a wrong type"):
         decode(encode(Hello("lab-pc", "run", {}, answers=True)).replace(b"true", b"7"))
+
+
+def test_mark_without_sections_is_as_older_servers_read_it() -> None:
+    """Header, fixed part, name and powers, and nothing after them."""
+    assert len(encode(mark())) == struct.calcsize("<4sBBq") + struct.calcsize("<BQqddQQdBB") + len("north") + 4 * 8
+    assert len(encode(replace(mark(), levels=(QUIET,)))) > len(encode(mark()))
+
+
+@given(st.integers(3, 255), st.binary(max_size=300), st.booleans())
+def test_unknown_section_is_skipped(tag: int, body: bytes, is_last: bool) -> None:
+    """A newer node may add sections, before or after those that this server knows."""
+    plain, whole = encode(mark()), encode(REPORT)
+    section = struct.pack("<BH", tag, len(body)) + body
+    known = whole[len(plain) :]
+    assert decode(plain + (known + section if is_last else section + known)) == REPORT
+
+
+@pytest.mark.parametrize(
+    ("tail", "expected"),
+    [
+        (struct.pack("<BH", 1, 10) + bytes(10), "levels of 1 to 16 channels, got 10 bytes"),
+        (struct.pack("<BH", 1, 0), "levels of 1 to 16 channels, got 0 bytes"),
+        (struct.pack("<BH", 1, 17 * 64) + bytes(17 * 64), "levels of 1 to 16 channels"),
+        (struct.pack("<BHQ7d", 1, 64, 0, math.nan, 0, 0, 0, 0, 0, 0), "levels up to 1000 dB, got nan"),
+        (struct.pack("<BHQ7d", 1, 64, 0, 0, 0, math.inf, 0, 0, 0, 0), "a mean up to 1e+07, got inf"),
+        (struct.pack("<BHQ7d", 1, 64, 0, 0, 0, 0, 0, 1e4, 0, 0), "a level up to 1000, got 10000"),
+        (struct.pack("<BH", 1, 64) + bytes(63), "a section of 64 bytes, got 63"),
+        (struct.pack("<BH", 2, 5) + bytes(5), "a machine's state of at least 28 bytes, got 5"),
+        (struct.pack("<BHBdQdBBB", 2, 28, 3, 0, 0, 0, 0, 0, 0), "a known clock, got 0 bytes and 3"),
+        (struct.pack("<BHBdQdBBB", 2, 28, 0, 0, 0, 0, 1, 0, 0), "1 bytes of names and a known clock, got 0 bytes"),
+        (struct.pack("<BHBdQdBBB", 2, 28, 0, math.inf, 0, 0, 0, 0, 0), "an error in seconds up to 1e+09, got inf"),
+    ],
+)
+def test_section_of_a_wrong_value_is_refused(tail: bytes, expected: str) -> None:
+    said = refusal(encode(mark()) + tail)
+    assert said.startswith("mark of array 'north': expected ")
+    assert expected in said
+
+
+@pytest.mark.parametrize("reads", [None, "mark-sections", [7], [""], ["n"] * 65])
+def test_welcome_of_a_wrong_value_is_refused(reads: Any) -> None:
+    head = encode(Welcome("run"))[: struct.calcsize("<4sBBq")]
+    assert "field 'reads' has a wrong type" in refusal(head + json.dumps({"run_id": "run", "reads": reads}).encode())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,17 +11,19 @@ from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
 from livessl.core.commission.clocks import find_clock_faults
-from livessl.core.commission.finding import Finding, Severity
+from livessl.core.commission.crosstalk import CrosstalkMeter
+from livessl.core.commission.finding import Finding, Severity, in_order
 from livessl.core.commission.observe import observe
-from livessl.core.types import Event
+from livessl.core.types import Event, Observation
 from livessl.recordings.assign import AssignedRecording
+from livessl.site.build.layout import layout_findings
 from livessl.site.build.set_up import find_set_up_faults, with_inputs
 from livessl.site.models import Site
 
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What recordings say about a set-up.
+    """Findings about a set-up, and the number of sounds behind them.
 
     Parameters
     ----------
@@ -63,6 +65,25 @@ def examine(
     return examine_parts(loaded, parts)
 
 
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """The observations that an examination rests on.
+
+    Parameters
+    ----------
+    events : tuple of Event
+        What was located, without what the arrays received of it.
+    sounds : tuple of tuple of Observation
+        What the arrays observed of each sound.
+    findings : tuple of Finding
+        Faults that show in the samples and in the clocks.
+    """
+
+    events: tuple[Event, ...]
+    sounds: tuple[tuple[Observation, ...], ...]
+    findings: tuple[Finding, ...]
+
+
 def examine_parts(
     site: Site, parts: Sequence[AssignedRecording], progress: Callable[[int], None] | None = None
 ) -> Examination:
@@ -73,21 +94,34 @@ def examine_parts(
     DeviceError
         If recordings of arrays that the site joins do not belong together.
     """
+    return conclude(site, gather(site, parts, progress))
+
+
+def gather(site: Site, parts: Sequence[AssignedRecording], progress: Callable[[int], None] | None = None) -> Gathered:
+    """Gather what recordings say: see `examine_parts`."""
     outputs = offline.run(site, parts, UnpacedClock(), progress=progress)
-    events = [output for output in outputs if isinstance(output, Event)]
-    sounds = [observe(event.received) for event in events if event.received]
-    findings = [
-        *(finding for part in parts for finding in _of_samples(part)),
-        *_of_clocks(site, events),
-        *find_set_up_faults(site, sounds),
-    ]
-    order = list(Severity)
-    told = sorted(with_inputs(site, _without_consequences(findings)), key=lambda one: order.index(one.severity))
-    return Examination(tuple(told), len(sounds))
+    events, sounds = [], []
+    for event in (output for output in outputs if isinstance(output, Event)):
+        if event.received:
+            sounds.append(observe(event.received))
+        events.append(replace(event, received=()))
+    of_samples = (finding for part in parts for finding in _of_samples(site, part))
+    return Gathered(tuple(events), tuple(sounds), (*of_samples, *_of_clocks(site, events)))
+
+
+def conclude(site: Site, gathered: Gathered) -> Examination:
+    """Draw the conclusions from what was gathered."""
+    findings = [*gathered.findings, *find_set_up_faults(site, gathered.sounds), *layout_findings(site)]
+    told = in_order(with_inputs(site, _without_consequences(findings)))
+    return Examination(tuple(told), len(gathered.sounds))
 
 
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
-    """Leave out what follows from another finding: whatever a silent channel shows, and the noise of a loud one."""
+    """Leave out what follows from another finding.
+
+    That is whatever a silent channel shows, the noise of a loud channel, and crosstalk of a channel with the signal of
+    another.
+    """
     faults: dict[tuple[str | None, int | None], set[str]] = {}
     for one in findings:
         faults.setdefault((one.array, one.channel), set()).add(one.fault)
@@ -96,6 +130,7 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
         for one in findings
         if "dead" not in (others := faults[one.array, one.channel] - {one.fault})
         and not (one.fault == "noisy" and others & {"level", "clipping"})
+        and not (one.fault == "crosstalk" and others & {"duplicate", "deaf"})
     ]
 
 
@@ -108,9 +143,11 @@ def _of_clocks(site: Site, events: Sequence[Event]) -> Iterator[Finding]:
     return find_clock_faults(starts_s)
 
 
-def _of_samples(part: AssignedRecording) -> list[Finding]:
-    meter = ChannelMeter(len(part.channels), part.recording.sample_rate_hz)
-    rows = np.array(part.channels) - 1
+def _of_samples(site: Site, part: AssignedRecording) -> list[Finding]:
+    rate_hz, rows = part.recording.sample_rate_hz, np.array(part.channels) - 1
+    microphones_m = next(spec.microphones_m for spec in site.specs if spec.name == part.array)
+    meters = ChannelMeter(len(rows), rate_hz), CrosstalkMeter(microphones_m, rate_hz, site.c_m_s)
     for block in part.recording.blocks(0):
-        meter.push(block.samples[rows])
-    return list(meter.faults(part.array))
+        for meter in meters:
+            meter.push(block.samples[rows])
+    return [finding for meter in meters for finding in meter.faults(part.array)]

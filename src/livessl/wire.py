@@ -2,6 +2,10 @@
 
 A message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, time of sending), then the body of its
 kind. Samples travel as float32, so that a frame arrives bit for bit as it was cut.
+
+A mark may end with sections: levels, and the state of the node's machine. A node sends them only to a server that has
+said in a `Welcome` that it reads sections, because older servers would refuse the mark. A server skips sections that it
+does not know, so that later ones need no other agreement.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROPHONES, ClockState, Frame, Mark
+from livessl.wire_sections import SectionError, decode_sections, encode_sections
 
 VERSION: Final = 2
 
@@ -35,6 +40,9 @@ MAX_FRAME_INDEX: Final = (2**63 - 1) // FRAME_NS - 1
 
 MAX_JSON_BYTES: Final = 64 * 1024
 """Longest JSON body, in bytes: greetings and acknowledgements take a few hundred."""
+
+MAX_EXTENSIONS: Final = 64
+"""Most extensions that a server may name."""
 
 MAX_MESSAGE_BYTES: Final = 256 + 4 * MAX_MICROPHONES * MAX_FRAME_SAMPLES
 """Longest message, in bytes: a frame of 16 channels."""
@@ -140,9 +148,28 @@ class Bye:
     run_id: str
 
 
-WireMessage = Frame | Mark | Hello | Ack | Bye | Request
-_Json = Hello | Ack | Bye | Request
-_JSON_KINDS: Final[dict[int, type[_Json]]] = {3: Hello, 4: Ack, 5: Bye, 6: Request}
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """A server's statement of what it reads beyond this version of the protocol. Older nodes ignore it.
+
+    Parameters
+    ----------
+    run_id : str
+        The run of the node that is addressed.
+    reads : tuple of str
+        Names of extensions, such as `SECTIONS`; nodes ignore those that they do not know.
+    """
+
+    run_id: str
+    reads: tuple[str, ...] = ()
+
+
+SECTIONS: Final = "mark-sections"
+"""Extension: marks may end with sections."""
+
+WireMessage = Frame | Mark | Hello | Ack | Bye | Request | Welcome
+_Json = Hello | Ack | Bye | Request | Welcome
+_JSON_KINDS: Final[dict[int, type[_Json]]] = {3: Hello, 4: Ack, 5: Bye, 6: Request, 7: Welcome}
 _FRAME_KIND: Final = 1
 _MARK_KIND: Final = 2
 
@@ -257,7 +284,8 @@ def _encode_mark(mark: Mark) -> bytes:
         _CLOCK_STATES.index(mark.clock),
         len(mark.channel_power),
     )
-    return b"".join([_head(_MARK_KIND), fixed, name, np.asarray(mark.channel_power, dtype="<f8").tobytes()])
+    powers = np.asarray(mark.channel_power, dtype="<f8").tobytes()
+    return b"".join([_head(_MARK_KIND), fixed, name, powers, encode_sections(mark.levels, mark.host)])
 
 
 def _decode_mark(body: memoryview) -> Mark:
@@ -267,14 +295,33 @@ def _decode_mark(body: memoryview) -> Mark:
         raise WireError(f"mark: expected a known clock state and at most 16 channels, got {clock} and {channels}")
     _check_frame_index(frame_index, "mark")
     name, start = _name(body, _MARK.size, name_length)
-    if len(body) - start != 8 * channels:
+    end = start + 8 * channels
+    if len(body) < end:
         raise WireError(f"mark: expected {8 * channels} bytes of channel powers, got {len(body) - start}")
-    channel_power = tuple(np.frombuffer(body, dtype="<f8", offset=start).tolist())
+    channel_power = tuple(np.frombuffer(body[start:end], dtype="<f8").tolist())
     if not all(0 <= value <= MAX_POWER for value in (power, noise, *channel_power)):
         raise WireError(f"mark of array {name!r}: expected powers from 0 to {MAX_POWER:g}")
     if not math.isfinite(drift):
         raise WireError(f"mark of array {name!r}: expected a finite drift, got {drift}")
-    return Mark(name, sequence, frame_index, power, noise, channel_power, overflows, lost, drift, _CLOCK_STATES[clock])
+    try:
+        levels, host = decode_sections(body[end:])
+    except SectionError as error:
+        raise WireError(f"mark of array {name!r}: {error}") from error
+    state = _CLOCK_STATES[clock]
+    return Mark(
+        name,
+        sequence,
+        frame_index,
+        power,
+        noise,
+        channel_power,
+        overflows,
+        lost,
+        drift,
+        state,
+        levels=levels,
+        host=host,
+    )
 
 
 def _decode_json(type_: type[_Json], body: bytes) -> WireMessage:
@@ -295,6 +342,8 @@ def _decode_json(type_: type[_Json], body: bytes) -> WireMessage:
             raise WireError(f"{what}: field {name!r} has a wrong type or value")
     for name in {"backlog", "wanted"} & fields.keys():
         fields[name] = {array: tuple(frame_indices) for array, frame_indices in fields[name].items()}
+    if type_ is Welcome:
+        fields["reads"] = tuple(fields["reads"])
     return type_(**fields)
 
 
@@ -357,6 +406,10 @@ _FIELDS: Final[dict[type[_Json], dict[str, Any]]] = {
     },
     Bye: {"node": _is_name, "run_id": _is_name},
     Request: {"run_id": _is_name, "wanted": _is_map_of(_is_span)},
+    Welcome: {
+        "run_id": _is_name,
+        "reads": lambda value: isinstance(value, list) and len(value) <= MAX_EXTENSIONS and all(map(_is_name, value)),
+    },
 }
 
 

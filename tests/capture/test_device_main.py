@@ -69,8 +69,8 @@ def received(reader: RingReader) -> list[tuple[int, int, bool]]:
     return blocks
 
 
-def receiver(ring: Ends, *, is_hardware: bool = True) -> Receiver:
-    return Receiver(ring[0], UnpacedClock(NOW_NS), RATE_HZ, is_hardware=is_hardware)
+def receiver(ring: Ends, *, is_hardware: bool = True, latency_s: float = 0.1) -> Receiver:
+    return Receiver(ring[0], UnpacedClock(NOW_NS), RATE_HZ, is_hardware=is_hardware, latency_s=latency_s)
 
 
 def test_samples_are_copied(ring: Ends) -> None:
@@ -106,6 +106,18 @@ def test_stamp_is_the_conversion_time_if_plausible(
     play(receiver(ring), age_s=age_s, origin_s=origin_s)
     [(_, time_ns, _)] = received(ring[1])
     assert abs(time_ns - (NOW_NS - believed_s * 1e9)) < 1000  # float64 seconds keep a microsecond
+
+
+@pytest.mark.parametrize("latency_s", [0.1, 0.9, 1.5, 4.0])
+def test_stamp_of_samples_that_waited_in_a_long_buffer_is_their_conversion_time(ring: Ends, latency_s: float) -> None:
+    """A buffer of more than a second, which a busy machine may need, may be full when the block comes."""
+    for waited_s in (0.0, 0.5 * latency_s, latency_s, latency_s + 0.9):
+        play(receiver(ring, latency_s=latency_s), age_s=waited_s + 0.02)
+        [(_, time_ns, _)] = received(ring[1])
+        assert abs(time_ns - (NOW_NS - (waited_s + 0.02) * 1e9)) < 1000
+    play(receiver(ring, latency_s=latency_s), age_s=latency_s + 1.1)  # no buffer of that length keeps samples so long
+    [(_, time_ns, _)] = received(ring[1])
+    assert abs(time_ns - (NOW_NS - 0.02e9)) < 1000
 
 
 def test_conversion_time_of_a_sound_server_is_ignored(ring: Ends) -> None:

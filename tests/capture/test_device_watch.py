@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -94,6 +96,11 @@ SERVER = Report(DeviceState.OPEN)
         (Seen(ABSENT, delivered_before=True), f"{UMC} was unplugged; waiting for it"),
         (Seen(ABSENT, silent_s=5.1), f"{LIBRARY} hangs; it was started again (over)"),
         (Seen(None, exit_code=-9), f"the process that reads {UMC} ended by signal 9; it was started again (over)"),
+        (
+            Seen(OPEN, delivered=True, exit_code=-signal.SIGXCPU),
+            f"{LIBRARY} ran for 1 s without a pause, so the kernel ended its process before it could take the machine; "
+            "it was started again (over)",
+        ),
         (Seen(None, exit_code=1), f"the process that reads {UMC} ended with code 1; it was started again (over)"),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby, islice
 from types import TracebackType
 from typing import Self
@@ -19,7 +20,7 @@ from livessl.capture.link import SILENT_NS, Link
 from livessl.capture.outbox import BACKLOG_FRAMES, LATE_NS
 from livessl.capture.spool import MEMORY_BYTES
 from livessl.clock import SystemClock
-from livessl.core.types import BackfillRequest, Frame, Mark, Message
+from livessl.core.types import BackfillRequest, ChannelLevel, Frame, HostState, Mark, Message
 from livessl.server.receiver import Receiver
 from small_site import FIRST_FRAME_INDEX, frame, mark, site_of, wait_until
 
@@ -589,3 +590,39 @@ def test_node_without_backfill_does_not_announce_answers() -> None:
         together(link, router, lambda: link.connected, "an acknowledgement")
         link.close(bye=False)
     assert not any(message.answers for message in router.got if isinstance(message, wire.Hello))
+
+
+def newest_mark(router: Router) -> Mark:
+    return [message for message in router.got if isinstance(message, Mark)][-1]
+
+
+def test_sections_of_marks_are_sent_only_to_a_server_that_reads_them() -> None:
+    """Older servers refuse a mark with sections; one that replaces the first may be older."""
+    level = ChannelLevel(-40.0, -50.0, 0, None, None, None, None)
+    report = replace(mark(0), levels=(level,) * 4, host=HostState(True, "chrony"))
+    clock = HandClock()
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, clock, backfill=remembered)
+
+        def sent() -> Mark:
+            before = len(router.marks())
+            link.send([report])
+            together(link, router, lambda: len(router.marks()) > before, "a mark")
+            return newest_mark(router)
+
+        connect(link, router)
+        assert sent() == mark(0)
+        router.send(wire.encode(wire.Welcome("another run", (wire.SECTIONS,))))
+        router.send(wire.encode(wire.Welcome("run-1", ("a later extension",))))
+        router.send(wire.encode(wire.Request("run-1")))  # answered by a greeting: what came before it was read
+        together(link, router, lambda: router.hellos()[-1].answers, "a greeting")
+        assert sent() == mark(0)
+        router.send(wire.encode(wire.Welcome("run-1", (wire.SECTIONS, "a later extension"))))
+        wait_until(lambda: sent() == report, "a mark with its sections")
+        clock.time_ns += 2 * SILENT_NS
+        before = hellos(router)
+        together(link, router, lambda: hellos(router) > before, "a greeting after silence")
+        router.ack()
+        together(link, router, lambda: link.connected, "an acknowledgement")
+        assert sent() == mark(0)
+        link.close(bye=False)

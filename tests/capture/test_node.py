@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 from livessl import wire
+from livessl.capture.host_clock import HostClock
+from livessl.capture.host_watch import HostWatch
 from livessl.capture.link import Link
 from livessl.capture.node import (
     AHEAD_NS,
@@ -23,15 +25,16 @@ from livessl.capture.node import (
     capture_device,
     capture_recordings,
     send_session,
+    with_host,
 )
 from livessl.clock import SystemClock, UnpacedClock
-from livessl.core.types import FRAME_NS, Block, Float32Array, Frame, Mark
+from livessl.core.types import FRAME_NS, Block, ChannelLevel, Float32Array, Frame, Mark
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.inlet import QUEUE_MESSAGES
 from livessl.server.receiver import Item, Joined, Left, Receiver
 from livessl.site.models import Site
-from small_site import HANG_S, RATE_HZ, hiss, mark, site_of, wait_until
+from small_site import HANG_S, RATE_HZ, frame, hiss, mark, site_of, wait_until
 
 START_NS = 1_767_225_600_000_000_000
 FIRST = START_NS // FRAME_NS
@@ -117,6 +120,10 @@ def test_session_arrives_whole_and_ends_with_a_good_bye() -> None:
         progress: list[int] = []
         replay(there, recordings(), progress.append)
         wait_until(lambda: there.of(Left), "the good-bye")
+        reports = [
+            mark.levels for array in ARRAYS for mark in there.messages(array) if isinstance(mark, Mark) and mark.levels
+        ]
+        assert [len(levels) for levels in reports] == [4, 4]  # of the first second, of each array
         hello = wire.Hello("replay", "run-1", {"north": 16000.0, "south": 16000.0}, replay=True)
         assert there.items[0] == Joined(hello)
         assert there.items[-1] == Left(replace(hello, answers=True))  # because the server has announced requests
@@ -259,6 +266,7 @@ class Scripted:
         self._script = script
         self._ready = ready
         self.problem: str | None = None
+        self.lost_blocks = 0
         self.entered = self.left = False
 
     def __enter__(self) -> Self:
@@ -343,3 +351,18 @@ def test_samples_beyond_full_scale_arrive_unchanged() -> None:
         wait_until(lambda: there.of(Left), "the good-bye")
         frames = [item for item in there.items if isinstance(item, Frame)]
         assert max(float(frame.samples.max()) for frame in frames) == pytest.approx(1.7)
+
+
+def test_state_of_the_machine_goes_with_the_levels() -> None:
+    level = ChannelLevel(-40.0, -50.0, 0, None, None, None, None)
+    report = replace(mark(3), levels=(level,) * 4)
+    with HostWatch(lambda: HostClock(True, "chrony", "ntp.example", 0.002)) as host:
+        assert with_host([mark(2)], host, 5) == [mark(2)]
+        wait_until(lambda: host.state() is not None, "the first reading of the clock")
+        plain, carries, sound = with_host([mark(2), report, frame(4)], host, 5)
+    assert plain == mark(2)
+    assert isinstance(sound, Frame)
+    assert isinstance(carries, Mark)
+    assert replace(carries, host=None) == report
+    assert carries.host is not None
+    assert (carries.host.synchronized, carries.host.reference, carries.host.lost_blocks) == (True, "ntp.example", 5)

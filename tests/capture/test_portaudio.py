@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -108,6 +109,37 @@ def test_other_failures_keep_their_reason(sd: FakePortAudio, monkeypatch: pytest
 
 def test_output_devices_are_not_listed(sd: FakePortAudio) -> None:
     assert [found.name for found in input_devices()] == ["Built-in: ALC257 (hw:0,0)", "UMC1820: USB Audio (hw:1,0)"]
+
+
+class Undecodable(FakePortAudio):
+    """A library that fails on the names that are not UTF-8, as sounddevice does, and its interface to C."""
+
+    def __init__(self, names: list[bytes]) -> None:
+        super().__init__()
+        self.plug(*((name.decode("utf-8", "replace"), 4) for name in names))
+        infos = [SimpleNamespace(name=name, hostApi=0, maxInputChannels=4, defaultSampleRate=48000.0) for name in names]
+        self._names = names
+        self._lib = SimpleNamespace(Pa_GetDeviceCount=lambda: len(infos), Pa_GetDeviceInfo=infos.__getitem__)
+        self._ffi = SimpleNamespace(string=bytes)
+
+    def query_devices(self, index: int | None = None) -> Any:
+        if index is None:
+            return [self.query_devices(number) for number in range(len(self._names))]
+        self._names[index].decode()
+        return super().query_devices()[index]
+
+
+@pytest.mark.parametrize("odd", [b"Micr\xf3fono (hw:2,0)", b"\xff\xfe (hw:2,0)", b"cut \xe2\x82"])
+def test_device_whose_name_is_not_utf8_hides_no_other(
+    odd: bytes, sd: FakePortAudio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [b"UMC1820: USB Audio (hw:1,0)", odd, "Mikrofon f\u00fcr alle (hw:3,0)".encode()]
+    library = Undecodable(names)
+    monkeypatch.setitem(sys.modules, "sounddevice", library)
+    shown = odd.decode("utf-8", "replace")
+    assert [found.name for found in input_devices()] == [names[0].decode(), shown, names[2].decode()]
+    assert opened(library, "UMC1820").wanted["device"] == 0
+    assert opened(library, shown).wanted["device"] == 1
 
 
 def test_missing_portaudio_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import pytest
 
 from livessl.capture.device_process import DeviceProcess
 from livessl.capture.device_report import Wanted
-from livessl.capture.sound_device import SoundDevice
+from livessl.capture.sound_device import SoundDevice, wanted_device
 from livessl.clock import SystemClock
 from livessl.core.types import Block
 from livessl.errors import DeviceError
@@ -198,8 +199,103 @@ def test_blocks_that_were_not_read_in_time_are_counted_and_told(caplog: pytest.L
         assert entered.overruns >= 30
         assert [block.first_index for block in blocks[:100]] == [160 * k for k in range(100)]
         assert blocks[-1].first_index == 160 * (100 + entered.overruns)
+    assert entered.lost_blocks == entered.overruns + entered.unflagged_gaps
     assert f"this machine lags: {entered.overruns} blocks of device 'UMC' were lost" in str(problems[-1])
     assert "were lost: this node did not read them in time" in caplog.text
+
+
+def test_sound_lost_by_a_busy_machine_and_interruptions_are_counted_apart() -> None:
+    flagged = "ring.count_flagged(); ring.count_flagged(); deliver(4, 0.02); os._exit(3)"
+    with device(f"report('open'); deliver(4, 0.02); {flagged}", DELIVER) as (entered, _):
+        blocks_until(entered, lambda blocks: len(blocks) == 12)
+        others = entered.overruns + entered.unflagged_gaps  # this machine may be busy, too
+        assert (entered.lost_blocks - others, entered.interruptions) == (2, 1)
+
+
+def test_interface_that_stays_away_is_one_interruption() -> None:
+    with device("report('open'); deliver(4, 0.02); os._exit(3)", "report('absent', 'gone'); os._exit(3)") as (
+        entered,
+        runs,
+    ):
+        blocks_until(entered, lambda _: len(runs.started) == 3)
+        assert entered.interruptions == 1
+
+
+class Held(DeviceProcess):
+    """A process that the kernel keeps, though it was killed, while its driver does not return."""
+
+    held = True
+
+    @property
+    def exit_code(self) -> int | None:
+        return None if Held.held else super().exit_code
+
+
+def test_process_that_the_kernel_holds_is_named_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It still has the device open, so that a second one would find it busy."""
+    monkeypatch.setattr(Held, "held", True)
+    started: list[DeviceProcess] = []
+
+    def start(wanted: Wanted) -> DeviceProcess:
+        script = DELIVER if started else "report('open'); deliver(4, 0.02); os.close(report_fd); time.sleep(1000)"
+        kind = DeviceProcess if started else Held
+        started.append(kind(wanted, (sys.executable, "-c", PROGRAM, str(len(started) + 1), script)))
+        return started[-1]
+
+    with SoundDevice(SoundDeviceConfig(name="UMC", sample_rate_hz=8000), 3, SystemClock(), start) as entered:
+        blocks_until(entered, lambda _: "is held by this node's former process" in str(entered.problem))
+        assert f"(process {started[0].pid}), which was killed and does not end" in str(entered.problem)
+        for _ in range(30):
+            next(entered)
+        assert len(started) == 1
+        Held.held = False
+        blocks, problems = blocks_until(entered, lambda blocks: len(blocks) == 2)
+        assert len(started) == 2
+        assert problems[-1] is None
+        assert [block.overflow for block in blocks] == [True, False]
+
+
+def test_wait_for_a_process_that_is_ending_does_not_return_at_once() -> None:
+    """A process that the kernel holds in a driver has closed its reports and not ended; the node would spin."""
+    wanted = wanted_device(SoundDeviceConfig(name="UMC", sample_rate_hz=8000), 3)
+    script = "os.close(report_fd); time.sleep(1000)"
+    process = DeviceProcess(wanted, (sys.executable, "-c", PROGRAM, "1", script))
+    try:
+        process.wait(HANG_S)
+        begun = time.monotonic()
+        process.wait(0.3)
+        assert time.monotonic() - begun >= 0.25
+    finally:
+        process.end(kill=True)
+
+
+WITHOUT_STREAMS = """
+import os, sys
+for number in map(int, sys.argv[3]):
+    os.close(number)
+from livessl.capture.device_process import DeviceProcess
+from livessl.capture.sound_device import SoundDevice
+from livessl.clock import SystemClock
+from livessl.site.node_models import SoundDeviceConfig
+command = (sys.executable, "-c", sys.argv[1], "1", "report('open'); deliver(10**6, 0.02)")
+config = SoundDeviceConfig(name="UMC", sample_rate_hz=8000)
+with SoundDevice(config, 3, SystemClock(), lambda wanted: DeviceProcess(wanted, command)) as device:
+    blocks = 0
+    for block in device:
+        blocks += block.samples.shape[1] > 0
+        if blocks == 3 or device.problem:
+            break
+with open(sys.argv[2], "w") as file:
+    file.write(f"{blocks} {device.problem}")
+"""
+
+
+@pytest.mark.parametrize("closed", ["0", "2", "012"])
+def test_device_works_in_a_process_without_standard_streams(closed: str, tmp_path: Path) -> None:
+    """New files get the numbers of closed streams, and the device's process has streams of its own."""
+    result = tmp_path / "result"
+    subprocess.run([sys.executable, "-c", WITHOUT_STREAMS, PROGRAM, result, closed], check=True, timeout=HANG_S)
+    assert result.read_text() == "3 None"
 
 
 def test_unsuitable_device_is_refused_when_it_is_entered() -> None:

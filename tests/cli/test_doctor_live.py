@@ -44,7 +44,7 @@ def test_a_fault_makes_its_array_degraded_and_ends_when_it_is_mended(
 ) -> None:
     with caplog.at_level(logging.WARNING):
         replayed(server, heard("south", SOUNDS)[[0, 2, 1, 3]], "swapped")
-        wait_until(lambda: server.parts.set_up_watch.sounds == SOUNDS, "all sounds")
+        wait_until(lambda: server.parts.set_up_watch.state.sounds == SOUNDS, "all sounds")
     answer = httpx.get(f"{server.url}/api/v1/findings").json()
     (finding,) = answer["findings"]
     assert answer["sounds"] == SOUNDS
@@ -68,7 +68,7 @@ def test_a_fault_makes_its_array_degraded_and_ends_when_it_is_mended(
 def test_an_inverted_channel_is_named_with_the_input_of_the_interface(server: Server) -> None:
     samples = heard("south", SOUNDS) * np.array([[1.0], [1.0], [1.0], [-1.0]], dtype=np.float32)
     replayed(server, samples, "inverted")
-    wait_until(lambda: server.parts.set_up_watch.sounds == SOUNDS, "all sounds")
+    wait_until(lambda: server.parts.set_up_watch.state.sounds == SOUNDS, "all sounds")
     (finding,) = httpx.get(f"{server.url}/api/v1/findings").json()["findings"]
     assert (finding["fault"], finding["array"], finding["channel"], finding["input"]) == ("inverted", "south", 4, 8)
 

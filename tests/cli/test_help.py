@@ -128,7 +128,7 @@ def test_help_of_an_action_of_keys_shows_an_example(run: Run, action: str) -> No
 
 
 def test_devices_without_an_input_fails_with_a_cure(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("livessl.cli.devices.input_devices", list)
+    monkeypatch.setattr("livessl.cli.devices.list_inputs", list)
     done = run("devices")
     assert (done.code, done.out) == (1, "")
     assert done.err.startswith("livessl: error: no audio input found; connect an audio interface, then run")
@@ -138,7 +138,7 @@ def test_devices_without_an_input_fails_with_a_cure(run: Run, monkeypatch: pytes
 
 def test_devices_lists_the_inputs(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [InputDevice("UMC1820", "ALSA", 8, 48000.0)]
-    monkeypatch.setattr("livessl.cli.devices.input_devices", lambda: found)
+    monkeypatch.setattr("livessl.cli.devices.list_inputs", lambda: found)
     done = run("devices")
     assert done.code == 0
     assert re.search(r"^ +8 +48000Hz  ALSA: UMC1820$", done.out, re.MULTILINE)
@@ -156,7 +156,7 @@ def test_devices_prints_a_line_to_paste_that_tells_equal_interfaces_apart(
         InputDevice("Cheap: USB Audio (hw:4,0)", "ALSA", 4, 48000.0, "0", "usb-0000:00:14.0-4"),
         InputDevice("pulse", "ALSA", 32, 44100.0),
     ]
-    monkeypatch.setattr("livessl.cli.devices.input_devices", lambda: found)
+    monkeypatch.setattr("livessl.cli.devices.list_inputs", lambda: found)
     lines = run("devices").out.partition("under nodes.NAME:\n")[2].splitlines()
     assert lines == [
         '  device: {name: "HDA Intel: ALC257", sample_rate_hz: 44100}',

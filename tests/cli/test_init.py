@@ -35,7 +35,7 @@ def connected(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """A function that sets the interfaces that are connected to the machine."""
 
     def connect(*devices: InputDevice) -> None:
-        monkeypatch.setattr("livessl.capture.portaudio.input_devices", lambda: list(devices))
+        monkeypatch.setattr("livessl.capture.input_search.list_inputs", lambda: list(devices))
 
     connect()
     return connect
@@ -149,7 +149,7 @@ def test_machine_without_portaudio_gets_a_site_file(run: Run, tmp_path: Path, mo
     def missing() -> list[InputDevice]:
         raise DeviceError("no PortAudio")
 
-    monkeypatch.setattr("livessl.capture.portaudio.input_devices", missing)
+    monkeypatch.setattr("livessl.capture.input_search.list_inputs", missing)
     assert run("init", tmp_path / "site.yaml", "--yes").code == 0
     assert load_site(tmp_path / "site.yaml").warnings == ()
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -22,14 +24,15 @@ from cli.command_runs import Run
 from livessl.cli.levels_view import Lines, Objects, Screen, table
 from livessl.core.commission.levels import InputLevel
 from livessl.core.commission.taps import Tap
-from livessl.core.types import Float32Array
+from livessl.core.types import Block, Float32Array
+from livessl.site.node_models import SoundDeviceConfig
 from small_site import HANG_S, hiss, started, wait_until, write_site, write_wav
 from virtual_interface import Interface, Interfaces
 
 CARD_HZ = 48000
 PLACES = {1: ("north", 1), 2: ("north", 2)}
-GOOD = InputLevel(-20.0, -30.0, 0, 0.0, None, None, -70.0, ())
-BAD = InputLevel(0.0, -3.0, 42, 0.2, 50.0, -12.0, -40.0, ("clipping", "dc", "hum"))
+GOOD = InputLevel(-20.0, -30.0, 0, 0.0, None, None, -70.0)
+BAD = InputLevel(0.0, -3.0, 42, 0.2, 50.0, -12.0, -40.0, None, ("clipping", "dc", "hum"))
 
 
 @pytest.fixture
@@ -143,7 +146,56 @@ def test_meter_waits_for_an_absent_interface_and_names_one_that_is_unplugged(int
         wait_until(lambda: running.of("problem")[-1]["message"] is None, f"sound, got {running.of('problem')}")
         running.process.send_signal(signal.SIGINT)
         assert running.ended() == 0
+        assert running.process.stderr is not None
+        assert re.search(r"the device was interrupted \d+ times: unplugged, ", running.process.stderr.read())
     assert len(running.of("summary")) == 6
+
+
+@pytest.mark.processes
+@pytest.mark.sound_card
+def test_command_without_standard_streams_meters(interfaces: Interfaces) -> None:
+    """Some services and scripts close them."""
+    interfaces.add(channels=2).play(hiss(1.0, 2, level=0.01))
+    command = (sys.executable, "-m", "livessl", "levels", "--json", "--device", "UMC1820", "--seconds", "1.2")
+    closing = ("sh", "-c", 'exec "$@" 0<&- 2>&-', "sh", *command)
+    with started(*closing, env=interfaces.environment, stdout=subprocess.PIPE) as process:
+        running = Levels(process)
+        assert running.ended() == 0
+    assert [each["input"] for each in running.of("summary")] == [1, 2]
+
+
+class Delivering:
+    """A device that opens, although no search finds it."""
+
+    problem = None
+    has_cause = False
+    lost_blocks = interruptions = 0
+
+    def __init__(self, config: SoundDeviceConfig, channels: int, clock: object) -> None:
+        self.channels = channels
+        self.sample_rate_hz = config.sample_rate_hz
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def __iter__(self) -> Iterator[Block]:
+        size = round(self.sample_rate_hz / 10)
+        return (Block(size * k, hiss(0.1, self.channels, k)[:, :size].copy(), 0) for k in count())
+
+
+@pytest.mark.parametrize(("options", "inputs"), [((), 1), (("--inputs", "3"), 3)])
+def test_device_that_opens_although_no_search_finds_it_is_metered(
+    run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], inputs: int
+) -> None:
+    monkeypatch.setattr("livessl.capture.input_search.search_input", lambda wanted: None)
+    monkeypatch.setattr("livessl.capture.sound_device.SoundDevice", Delivering)
+    done = run("levels", "--device", "UMC1820", "--sample-rate", "8000", "--seconds", "0.5", "--json", *options)
+    assert done.code == 0
+    found = [json.loads(line) for line in done.out.splitlines()]
+    assert [each["input"] for each in found if each["kind"] == "summary"] == list(range(1, inputs + 1))
 
 
 @pytest.mark.processes

@@ -11,7 +11,7 @@ import pytest
 from world import START, HandClock
 
 from livessl import wire
-from livessl.core.types import FRAME_NS
+from livessl.core.types import FRAME_NS, ChannelLevel, HostState
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import REPORT_NS, WATCH_NS, ArrayStates
 from livessl.server.ingest import Ingest
@@ -24,6 +24,7 @@ from livessl.server.store import Finalized, Store, StoreError
 from small_site import mark, site_of
 
 SITE = site_of()
+QUIET = ChannelLevel(-41.26, -52.0, 0, 0.0001234567, None, None, -70.0)
 HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
 
 
@@ -49,9 +50,9 @@ class Desk:
         self.store = Store() if store is None else store
         site_time = SiteTime(self.clock)
         overload = Overload(self.clock)
-        watch = SetUpWatch(SITE, overload)
+        self.watch = SetUpWatch(SITE, overload)
         self.states = ArrayStates(
-            SITE, self.clock, self.store, site_time, self.ingest, overload, watch, self.published.append
+            SITE, self.clock, self.store, site_time, self.ingest, overload, self.watch, self.published.append
         )
         self.fusion = live_run(SITE, Finalized(None, None), for_each).fusion
         self.states.follow(self.fusion)
@@ -66,6 +67,13 @@ class Desk:
         self.clock.time_ns += FRAME_NS
         marks = [mark(0, START + self.pace - 1, array) for array in arrays]
         self.fusion.step(marks, self.clock.now_ns())
+
+    def report(self, array: str, level: ChannelLevel, host: HostState | None = None) -> None:
+        """The node sends a mark with the level of its array's channels, once a second."""
+        self.clock.time_ns += 1_000_000_000
+        report = replace(mark(0, START + self.pace, array), levels=(QUIET, level, QUIET, QUIET), host=host)
+        self.ingest.receive(b"p1", wire.encode(report), self.clock.monotonic_ns())
+        self.states.watch()
 
     def array(self, name: str) -> dict[str, Any]:
         return next(array for array in self.states.describe() if array["name"] == name)
@@ -156,3 +164,59 @@ def test_a_clock_that_is_behind_is_named_and_only_then() -> None:
         if named:
             assert "clock is 2.0 s behind the server's" in north["reason"]
             assert "NTP" in north["reason"]
+
+
+def test_levels_and_machine_that_a_node_reports_are_described() -> None:
+    desk = Desk()
+    desk.greet()
+    north = desk.array("north")
+    assert (north["channels"], north["channels_age_s"], north["host"]) == ([], None, None)
+    host = HostState(True, "chrony", "ntp.example", 0.0021049999, 2, 0.456, "m1")
+    desk.report("north", ChannelLevel(-200.0, -200.0, 17, None, 50.0, -60.04, None), host)
+    desk.clock.time_ns += 700_000_000
+    north = desk.array("north")
+    assert north["channels"][0] == {
+        "peak_dbfs": -41.3,
+        "rms_dbfs": -52.0,
+        "noise_dbfs": -70.0,
+        "clipped": 0,
+        "mean": 0.00012,
+        "hum_hz": None,
+        "hum_dbfs": None,
+        "faults": [],
+    }
+    second = north["channels"][1]
+    assert (second["peak_dbfs"], second["rms_dbfs"], second["clipped"], second["mean"]) == (None, None, 17, None)
+    assert (second["hum_hz"], second["hum_dbfs"]) == (50.0, -60.0)
+    assert north["channels_age_s"] == 0.7
+    assert north["host"] == {
+        "synchronized": True,
+        "service": "chrony",
+        "reference": "ntp.example",
+        "error_s": 0.002105,
+        "lost_blocks": 2,
+        "load": 0.46,
+    }
+    assert desk.array("south")["channels"] == []
+    desk.states.follow(desk.fusion)
+    assert desk.array("north")["channels"] == []  # another run is about another set-up
+
+
+def test_lasting_fault_of_a_channel_becomes_a_finding_and_shows_at_the_channel(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    desk = Desk()
+    desk.greet()
+    hums = replace(QUIET, hum_hz=50.0, hum_dbfs=-50.0)
+    with caplog.at_level("WARNING"):
+        for turn in range(20):
+            desk.report("north", replace(hums, hum_dbfs=-50.0 - turn % 3))
+    assert [channel["faults"] for channel in desk.array("north")["channels"]] == [[], ["hum"], [], []]
+    assert desk.array("north")["state"] == desk.array("south")["state"]  # a warning: positions are as before
+    [finding] = desk.watch.state.findings
+    assert (finding.fault, finding.array, finding.channel, finding.input) == ("hum", "north", 2, 2)
+    assert caplog.text.count("channel 2 of 'north' hums at 50 Hz") == 1  # its figures change, and it is one fault
+    for _ in range(10):
+        desk.report("north", QUIET)
+    assert desk.watch.state.findings == ()
+    assert desk.array("north")["channels"][1]["faults"] == []

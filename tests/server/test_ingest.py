@@ -10,7 +10,7 @@ import pytest
 from livessl import wire
 from livessl.core.types import BackfillRequest
 from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Ingest, Received
-from livessl.wire import Ack, Bye, Hello, Request
+from livessl.wire import Ack, Bye, Hello, Request, Welcome
 from small_site import frame, mark, site_of
 
 NOW = 1_767_225_600_000_000_000
@@ -44,7 +44,9 @@ def refusal(into: Ingest, hello: Hello, peer: bytes = b"p2", now_ns: int = NOW) 
 def test_greeting_is_answered_with_what_is_known() -> None:
     into = ingest()
     received = tell(into, HELLO)
-    assert received == Received(joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"))
+    assert received == Received(
+        joined=HELLO, reply=Ack("run-1", {}), offer=Request("run-1"), welcome=Welcome("run-1", ("mark-sections",))
+    )
     tell(into, frame(1))
     again = tell(into, HELLO)
     assert again == Received(reply=Ack("run-1", {"north": 1000}))  # the same run: nobody new
@@ -218,14 +220,20 @@ def test_problem_of_a_device_is_reported_until_it_is_over() -> None:
     assert into.problem_of("north") is None
 
 
-def test_node_is_informed_once_that_the_server_may_request_frames() -> None:
+def test_node_is_informed_once_of_what_the_server_reads_and_may_request() -> None:
     into = ingest()
-    assert tell(into, HELLO).offer == Request("run-1")
-    assert tell(into, HELLO).offer is None  # an older one that says nothing of it
+    both = (Request("run-1"), Welcome("run-1", ("mark-sections",)))
+
+    def news(hello: Hello, peer: bytes = b"p1") -> tuple[Request | None, Welcome | None]:
+        received = tell(into, hello, peer)
+        return received.offer, received.welcome
+
+    assert news(HELLO) == both
+    assert news(HELLO) == (None, None)  # an older one that says nothing of it
     knows = tell(into, replace(HELLO, answers=True))
-    assert (knows.offer, knows.greeted) == (None, replace(HELLO, answers=True))
-    assert tell(into, HELLO).offer == Request("run-1")  # it has begun anew on the same connection
-    assert tell(into, HELLO, b"p9").offer == Request("run-1")
+    assert (knows.offer, knows.welcome, knows.greeted) == (None, None, replace(HELLO, answers=True))
+    assert news(HELLO) == both  # it has begun anew on the same connection
+    assert news(HELLO, b"p9") == both
 
 
 def test_requests_go_to_nodes_that_know_them() -> None:

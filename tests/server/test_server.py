@@ -24,7 +24,7 @@ from livessl.capture.node import send_session
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS, Event
 from livessl.recordings.recording import SplicedRecording
-from livessl.server import app, site_time
+from livessl.server import site_time
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.receiver import BindError
@@ -188,21 +188,6 @@ def test_replay_whose_node_has_died_ends(monkeypatch: pytest.MonkeyPatch) -> Non
         assert live.connected
         wait_until(lambda: server.parts.site_time.mode == "live", "live again")
         live.close(bye=True)
-
-
-@pytest.mark.parametrize(("say_s", "said"), [(0.0, True), (5.0, False)], ids=["long", "short"])
-def test_start_that_waits_for_the_compiler_is_logged(
-    say_s: float, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def compile_slowly() -> None:
-        if said:
-            wait_until(lambda: "compiling kernels" in caplog.text, "the message")
-
-    monkeypatch.setattr(app, "NOTICE_S", say_s)
-    monkeypatch.setattr(app, "warm_up", compile_slowly)
-    with caplog.at_level("INFO"), running_server(site_of()):
-        pass
-    assert ("compiling kernels" in caplog.text) == said
 
 
 def test_failed_start_leaves_nothing_open(tmp_path: Path) -> None:

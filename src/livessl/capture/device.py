@@ -21,6 +21,11 @@ class Device(Protocol):
         """The present problem of the device, in words; None if there is none."""
         ...
 
+    @property
+    def lost_blocks(self) -> int:
+        """Blocks that were lost since the start because this machine did not keep up."""
+        ...
+
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /

@@ -35,7 +35,8 @@ CLOSING_S: Final = 0.3
 """Longest time, in seconds, in which the library may close the device when the node ends."""
 
 MAX_BACKLOG_S: Final = 1.0
-"""Largest plausible age of samples in the driver's buffer, in seconds; a conversion time beyond it is ignored."""
+"""Largest plausible age of samples beyond the length of a block and of the driver's buffer, in seconds. A conversion
+time beyond it is ignored."""
 
 
 class Receiver:
@@ -49,13 +50,18 @@ class Receiver:
     sample_rate_hz : float
     is_hardware : bool
         Whether conversion times of the driver are to be trusted.
+    latency_s : float
+        Length of the driver's buffer, in seconds: samples in it may be that old.
     """
 
-    def __init__(self, ring: RingWriter, clock: Clock, sample_rate_hz: float, *, is_hardware: bool) -> None:
+    def __init__(
+        self, ring: RingWriter, clock: Clock, sample_rate_hz: float, *, is_hardware: bool, latency_s: float = 0.0
+    ) -> None:
         self._ring = ring
         self._clock = clock
         self._rate_hz = sample_rate_hz
         self._is_hardware = is_hardware
+        self._most_waited_s = latency_s + MAX_BACKLOG_S
         self._next_index = 0
         self._lost = False
 
@@ -77,7 +83,7 @@ class Receiver:
             return
         length_s = count / self._rate_hz
         age_s = time.currentTime - time.inputBufferAdcTime if self._is_hardware else length_s
-        if not length_s <= age_s <= length_s + MAX_BACKLOG_S:
+        if not length_s <= age_s <= length_s + self._most_waited_s:
             age_s = length_s
         time_ns = self._clock.now_ns() - round(age_s * 1e9)
         self._lost = not self._ring.write(first_index, samples, count, time_ns, lost=self._lost)
@@ -100,8 +106,11 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
     """Open the device as soon as that is possible, and watch its stream until it stops or the node ends."""
     clock = SystemClock()
 
-    def receiver(device: Any) -> Any:
-        return Receiver(ring, clock, wanted.sample_rate_hz, is_hardware=device.is_hardware).receive
+    def callback(device: Any) -> Any:
+        receiver = Receiver(
+            ring, clock, wanted.sample_rate_hz, is_hardware=device.is_hardware, latency_s=wanted.latency_s
+        )
+        return receiver.receive
 
     sd: Any = None
     stream: Any = None
@@ -114,7 +123,7 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
                 not_realtime = request_realtime()  # the library has started its helpers, and not yet its threads
             else:
                 rescan(sd)
-            stream, is_hardware = open_stream(sd, wanted, receiver)
+            stream, is_hardware = open_stream(sd, wanted, callback)
         except OpeningError as trouble:
             reporter.report(Report(trouble.state, str(trouble)))
             for _ in range(round(REOPEN_S / BEAT_S)):

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from livessl.capture.device_report import Report, Wanted
-from livessl.capture.ring import RingReader
+from livessl.capture.ring import RingReader, beyond_standard
 from livessl.core.types import Block
 
 OUTPUT_BYTES: Final = 65536
@@ -50,7 +50,7 @@ class DeviceProcess:
         self._wanted = wanted
         self._ring = RingReader(wanted.ring)
         try:
-            self._reports_fd, report_fd = os.pipe()
+            self._reports_fd, report_fd = map(beyond_standard, os.pipe())
         except OSError:
             self._ring.close()
             raise
@@ -106,10 +106,19 @@ class DeviceProcess:
         """Exit code of the process, negative for a signal; None while it runs."""
         return self._process.poll()
 
+    @property
+    def pid(self) -> int:
+        """Process ID."""
+        return self._process.pid
+
     def wait(self, seconds: float) -> None:
         """Return when the process has published a block or a report, or has ended, or after some seconds."""
         if not self._ring.waiting:
-            self._poll.poll(seconds * 1e3)
+            for fd, events in self._poll.poll(seconds * 1e3):
+                if fd == self._reports_fd and events & select.POLLHUP and not events & select.POLLIN:
+                    # The process is ending, which lasts while the kernel holds it in a driver. Without this, each wait
+                    # until then would return at once.
+                    self._poll.unregister(fd)
             self._ring.receive()
 
     def block(self) -> Block | None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import dataclass
 from typing import Final
 
 from livessl.capture.device_report import DeviceState, Report
+from livessl.capture.realtime import LONGEST_S
 
 START_NOTICE_S: Final = 1.5
 """Time in seconds without a first report after which the problem says so."""
@@ -152,5 +154,10 @@ def _judge_stream(name: str, block_s: float, seen: Seen, *, is_hardware: bool) -
 def _ended(name: str, state: DeviceState | None, exit_code: int) -> str:
     if state is DeviceState.STOPPED:
         return f"device {name!r} has stopped; was it unplugged? Waiting for it"
+    if exit_code == -signal.SIGXCPU:
+        return (
+            f"the sound library of device {name!r} ran for {LONGEST_S} s without a pause, so the kernel ended its "
+            "process before it could take the machine; it was started again"
+        )
     how = f"by signal {-exit_code}" if exit_code < 0 else f"with code {exit_code}"
     return f"the process that reads device {name!r} ended {how}; it was started again"

@@ -189,6 +189,8 @@ class Link:
                 self._acknowledge(message)
             elif isinstance(message, wire.Request) and message.run_id == self._hello.run_id:
                 self._answer(message)
+            elif isinstance(message, wire.Welcome) and message.run_id == self._hello.run_id:
+                self._outbox.send_sections(wire.SECTIONS in message.reads)
 
     def _answer(self, request: wire.Request) -> None:
         if self._backfill is None:
@@ -244,7 +246,8 @@ class Link:
         """Expect nothing from the connection: unacknowledged frames are sent again when the server answers."""
         self._accepted = False
         self._outbox.disconnected()
-        # The next server may be an older one that does not understand `answers`.
+        self._outbox.send_sections(False)
+        # The next server may be an older one that does not understand `answers` or sections.
         self._hello = replace(self._hello, backlog=self._outbox.backlog_spans(), answers=False)
 
     def _say_hello(self) -> None:

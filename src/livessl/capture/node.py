@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 from livessl import wire
 from livessl.capture.device import Device
+from livessl.capture.host_watch import HostWatch
 from livessl.capture.link import Link
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.stream.segmenter import RECENT_S
-from livessl.core.types import FRAME_NS, BackfillRequest, Message
+from livessl.core.types import FRAME_NS, BackfillRequest, Mark, Message
 from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
@@ -57,11 +59,11 @@ Progress = Callable[[int], None]
 def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: str, stop: Stop) -> None:
     """Run a node on its audio device until `stop()`, through any interruption of device or server."""
     config: NodeConfig = site.nodes[name]
-    pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz)
+    pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz, reports_levels=True)
     link = _link(site, name, config.server, [pipeline], clock, run_id, _spool(site, name))
     problem = None
     try:
-        with device:
+        with device, HostWatch() as host:
             for block in device:
                 if stop():
                     break
@@ -69,7 +71,7 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
                     link.report(problem)
-                link.send(pipeline.push(block))
+                link.send(with_host(pipeline.push(block), host, device.lost_blocks))
     finally:
         link.close(bye=True)
 
@@ -92,12 +94,29 @@ def capture_recordings(
     UndeliveredError
         If the server has not acknowledged everything.
     """
-    pipelines, inputs = make_pipelines(site, recordings)
+    pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
     link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
-    for end_ns in _sent(link, pipelines, inputs, clock, stop):
-        if progress is not None:
-            progress(end_ns)
+    with HostWatch() as host:
+        for end_ns in _sent(link, pipelines, inputs, clock, stop, host):
+            if progress is not None:
+                progress(end_ns)
     _finish(link, clock, stop)
+
+
+def with_host(messages: Iterable[Message], host: HostWatch, lost_blocks: int = 0) -> list[Message]:
+    """Return messages with the state of this machine in those marks that carry levels.
+
+    Parameters
+    ----------
+    messages : iterable of Message
+    host : HostWatch
+    lost_blocks : int
+        Blocks of the device that were lost because the machine did not keep up.
+    """
+    return [
+        replace(message, host=host.state(lost_blocks)) if isinstance(message, Mark) and message.levels else message
+        for message in messages
+    ]
 
 
 def send_session(
@@ -119,7 +138,7 @@ def send_session(
     UndeliveredError
         If no server answers, or it refuses the sound, or has not acknowledged everything.
     """
-    pipelines, inputs = make_pipelines(site, recordings)
+    pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
     link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
@@ -185,13 +204,18 @@ def _link(
 
 
 def _sent(
-    link: Link, pipelines: Sequence[Pipeline], inputs: Sequence[TimedRecording], pace: Clock, stop: Stop
+    link: Link,
+    pipelines: Sequence[Pipeline],
+    inputs: Sequence[TimedRecording],
+    pace: Clock,
+    stop: Stop,
+    host: HostWatch | None = None,
 ) -> Iterator[int]:
-    """Send the messages of the pipelines, block by block; yield the site time reached."""
+    """Send the messages of the pipelines, block by block, with the state of the host; yield the site time reached."""
     for end_ns, batch in paced_messages(pipelines, inputs, pace):
         if stop():
             return
-        link.send(batch)
+        link.send(batch if host is None else with_host(batch, host))
         yield end_ns
 
 

@@ -60,6 +60,7 @@ class Outbox:
     def __init__(self, spool: Spool) -> None:
         self.dropped = 0
         self.settled: int | None = None
+        self._with_sections = False
         self._spool = spool
         self._newest_marks: dict[str, Mark] = {}  # while the server is away
         self._live: deque[tuple[int, Kept | Mark]] = deque()  # with the time at which each was queued
@@ -105,6 +106,10 @@ class Outbox:
             self._live.append((now_ns, message))
         else:
             self._newest_marks[message.array] = message
+
+    def send_sections(self, allowed: bool) -> None:
+        """Send marks with their sections from now on, or without them to a server that would refuse the marks."""
+        self._with_sections = allowed
 
     def add_requested(self, messages: Iterable[Message]) -> None:
         """Queue the answer to a backfill request. It bypasses the spool: it is not sent again if it gets lost."""
@@ -168,7 +173,8 @@ class Outbox:
     def _send_one(self, message: Kept | Mark, send: Send) -> bool:
         """Return True if the message was handed over, or cannot be read any more."""
         if isinstance(message, Mark):
-            return send(wire.encode(replace(message, lost_frames=message.lost_frames + self.dropped)))
+            mark = replace(message, lost_frames=message.lost_frames + self.dropped)
+            return send(wire.encode(mark if self._with_sections else replace(mark, levels=(), host=None)))
         try:
             data = self._spool.read(message)
         except SpoolError as error:

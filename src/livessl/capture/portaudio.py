@@ -234,9 +234,32 @@ def _inputs(sd: Any) -> list[tuple[int, InputDevice]]:
                 default_sample_rate_hz=float(found["default_samplerate"]),
             ),
         )
-        for found in sd.query_devices()
+        for found in _described(sd)
         if found["max_input_channels"] > 0
     ]
+
+
+def _described(sd: Any) -> list[Any]:
+    """Return what PortAudio knows of each device, also where names are not UTF-8, as the kernel's may be."""
+    try:
+        return list(sd.query_devices())
+    except UnicodeDecodeError:
+        return [_with_name_replaced(sd, index) for index in range(sd._lib.Pa_GetDeviceCount())]
+
+
+def _with_name_replaced(sd: Any, index: int) -> Any:
+    """Return what PortAudio knows of one device, with a replacement character for each byte that is not UTF-8."""
+    try:
+        return sd.query_devices(index)
+    except UnicodeDecodeError:
+        info = sd._lib.Pa_GetDeviceInfo(index)
+        return {
+            "name": sd._ffi.string(info.name).decode("utf-8", "replace"),
+            "index": index,
+            "hostapi": info.hostApi,
+            "max_input_channels": info.maxInputChannels,
+            "default_samplerate": info.defaultSampleRate,
+        }
 
 
 def _find(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> tuple[int, InputDevice]:

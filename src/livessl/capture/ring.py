@@ -9,6 +9,7 @@ that a position that becomes visible early does no harm. All counters are 32-bit
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 import struct
@@ -20,6 +21,7 @@ _READ, _OVERRUNS, _FLAGGED, _BEATS = range(4)
 flagged them, and turns of the device process's main loop."""
 
 _HEADER_BYTES: Final = 64
+_STANDARD_ERROR: Final = 2
 _WORD: Final = 1 << 32
 _LABEL: Final = struct.Struct("=qqqq")
 """Label of a slot: index of the first sample, number of samples, time of the first sample in ns, loss before it."""
@@ -76,6 +78,20 @@ class Slot:
     time_ns: int
     lost: bool
     samples: memoryview
+
+
+def beyond_standard(fd: int) -> int:
+    """Return a file descriptor for the same file that is none of the three standard streams; close the former one.
+
+    In a process that was started without standard streams, new files get their numbers. A child process would have its
+    own standard streams in the place of such a file.
+    """
+    if fd > _STANDARD_ERROR:
+        return fd
+    try:
+        return fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, _STANDARD_ERROR + 1)
+    finally:
+        os.close(fd)
 
 
 class _Ring:
@@ -144,9 +160,9 @@ class RingReader(_Ring):
     """
 
     def __init__(self, shape: RingShape) -> None:
-        self.memory_fd = os.memfd_create("livessl-ring")
+        self.memory_fd = beyond_standard(os.memfd_create("livessl-ring"))
         os.ftruncate(self.memory_fd, shape.bytes)
-        self.published_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.published_fd = beyond_standard(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC))
         super().__init__(self.memory_fd, self.published_fd, shape)
         self.waiting = 0
         self._read = 0

@@ -49,6 +49,9 @@ FLOOD_BYTES: Final = 32768
 LAG_SHOWN_NS: Final = 5_000_000_000
 """Time in ns for which a loss in the ring stays the problem of the device."""
 
+HELD_NS: Final = 50_000_000
+"""Interval, in ns, at which a process that was killed and does not end is looked at."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -86,6 +89,11 @@ class SoundDevice:
         Number of times that the process was started.
     unflagged_gaps : int
         Gaps that no driver flagged.
+    lost_blocks : int
+        Blocks that were lost because this machine did not keep up: those that its driver flagged, those that this
+        process did not read in time, and one for each gap without a flag.
+    interruptions : int
+        Number of times that the device had delivered and was then opened again: it was unplugged, stopped or failed.
     """
 
     def __init__(
@@ -102,6 +110,8 @@ class SoundDevice:
         self.overruns = 0
         self.starts = 0
         self.unflagged_gaps = 0
+        self.lost_blocks = 0
+        self.interruptions = 0
         self._block_s = config.block_s
         self._wanted = wanted_device(config, channels)
         self._clock = clock
@@ -109,6 +119,7 @@ class SoundDevice:
         self._output = NativeOutput()
         self._gaps = GapWatch(config.sample_rate_hz, config.block_s, SOUND_SERVER)
         self._run: _Run | None = None
+        self._former: DeviceProcess | None = None
         self._failures = 0
         self._start_ns = clock.monotonic_ns()
         self._lag_ns: int | None = None
@@ -187,6 +198,7 @@ class SoundDevice:
         if gap_ns:
             overflow = True
             self.unflagged_gaps += 1
+            self.lost_blocks += 1
             _log.warning(
                 "%.0f ms of sound of device %r are missing without a flag of its driver; %d such gaps so far",
                 gap_ns / 1e6,
@@ -258,7 +270,9 @@ class SoundDevice:
         )
 
     def _count_overruns(self, run: _Run) -> None:
+        self.lost_blocks += run.new_flagged()
         lost = run.new_overruns()
+        self.lost_blocks += lost
         if lost:
             self.overruns += lost
             self._lag_ns = self._clock.monotonic_ns()
@@ -266,6 +280,7 @@ class SoundDevice:
 
     def _give_up(self, run: _Run) -> None:
         self._failures = 0 if run.report is not None else self._failures + 1
+        self.interruptions += run.delivers
         self._end(kill=True)
 
     def _leave(self) -> None:
@@ -285,9 +300,19 @@ class SoundDevice:
             )
 
     def _wait_to_begin(self) -> None:
-        """Start the process again as soon as `RESTART_S` has passed since its last start."""
+        """Start the process again as soon as `RESTART_S` has passed since its last start, and the former has ended.
+
+        A process that the kernel holds in a driver keeps the device busy, although it was killed.
+        """
         interval_s = min(MAX_RESTART_S, RESTART_S * 2.0**self._failures)
         missing_ns = self._start_ns + round(interval_s * 1e9) - self._clock.monotonic_ns()
+        if self._former is not None and self._former.exit_code is None:
+            missing_ns = max(missing_ns, HELD_NS)
+            self.problem = (
+                f"device {self.name!r} is held by this node's former process (process {self._former.pid}), which was "
+                "killed and does not end, because the kernel waits for the driver; unplug the interface, or restart "
+                "the machine; waiting for it"
+            )
         if missing_ns > 0:
             self._clock.sleep_until_ns(self._clock.now_ns() + missing_ns)
         else:
@@ -298,6 +323,7 @@ class SoundDevice:
         if run is not None:
             self._count_overruns(run)
             self._output.feed(run.process.end(kill=kill), self._clock.monotonic_ns())
+            self._former = run.process
             self._lost = self._lost or self._delivered
 
 
@@ -313,7 +339,7 @@ class _Run:
         self._beats = self._last_beats = process.beats
         self._flagged = self._last_flagged = process.flagged
         self._unflagged_s = 0.0
-        self._overruns = 0
+        self._overruns = self._counted_flagged = 0
         self._floods = 0
         self._output_ns = clock.monotonic_ns()
 
@@ -351,6 +377,11 @@ class _Run:
         """Return the number of blocks that the ring had no room for since the last call."""
         before, self._overruns = self._overruns, self.process.overruns
         return self._overruns - before
+
+    def new_flagged(self) -> int:
+        """Return the number of blocks that the driver flagged since the last call."""
+        before, self._counted_flagged = self._counted_flagged, self.process.flagged
+        return self._counted_flagged - before
 
     def read_output(self, output: NativeOutput) -> None:
         """Read a limited amount of what native libraries print."""

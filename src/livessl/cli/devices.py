@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from livessl.capture.portaudio import InputDevice, input_devices
+from livessl.capture.input_search import list_inputs
+from livessl.capture.portaudio import InputDevice
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json
 from livessl.cli.output import complain
@@ -21,7 +22,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    devices = input_devices()
+    devices = list_inputs()
     if arguments.json:
         print(json.dumps([asdict(device) for device in devices]))
     else:

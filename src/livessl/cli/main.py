@@ -14,6 +14,7 @@ from typing import Final
 from livessl import __version__
 from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctrl_c
 from livessl.cli.output import complain
+from livessl.cli.standard_streams import open_standard_streams
 from livessl.errors import RunError, UseError
 
 
@@ -100,6 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
+    open_standard_streams()
     given = sys.argv[1:] if arguments is None else arguments
     parsed = _parser(given).parse_args(given)
     from threadpoolctl import threadpool_limits

@@ -20,6 +20,7 @@ from livessl.core.types import Block
 from livessl.errors import ConfigError, Fault
 
 if TYPE_CHECKING:
+    from livessl.capture.sound_device import SoundDevice
     from livessl.recordings.sound_file import SoundWriter
     from livessl.site.models import Site
     from livessl.site.node_models import NodeConfig, SoundDeviceConfig
@@ -99,7 +100,24 @@ def meter_device(arguments: argparse.Namespace, site: Site | None) -> int:
                     limit.begin(sounds=bool(block.samples.shape[1]))
                 return limit.is_over
 
-            return session.run(device, over)
+            code = session.run(device, over)
+            _note_losses(device)
+            return code
+
+
+def _note_losses(device: SoundDevice) -> None:
+    """Print how often sound was lost, and why: the machine was busy, or the device was not there."""
+    if device.lost_blocks:
+        complain(
+            f"sound was lost {device.lost_blocks} times because this machine did not keep up; stop other programs",
+            kind="note",
+        )
+    if device.interruptions:
+        complain(
+            f"the device was interrupted {device.interruptions} times: unplugged, switched off, or opened again after "
+            "an error; the lines above say when",
+            kind="note",
+        )
 
 
 class _Limit:
@@ -169,6 +187,7 @@ def _open_when_there(
     clock = SystemClock()
     least = arguments.inputs or least
     told: str | None = None
+    delivers = False
     while not limit.is_over:
         found = search_input(wanted_device(config, least))
         if found is not None:
@@ -178,6 +197,8 @@ def _open_when_there(
             if told is not None:
                 view.problem(None)
             return config, arguments.inputs or usual
+        if delivers:  # it opens although no search finds it, such as with a library that lists it late
+            return config, least
         # the attempt to open it says why it is not found
         end_ns = clock.monotonic_ns() + round(SEARCH_S * 1e9)
         with SoundDevice(config, least, clock) as device:
@@ -188,7 +209,8 @@ def _open_when_there(
                 has_cause = device.problem is not None and device.has_cause
                 if has_cause:
                     limit.begin(sounds=False)
-                if limit.is_over or block.samples.shape[1] or (has_cause and clock.monotonic_ns() >= end_ns):
+                delivers = block.samples.shape[1] > 0
+                if limit.is_over or delivers or (has_cause and clock.monotonic_ns() >= end_ns):
                     break
     return None
 
@@ -213,7 +235,7 @@ class _Session:
         self._target: Path = arguments.out
         self._interval = max(1, round(interval_s * source.sample_rate_hz))
         self._seconds: float | None = arguments.seconds
-        self._samples = self._gaps = 0
+        self._samples = 0
         self._is_live = arguments.wav is None
 
     def run(self, blocks: Iterable[Block], over: Callable[[Block], bool]) -> int:
@@ -228,8 +250,6 @@ class _Session:
         if self._samples == 0:
             return _no_sound(self._source.name)
         self._view.summary(self._time_s, self._meter.overall())
-        if self._gaps:
-            complain(f"sound was lost {self._gaps} times; stop other programs on this machine", kind="note")
         if self._listen is not None:
             complain(f"input {self._listen} was written to {self._target}", kind="note")
         return OK
@@ -244,7 +264,6 @@ class _Session:
     def _take(self, block: Block, writer: SoundWriter | None) -> None:
         before = self._samples
         self._samples += block.samples.shape[1]
-        self._gaps += block.overflow
         self._meter.push(block.samples)
         if writer is not None and self._listen is not None:
             writer.write(block.samples[self._listen - 1 : self._listen])

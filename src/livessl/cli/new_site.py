@@ -237,10 +237,10 @@ def _free_names(taken: Sequence[str], count: int) -> list[str]:
 
 def _connected() -> dict[str, int]:
     """Return the interfaces that are connected, with their number of inputs; none without PortAudio."""
-    from livessl.capture.portaudio import input_devices
+    from livessl.capture.input_search import list_inputs
 
     try:
-        return {device.name: device.channels for device in input_devices() if device.is_hardware}
+        return {device.name: device.channels for device in list_inputs() if device.is_hardware}
     except DeviceError:
         return {}
 

@@ -14,7 +14,7 @@ from livessl.clock import Clock
 from livessl.errors import RunError
 
 READY_NS: Final = 300_000_000_000
-"""Longest start of a server, in nanoseconds; the first one on a busy machine compiles kernels for minutes."""
+"""Longest start of a server, in nanoseconds, on a machine that is very busy."""
 
 POLL_NS: Final = 50_000_000
 """Time, in nanoseconds, between two checks whether a server is ready."""

@@ -56,10 +56,13 @@ class AssignedRecording:
         return TimedRecording(self.recording, self.start_ns)
 
 
-def make_pipelines(site: Site, recordings: Iterable[AssignedRecording]) -> tuple[list[Pipeline], list[TimedRecording]]:
+def make_pipelines(
+    site: Site, recordings: Iterable[AssignedRecording], *, reports_levels: bool = False
+) -> tuple[list[Pipeline], list[TimedRecording]]:
     """Return the pipelines that turn recordings into messages, and the recording that feeds each pipeline.
 
-    Recordings of arrays that the site joins are stacked into one, as if one device had recorded them.
+    Recordings of arrays that the site joins are stacked into one, as if one device had recorded them. With
+    `reports_levels`, marks carry the levels of the channels.
 
     Raises
     ------
@@ -79,7 +82,8 @@ def make_pipelines(site: Site, recordings: Iterable[AssignedRecording]) -> tuple
         for member in members:
             channels[member.array] = [before + number for number in member.channels]
             before += member.recording.channels
-        pipelines.append(make_pipeline(site, channels, first.recording.sample_rate_hz))
+        rate_hz = first.recording.sample_rate_hz
+        pipelines.append(make_pipeline(site, channels, rate_hz, reports_levels=reports_levels))
         stacked = StackedRecording(tuple(member.recording for member in members))
         inputs.append(first if len(members) == 1 else TimedRecording(stacked, first.start_ns))
     return pipelines, inputs

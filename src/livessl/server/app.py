@@ -6,19 +6,18 @@ import asyncio
 import gc
 import logging
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
 from livessl.clock import Clock
-from livessl.core.locate.peak_search import warm_up
 from livessl.errors import ConfigError
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
@@ -41,9 +40,6 @@ from livessl.site.models import Site
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
 releases it thousands of times a second; by Python's default it would wait 5 ms each time to get it back."""
-
-NOTICE_S: Final = 2.0
-"""Time, in seconds, that the kernels may take to load before the log says that they are being compiled."""
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
@@ -183,7 +179,9 @@ class Server:
             undo.callback(sinks.close)
             store = Store.of(site)
             undo.callback(store.close)
-            _compile_kernels()
+            self._compiler = load_kernels()
+            if self._compiler is not None:
+                undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
@@ -204,6 +202,8 @@ class Server:
             asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
+            if self._compiler is not None:
+                self._compiler.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
@@ -258,13 +258,3 @@ class Server:
             loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed, and no subscriber is left
             _log.debug("a message was published after the event loop had closed")
-
-
-def _compile_kernels() -> None:
-    """Compile the kernels before anybody waits for a result; reading them from numba's cache takes a moment only."""
-    notice = threading.Timer(NOTICE_S, _log.info, ["First start: compiling kernels. This can take a minute."])
-    notice.start()
-    try:
-        warm_up()
-    finally:
-        notice.cancel()

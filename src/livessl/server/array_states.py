@@ -15,6 +15,7 @@ from livessl.clock import Clock, utc_text
 from livessl.core.stream.array_health import ArrayState, ArrayStatus, NodeReport
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
+from livessl.server.api.encode_reports import node_report
 from livessl.server.ingest import Ingest
 from livessl.server.node_clocks import clock_is_behind
 from livessl.server.overload import Overload
@@ -22,6 +23,7 @@ from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
 from livessl.site.build.pipeline import activity_parameters
+from livessl.site.build.set_up import with_inputs
 from livessl.site.models import Site
 
 REPORT_NS: Final = 500_000_000
@@ -67,6 +69,7 @@ class ArrayStates:
         publish: Callable[[JsonObject], None],
     ) -> None:
         self._site = site
+        self._nodes = {spec.name: site.node_of(spec.name) for spec in site.processed}
         self._activity = activity_parameters(site)
         self._clock = clock
         self._store = store
@@ -95,6 +98,7 @@ class ArrayStates:
         """Describe the arrays as this fusion sees them, from now on; past sounds say nothing about them any more."""
         self._fusion = fusion
         self._set_up_watch.forget()
+        self._ingest.node_reports.forget()
 
     @property
     def disabled(self) -> frozenset[str]:
@@ -138,6 +142,8 @@ class ArrayStates:
             if all(state == self._reported.get(name) for name, state in states.items()):
                 return
         self._reported_ns = now_ns
+        reported = self._ingest.node_reports.findings(self._nodes, now_ns)
+        self._set_up_watch.note_reports(with_inputs(self._site, reported))
         arrays = self.describe()
         for array in arrays:
             before = self._reported.get(array["name"])
@@ -158,8 +164,19 @@ class ArrayStates:
 
     def _described(self, status: ArrayStatus, fusion: TwoPassFusion) -> JsonObject:
         status = replace(status, counters=self._counters(status, fusion))
-        described = array_status(status, self._site.node_of(status.name), self._activity)
-        return {**described, "enabled": status.state is not ArrayState.DISABLED}
+        described = array_status(status, self._nodes[status.name], self._activity)
+        report = node_report(
+            self._ingest.node_reports.of(status.name), self._clock.monotonic_ns(), self._faults_of(status.name)
+        )
+        return {**described, **report, "enabled": status.state is not ArrayState.DISABLED}
+
+    def _faults_of(self, array: str) -> dict[int, list[str]]:
+        """Return the codes of the faults of each channel, from 1, of an array."""
+        faults: dict[int, list[str]] = {}
+        for finding in self._set_up_watch.state.findings:
+            if finding.array == array and finding.channel is not None:
+                faults.setdefault(finding.channel, []).append(finding.fault)
+        return faults
 
     def _node_report(self, array: str) -> NodeReport:
         return NodeReport(

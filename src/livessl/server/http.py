@@ -18,6 +18,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import InvalidState
 
 from livessl.errors import ConfigError, Fault
+from livessl.server.connections import LimitedListener, TimedRequests
 from livessl.server.receiver import BindError, address_cure
 from livessl.site.addresses import in_url
 from livessl.site.models import Site
@@ -26,9 +27,9 @@ from livessl.site.server_models import HttpConfig
 SHUTDOWN_S: Final = 2
 """Time, in seconds, that open connections get to end."""
 
-MAX_CONNECTIONS: Final = 1000
+MAX_CONNECTIONS: Final = 900
 """Most connections at once: more than any site has clients, and fewer than the 1024 files that most systems allow a
-process to open."""
+process to open, of which the nodes' connections and the database need some."""
 
 MAX_INCOMING_BYTES: Final = 4096
 """Longest WebSocket message that a client may send; the server ignores them all."""
@@ -90,7 +91,7 @@ def listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with ExitStack() as undo:
         try:
-            listener = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            listener = undo.enter_context(LimitedListener(family, MAX_CONNECTIONS))
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # accepted sockets inherit it
             address: tuple[Any, ...] = (host, port)
@@ -145,7 +146,8 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
             _Ended(app),
             ws=_WebSocket,  # sends many small messages faster than uvicorn's other implementations
             log_level="warning",
-            http="h11",  # the implementation that limits the head of a request
+            http=TimedRequests,  # h11 is the implementation that limits the head of a request
+            loop="asyncio",  # another loop would not accept connections by `LimitedListener.accept`
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ssl_certfile=certificate,
             ssl_ciphers=CIPHERS,

@@ -10,6 +10,7 @@ from typing import Final
 from livessl import wire
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
 from livessl.server.node_clocks import NodeClocks
+from livessl.server.node_reports import NodeReports
 from livessl.site.models import Site
 
 ACK_NS: Final = 250_000_000
@@ -68,8 +69,8 @@ class Peer:
 class Received:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `offer` informs a node that the server
-    may request frames; it is sent before the reply.
+    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` informs a node of what the
+    server reads, and `offer` that it may request frames; both are sent before the reply.
     """
 
     message: Message | None = None
@@ -78,6 +79,7 @@ class Received:
     left: wire.Hello | None = None
     reply: wire.Ack | None = None
     offer: wire.Request | None = None
+    welcome: wire.Welcome | None = None
 
 
 class Ingest:
@@ -95,6 +97,7 @@ class Ingest:
         self._final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
         self._notice_ns = -NOTICE_NS
         self.node_clocks = NodeClocks()
+        self.node_reports = NodeReports()
         self.malformed = 0
         """Malformed messages since the start."""
         self._kept: frozenset[str] | None = None  # replaced as a whole, never changed
@@ -177,6 +180,8 @@ class Ingest:
         if isinstance(message, Frame):
             peer.take(message)
             message = self._relieved(message)
+        else:
+            self.node_reports.note(message, now_ns)
         return Received(message=message)
 
     def _relieved(self, frame: Frame) -> Frame:
@@ -242,6 +247,7 @@ class Ingest:
         known = self._peers.get(routing_id)
         unaware = not hello.answers and (known is None or known.hello.answers)
         offer = wire.Request(hello.run_id) if unaware else None
+        welcome = wire.Welcome(hello.run_id, (wire.SECTIONS,)) if unaware else None
         peer = Peer(routing_id, hello, now_ns)
         if same_run is not None:
             moved = same_run.routing_id != routing_id or hello.backlog.items() - same_run.hello.backlog.items()
@@ -258,10 +264,10 @@ class Ingest:
             _log.info("node %r joined with %s", hello.node, ", ".join(hello.arrays))
         reply = self._ack(peer)
         if same_run is None:
-            return Received(joined=hello, reply=reply, offer=offer)
+            return Received(joined=hello, reply=reply, offer=offer, welcome=welcome)
         before = same_run.hello
         news = hello.backlog != before.backlog or hello.answers != before.answers
-        return Received(greeted=hello if news else None, reply=reply, offer=offer)
+        return Received(greeted=hello if news else None, reply=reply, offer=offer, welcome=welcome)
 
     def _ack(self, peer: Peer) -> wire.Ack:
         final = [self._final_until[array] for array in peer.hello.arrays if array in self._final_until]

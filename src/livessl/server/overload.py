@@ -26,7 +26,7 @@ _WORDS: Final = {
 }
 
 CURE: Final = "Use a faster machine or fewer arrays per server, raise fusion.update_s, or stop other programs on it"
-"""What helps against an overload."""
+"""Cure of an overload, in words."""
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class Overload:
         self._ended_ns = clock.monotonic_ns()
         self._since_ns: int | None = None
         self.relief = NOTHING_SHED
-        """What is shed now."""
+        """The work that is shed now."""
         self.updates_shed = 0
         """Windows that were not located for the load, since the start."""
 

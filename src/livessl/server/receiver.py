@@ -267,8 +267,9 @@ class Receiver:
             self.arrivals.note(message.frame_index, arrival)
             self.ingest.node_clocks.note(message.array, *arrival)
             read.append((message.samples.nbytes if isinstance(message, Frame) else 0, message))
-        if received.offer is not None:
-            self._reply(routing_id, received.offer)
+        for announcement in (received.welcome, received.offer):
+            if announcement is not None:
+                self._reply(routing_id, announcement)
         if received.reply is not None:
             self._reply(routing_id, received.reply)
 
@@ -288,7 +289,7 @@ class Receiver:
         for routing_id, request in self.ingest.requests(due):
             self._reply(routing_id, request)
 
-    def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request) -> None:
+    def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request | wire.Welcome) -> None:
         try:
             self._socket.send_multipart([routing_id, wire.encode(reply)], zmq.NOBLOCK)
         except zmq.ZMQError as error:  # the node is gone or does not read; it will greet again

@@ -1,6 +1,7 @@
 """Examines the set-up with the sounds that are located, in a thread of its own: `livessl doctor`, all the time.
 
-It keeps the observations of the last sounds only, so that findings end once the set-up is mended.
+It keeps the observations of the last sounds only, so that findings end once the set-up is mended. Findings have
+hysteresis (`livessl.core.commission.steady`): they do not come and go with single sounds.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
-from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
+from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation, Received
 from livessl.server.overload import Overload
+from livessl.site.build.layout import layout_findings
 from livessl.site.models import Site
 
 KEPT_SOUNDS: Final = 12
@@ -25,10 +29,29 @@ WAIT_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class SetUpState:
+    """The set-up as the sounds so far show it.
+
+    Parameters
+    ----------
+    sounds : int
+        Number of sounds that the findings rest on.
+    findings : tuple of Finding
+        Faults of the set-up, errors first.
+    errors : mapping of array to str
+        The error that concerns each array, in words; arrays without one are left out.
+    """
+
+    sounds: int = 0
+    findings: tuple[Finding, ...] = ()
+    errors: Mapping[str, str] = field(default_factory=dict)
+
+
 class SetUpWatch:
     """Examines the set-up.
 
-    The fusion thread calls `take` and `forget`; every thread may read `findings` and `finding_of`.
+    The fusion thread calls `take` and `forget`; every thread may read `state`, which is replaced as a whole.
 
     Parameters
     ----------
@@ -43,27 +66,22 @@ class SetUpWatch:
         self._lock = threading.Lock()
         self._new: deque[Sequence[Received]] = deque(maxlen=KEPT_SOUNDS)
         self._sounds: Sequence[Sequence[Observation]] = ()
+        self._unjudged = 0  # sounds since findings were last looked for
         self._run = 0  # number of times that all sounds were forgotten
-        self._findings: tuple[Finding, ...] = ()
-        self._by_array: Mapping[str, str] = {}
+        self._steady = SteadyFindings()
+        self._of_layout = layout_findings(site)
+        self._of_sounds: tuple[Finding, ...] = ()
+        self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
+        self.state = SetUpState(findings=self._of_layout)
+        """The latest state. Read it once for values that belong together."""
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Faults of the set-up, errors first."""
-        return self._findings
-
-    @property
-    def sounds(self) -> int:
-        """Number of sounds that the findings rest on, or will."""
-        return len(self._sounds)
-
     def finding_of(self, array: str) -> str | None:
         """Return the error that concerns an array, in words; None if there is none."""
-        return self._by_array.get(array)
+        return self.state.errors.get(array)
 
     def take(self, event: Event) -> None:
         """Take in a final event."""
@@ -71,12 +89,20 @@ class SetUpWatch:
             with self._lock:
                 self._new.append(event.received)
 
+    def note_reports(self, findings: Sequence[Finding]) -> None:
+        """Take in what the reports of the nodes show now; new faults are logged."""
+        with self._lock:
+            self._log_new(self._reported, findings)
+            self._reported = tuple(findings)
+            self._publish()
+
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
         with self._lock:
             self._new.clear()
-            self._sounds = ()
+            self._sounds, self._unjudged = (), 0
             self._run += 1
+            self._steady = SteadyFindings()
             self._note(())
 
     def start(self) -> None:
@@ -101,24 +127,41 @@ class SetUpWatch:
         from livessl.site.build.set_up import find_set_up_faults
 
         sounds = [*known, *(observe(received) for received in new)][-KEPT_SOUNDS:]
-        findings = tuple(find_set_up_faults(self._site, sounds)) if len(sounds) >= LEAST_SOUNDS else ()
+        findings = find_set_up_faults(self._site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
-            if run == self._run:
-                self._sounds = sounds
-                self._note(findings)
+            if run != self._run:
+                return
+            self._sounds = sounds
+            self._unjudged += len(new)
+            if findings is None:
+                self._note(())
+            else:
+                self._note(self._steady.note(findings, self._unjudged))
+                self._unjudged = 0
 
-    def _note(self, findings: tuple[Finding, ...]) -> None:
-        known = {finding.message.partition(":")[0] for finding in self._findings}
-        for finding in findings:
-            if finding.message.partition(":")[0] not in known:
-                _log.warning("%s; %s", finding.message, finding.cure)
-        self._findings = findings
-        self._by_array = {
+    def _note(self, findings: Sequence[Finding]) -> None:
+        self._log_new(self._of_sounds, findings)
+        self._of_sounds = tuple(findings)
+        self._publish()
+
+    def _publish(self) -> None:
+        """Replace the state."""
+        all_arrays = [spec.name for spec in self._site.processed]
+        errors = {
             array: f"{finding.message}; {finding.cure}"
-            for finding in reversed(findings)
+            for finding in reversed(self._of_sounds)
             if finding.severity is Severity.ERROR
-            for array in ([finding.array] if finding.array is not None else [one.name for one in self._site.processed])
+            for array in ([finding.array] if finding.array is not None else all_arrays)
         }
+        findings = in_order([*self._of_sounds, *self._reported, *self._of_layout])
+        self.state = SetUpState(len(self._sounds), tuple(findings), errors)
+
+    @staticmethod
+    def _log_new(known: Sequence[Finding], findings: Sequence[Finding]) -> None:
+        before = {_subject(finding) for finding in known}
+        for finding in findings:
+            if _subject(finding) not in before:
+                _log.warning("%s; %s", finding.message, finding.cure)
 
     def _work(self) -> None:
         try:
@@ -129,3 +172,8 @@ class SetUpWatch:
             self.failure = error
             _log.exception("the examination of the set-up has failed; the server ends")
             raise
+
+
+def _subject(finding: Finding) -> tuple[str, str | None, int | None]:
+    """Return what a finding of a report is about; its figures change all the time."""
+    return finding.fault, finding.array or finding.message.partition(":")[0], finding.channel

@@ -30,7 +30,7 @@ COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
 
 SAMPLED_GRID_POINTS: Final = 500
-"""Approximate number of grid points at which `_wide_arrays` compares the grid with an array: enough for a median."""
+"""Approximate number of grid points at which `wide_arrays` compares the grid with an array: enough for a median."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -190,8 +190,8 @@ def _capture_faults(node: NodeConfig, spec: ArraySpec, channels: Sequence[int]) 
         )
 
 
-def _wide_arrays(site: Site) -> Iterator[str]:
-    """Yield a warning for each array whose peaks are narrower than the grid.
+def wide_arrays(site: Site) -> Iterator[tuple[ArraySpec, float]]:
+    """Yield each array whose peaks are narrower than the grid, and the frequency up to which they are not, in hertz.
 
     These are arrays for which, at half of all grid points and pairs or more, the delay changes by over half a period
     from a grid point to a corner of its cell.
@@ -202,15 +202,22 @@ def _wide_arrays(site: Site) -> Iterator[str]:
     for spec in site.processed:
         if reach_m == 0.0 or uses_envelope(spec.band_hz):
             continue
-        pairs, high = microphone_pairs(len(spec.microphones_m)), spec.band_hz[1]
-        kept = float(np.median(alias_free_hz(points_m, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        pairs = microphone_pairs(len(spec.microphones_m))
+        kept_hz = float(np.median(alias_free_hz(points_m, spec.microphones_m, pairs, reach_m, site.c_m_s)))
+        if kept_hz < spec.band_hz[1]:
+            yield spec, kept_hz
+
+
+def _wide_arrays(site: Site) -> Iterator[str]:
+    """Yield a warning for each array whose peaks are narrower than the grid."""
+    for spec, kept_hz in wide_arrays(site):
+        spacing_m, high_hz = site.grid.spacing_m, spec.band_hz[1]
         cure = f"take joint.{spec.name} away" if spec.name in site.joint else "make arrays smaller"
-        if kept < high:
-            yield (
-                f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high:g} Hz needs a "
-                f"spacing of about {grid.spacing_m * kept / high:.2g} m, got {grid.spacing_m:g}; positions may be "
-                f"wrong: lower the array's band_hz, or {cure}"
-            )
+        yield (
+            f"grid.spacing_m: array {spec.name!r} is {spec.aperture_m:.1f} m wide: up to {high_hz:g} Hz needs a "
+            f"spacing of about {spacing_m * kept_hz / high_hz:.2g} m, got {spacing_m:g}; positions may be "
+            f"wrong: lower the array's band_hz, or {cure}"
+        )
 
 
 def _near_arrays(site: Site) -> Iterator[str]:

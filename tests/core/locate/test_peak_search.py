@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Iterator
+from itertools import pairwise, product
 from types import ModuleType
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, ideal_gcc, tetra, true_lags_s
 from livessl.core.correlate.gcc_phat import GCCPhat
 from livessl.core.geometry import Grid, pair_weight
+from livessl.core.kernels import kernels as in_use
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.kernels.arguments import BLOCKS, RUNS
 from livessl.core.kernels.search_with_numpy import lag_places
@@ -26,11 +28,11 @@ KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="Nu
 
 
 @pytest.fixture(params=KERNELS)
-def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    chosen: ModuleType = request.param
-    for module in (peak_search, srp):
-        monkeypatch.setattr(module, "kernels", chosen)
-    return chosen
+def kernels(request: pytest.FixtureRequest) -> Iterator[ModuleType]:
+    before = in_use.in_use
+    in_use.use(request.param)
+    yield request.param
+    in_use.use(before)
 
 
 def arrays(count: int, seed: int) -> list[ArraySpec]:
@@ -63,8 +65,12 @@ def sounds(specs: list[ArraySpec], kind: str, seed: int) -> list[Evidence]:
     return evidence
 
 
+def mapper_of(one: Evidence, grid: Grid) -> SRPMapper:
+    return SRPMapper(one.spec, grid, one.gcc.pairs, one.gcc.lags_s, C_M_S)
+
+
 def fused_map(evidence: list[Evidence], grid: Grid) -> Float32Array:
-    maps = [SRPMapper(h.spec, grid, h.gcc.pairs, h.gcc.lags_s, C_M_S)(h.gcc) for h in evidence]
+    maps = [mapper_of(h, grid)(h.gcc) for h in evidence]
     return np.asarray(np.add.reduce(maps))
 
 
@@ -92,15 +98,22 @@ def test_the_peak_is_that_of_the_whole_map(kernels: ModuleType, count: int, kind
 def test_both_kinds_of_kernels_find_the_same_peaks() -> None:
     grid = Grid(ROOM, 0.11)
     evidence = sounds(arrays(3, 5), "two", 5)
-    said = []
-    for kind in (with_numba, with_numpy):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(peak_search, "kernels", kind)
-            searched = searching(evidence, grid)
+    said, powers = [], []
+    before = in_use.in_use
+    try:
+        for prepared_by, searched_by in product((with_numba, with_numpy), repeat=2):  # they may change in between
+            in_use.use(prepared_by)
+            searched, mapper = searching(evidence, grid), mapper_of(evidence[0], grid)
+            in_use.use(searched_by)
             box = np.array([[3, 20], [5, 30], [0, 24]])
             said.append(searched.among(evidence)(6, 2, [box]))
-    assert said[0] == said[1]
+            powers.append(mapper(evidence[0].gcc))
+    finally:
+        in_use.use(before)
+    assert all(each == said[0] for each in said)
     assert len(said[0]) == 6
+    for power in powers:
+        np.testing.assert_allclose(power, powers[0], rtol=1e-5)
 
 
 def test_several_peaks_are_those_of_the_map(kernels: ModuleType) -> None:

@@ -7,16 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from free_field import C_M_S, RATE_HZ, band_mean_cos, burst, heard, tetra, true_lags_s
+from free_field import C_M_S, RATE_HZ, band_mean_cos, burst, heard, ideal_gcc, tetra, true_lags_s
 from livessl.core.correlate.gcc_phat import LagSampling
+from livessl.core.correlate.onset_gcc import OnsetGCC
 from livessl.core.geometry import Grid, microphone_pairs
+from livessl.core.locate import frame_gccs
 from livessl.core.locate.estimator import Course, Localization, Sound
 from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.onset import Onset
+from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.peak_search import PeakSearch
-from livessl.core.locate.place import highest_place
-from livessl.core.locate.second_source import SecondSourceFeatures, SecondSourceSearch
+from livessl.core.locate.place import Place, highest_place
+from livessl.core.locate.second_source import SecondSourceFeatures, SecondSourceSearch, _powers
+from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import FRAME_S, GCC, ArraySpec, Evidence, FloatArray
 
 GRID = Grid(((0.0, 4.2), (0.0, 5.1), (0.0, 2.7)), 0.1)
@@ -333,3 +339,88 @@ def test_no_second_source_is_returned_unless_wanted(estimator: Onset) -> None:
 def test_one_array_alone_finds_no_second_source(estimator: Onset) -> None:
     sounds = sounds_of(estimator, [(ONE_M, 1.0), (OTHER_M, 1.0)])
     assert estimator.locate({"north": sounds["north"]}).others == ()
+
+
+@pytest.mark.parametrize("left_out", ["east", "north"])
+def test_a_place_has_the_power_of_the_arrays_that_the_sources_are_separated_by(left_out: str) -> None:
+    """Not that of the arrays it was found by, of which an outlier, or one of many arrays, is not among them."""
+    specs = (EAST, NORTH, SOUTH)
+    evidence = tuple(Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, ONE_M))) for spec in specs)
+    used = tuple(part for part in evidence if part.spec.name != left_out)
+    search = PeakSearch(specs, GRID, C_M_S)
+    for part in evidence:
+        search.prepare(part.spec.name, part.gcc.lags_s)
+    place = highest_place(evidence, search, GRID, C_M_S)
+    onset = OnsetGCC(np.zeros((6, 3), dtype=np.complex64), np.ones(4))
+    sounds = {part.spec.name: Sound((), RATE_HZ, (onset,), sources=2) for part in used}
+    examined: list[Place] = []
+
+    class Recording(SecondSourceSearch):
+        def find(self, first: Place, frames: Sequence[FrameGCCs]) -> None:
+            examined.append(first)
+
+    def frames_of(part: Evidence) -> FrameGCCs:
+        values = part.gcc.values[None]
+        return FrameGCCs(part.spec, part.gcc.lags_s, values, np.ones(1), np.ones(1), np.zeros(1, dtype=np.bool_))
+
+    Recording(search, GRID, C_M_S).separate(Consensus(place), used, sounds, frames_of)
+    (first,) = examined
+    alone = highest_place(used, search, GRID, C_M_S)
+    assert first.power == pytest.approx(alone.power, rel=1e-2)
+    assert first.rival_power == pytest.approx(alone.rival_power, rel=1e-2)
+    assert first.power < 0.8 * place.power
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 1000), height=st.floats(0.05, 0.4))
+def test_a_second_source_that_is_clear_in_no_frame_has_its_share_of_the_power(seed: int, height: float) -> None:
+    """It is weaker than the first in every frame, so that its part may be reflections; the first keeps its level."""
+    rng = np.random.default_rng(seed)
+    places, frames = [], []
+    for spec in (NORTH, SOUTH):
+        whole = ideal_gcc(spec, true_lags_s(spec.microphones_m, ONE_M))
+        other = ideal_gcc(spec, true_lags_s(spec.microphones_m, OTHER_M))
+        levels = np.array([1.0, 0.7])[:, None, None]
+        values = (levels * (whole.values + height * other.values)).astype(np.float32)
+        values += 0.02 * rng.standard_normal(values.shape).astype(np.float32)
+        weights, powers = 1000.0 * levels[:, 0, 0], np.array([4e-4, 2e-4])
+        frames.append(FrameGCCs(spec, whole.lags_s, values, weights, powers, np.zeros(2, dtype=np.bool_)))
+        places.append(Evidence(spec, whole))
+    evidence = tuple(places)
+    functional = SRPFunctional(evidence, C_M_S)
+    first, second = (Place(evidence, functional, at_m, 1.0, 0.0) for at_m in (ONE_M, OTHER_M))
+    of_first, of_second = _powers(first, second, frames)
+    assert of_first == pytest.approx(4e-4)
+    assert of_second is not None
+    assert of_second / 4e-4 == pytest.approx(height / (1.0 + height), rel=0.35)
+
+
+def test_the_power_of_sources_is_unknown_without_the_powers_of_the_frames() -> None:
+    evidence = tuple(Evidence(spec, ideal_gcc(spec, true_lags_s(spec.microphones_m, ONE_M))) for spec in (NORTH, SOUTH))
+    functional = SRPFunctional(evidence, C_M_S)
+    first, second = (Place(evidence, functional, at_m, 1.0, 0.0) for at_m in (ONE_M, OTHER_M))
+    frames = [
+        FrameGCCs(part.spec, part.gcc.lags_s, part.gcc.values[None], np.ones(1), np.zeros(1), np.zeros(1, np.bool_))
+        for part in evidence
+    ]
+    assert _powers(first, second, frames) == (None, None)
+
+
+@settings(max_examples=20)
+@given(count=st.integers(1, 60), most_bytes=st.integers(1, 1 << 20), first_active=st.integers(0, 60))
+def test_memory_of_the_frames_is_bounded(count: int, most_bytes: int, first_active: int) -> None:
+    """What does not fit is merged: no frame is lost, and none of the sound becomes quiet."""
+    sampling = LagSampling.shared(NORTH.band_hz, RATE_HZ, NORTH.aperture_m / C_M_S)
+    one = OnsetGCC(np.ones((6, sampling.count), dtype=np.complex64), np.ones(4))
+    powers = np.linspace(0.5, 1.0, count)
+    course = Course(np.arange(count), powers, first_active)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frame_gccs, "MAX_BYTES", most_bytes)
+        frames = FrameGCCs.of(NORTH, sampling, [one] * count, np.ones(6, dtype=np.bool_), course)
+    assert frames.values.nbytes <= max(most_bytes, frames.values[0].nbytes)
+    assert len(frames.values) <= frame_gccs.MAX_FRAMES
+    assert frames.weights.sum() == pytest.approx(count)
+    assert frames.powers.max() == powers.max()
+    assert frames.quiet.sum() <= max(0, first_active - frame_gccs.BEGINNING)
+    if count <= frame_gccs.MAX_FRAMES and count * frames.values[0].nbytes <= most_bytes:
+        assert len(frames.values) == count

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi
 
 from free_field import BAND_HZ, C_M_S, tetra, true_lags_s
 from livessl.core.geometry import posed
 from livessl.core.joint_array import joined
-from livessl.core.locate.set_up_error import set_up_covariance_m2
+from livessl.core.locate.set_up_error import half_axis_m, probability_within, set_up_covariance_m2
 from livessl.core.types import ArraySpec, FloatArray, Uncertainty
 
 ALL = (0, 1, 2)
@@ -130,3 +131,33 @@ def test_there_is_no_error_along_an_axis_that_is_not_searched() -> None:
     covariance_m2 = set_up_covariance_m2([flat], np.array([3.0, 2.0, 1.0]), (0, 1))
     assert np.diag(covariance_m2)[:2].min() > 0.0
     np.testing.assert_array_equal(covariance_m2[2], np.zeros(3))
+
+
+@settings(max_examples=30)
+@given(
+    deviations_m=st.tuples(*[st.floats(0.001, 2.0)] * 3),
+    turned=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    radius_m=st.floats(0.05, 2.0),
+    seed=st.integers(0, 1000),
+)
+def test_probability_is_the_share_of_errors_that_are_shorter(
+    deviations_m: tuple[float, ...], turned: tuple[float, ...], radius_m: float, seed: int
+) -> None:
+    turn = Rotation.from_rotvec(turned).as_matrix()
+    covariance_m2 = turn @ np.diag(np.square(deviations_m)) @ turn.T
+    errors_m = np.random.default_rng(seed).standard_normal((40_000, 3)) * deviations_m
+    share = float(np.mean(np.linalg.norm(errors_m, axis=1) <= radius_m))
+    # 0.01 is four standard deviations of a share of 40 000
+    assert probability_within(radius_m, covariance_m2) == pytest.approx(share, abs=0.012)
+    inside = np.einsum("na,ab,nb->n", errors_m @ turn.T, np.linalg.inv(covariance_m2), errors_m @ turn.T)
+    assert np.mean(inside <= (half_axis_m(covariance_m2) / max(deviations_m)) ** 2) == pytest.approx(0.9, abs=0.012)
+
+
+@given(deviation_m=st.floats(0.01, 3.0), axes=st.sampled_from([(0,), (1, 2), (0, 1, 2)]))
+def test_probability_of_flat_errors(deviation_m: float, axes: tuple[int, ...]) -> None:
+    """In one dimension it is that of the normal distribution, in two that of Rayleigh's, in three of Maxwell's."""
+    covariance_m2 = np.zeros((3, 3))
+    covariance_m2[axes, axes] = deviation_m**2
+    expected = chi(len(axes), scale=deviation_m).cdf(0.5)
+    assert probability_within(0.5, covariance_m2) == pytest.approx(expected, abs=3e-3)
+    assert probability_within(0.5, np.zeros((3, 3))) == 1.0

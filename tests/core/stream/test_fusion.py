@@ -19,7 +19,9 @@ from livessl.core.correlate.band import band_power
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import Grid
 from livessl.core.joint_array import joined
+from livessl.core.locate.confidence import NEAR_M, ConfidenceFeatures
 from livessl.core.locate.estimator import Localization, PowerMaps, Sound
+from livessl.core.locate.set_up_error import half_axis_m, probability_within, set_up_covariance_m2
 from livessl.core.locate.srp_phat import SrpPhat
 from livessl.core.stream.array_health import ArrayHealth, ArrayState, ArrayStatus
 from livessl.core.stream.array_stream import ArrayStream
@@ -33,6 +35,7 @@ from livessl.core.types import (
     ArraySpec,
     Candidate,
     ClockState,
+    Estimate,
     Event,
     Evidence,
     Float32Array,
@@ -44,6 +47,7 @@ from livessl.core.types import (
     Status,
     Track,
     TrackState,
+    Uncertainty,
     Update,
     Window,
 )
@@ -1143,3 +1147,76 @@ def test_an_answer_that_is_not_finite_is_refused(position: float, variance: floa
     event = only_event(play(fusion_of(Odd(), updates=True), arrivals, 50))
     assert event.status is Status.REFUSED
     assert event.reason == "method 'scripted' answered with a position or covariance that is not finite"
+
+
+@pytest.mark.parametrize("powers", [(None, None), (4e-3, 1e-3), (4e-3, None)])
+def test_each_source_has_the_level_that_the_estimator_found(powers: tuple[float | None, float | None]) -> None:
+    """The first has all power unless it was divided; the second has none but its own."""
+
+    class Divided(Duet):
+        def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+            found = super().locate(sounds)
+            others = tuple(replace(other, power=powers[1]) for other in found.others)
+            return replace(found, power=powers[0], others=others)
+
+    outputs = sound_at(Fusion(state_of(Divided(), THREE)), 0, ("north", "south"))
+    first, second = (output for output in outputs if isinstance(output, Event))
+    alone = Fusion(state_of(Duet(), THREE, sources=1))
+    (whole,) = (output for output in sound_at(alone, 0, ("north", "south")) if isinstance(output, Event))
+    assert (first.power, second.power) == (powers[0] or whole.power, powers[1])
+
+
+@pytest.mark.parametrize("free_axes", [(0, 1, 2), (0, 1)])
+def test_a_position_without_covariance_has_the_error_of_the_set_up(free_axes: tuple[int, ...]) -> None:
+    class Certain(Scripted):
+        def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+            return replace(super().locate(sounds), covariance_m2=np.zeros((3, 3)))
+
+    state = SiteState("site", (NORTH, SOUTH), Certain(), free_axes=free_axes)
+    arrivals = node("north", range(10, 16), range(50)) + node("south", range(10, 16), range(50))
+    estimate = only_event(play(Fusion(state, Role(updates=False)), arrivals, 50)).estimate
+    assert estimate is not None
+    assert tuple(np.flatnonzero(np.diag(estimate.covariance_m2))) == free_axes
+    np.testing.assert_array_equal(estimate.sound_covariance_m2, np.zeros((3, 3)))
+    expected_m2 = set_up_covariance_m2((NORTH, SOUTH), SOURCE_M, free_axes)
+    np.testing.assert_allclose(estimate.covariance_m2, expected_m2)
+
+
+class Sure(Scripted):
+    """An estimator whose confidence is a probability."""
+
+    def locate(self, sounds: Mapping[str, Sound]) -> Localization:
+        found = super().locate(sounds)
+        return replace(found, covariance_m2=1e-4 * np.eye(3), confidence=0.95, features=ConfidenceFeatures(0.5, 9.0))
+
+
+def located_with(estimator: Scripted, orientation_deg: float) -> tuple[Event, Estimate]:
+    """An event, and its estimate, of arrays whose orientation is known so well."""
+    known = Uncertainty(0.01, orientation_deg, 0.0, 0.0)
+    arrays = [replace(spec, uncertainty=known) for spec in (NORTH, SOUTH)]
+    arrivals = node("north", range(10, 16), range(50)) + node("south", range(10, 16), range(50))
+    event = only_event(play(Fusion(state_of(estimator, arrays), Role(updates=False)), arrivals, 50))
+    assert event.estimate is not None
+    return event, event.estimate
+
+
+@settings(max_examples=15)
+@given(orientation_deg=st.floats(0.1, 30.0), further_deg=st.floats(1.0, 20.0))
+def test_confidence_falls_with_the_error_of_the_set_up_and_the_reason_says_so(
+    orientation_deg: float, further_deg: float
+) -> None:
+    """A position stays a position: the sound determines it, and measuring the poses is what helps."""
+    event, estimate = located_with(Sure(), orientation_deg)
+    _, worse = located_with(Sure(), orientation_deg + further_deg)
+    assert event.status is Status.LOCATED
+    assert worse.confidence <= estimate.confidence <= 0.95
+    assert estimate.sound_confidence == worse.sound_confidence == 0.95
+    within = probability_within(NEAR_M, estimate.covariance_m2)
+    assert estimate.confidence == pytest.approx(0.95 * within, rel=1e-6)
+    is_limited = half_axis_m(estimate.set_up_covariance_m2) > NEAR_M
+    assert is_limited == (event.reason is not None)
+    assert not is_limited or "the set-up alone allows an error of" in str(event.reason)
+
+
+def test_confidence_that_is_no_probability_stays() -> None:
+    assert located_with(Scripted(), 20.0)[1].confidence == 0.5

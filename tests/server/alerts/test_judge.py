@@ -27,6 +27,7 @@ from livessl.core.types import Event
 from livessl.server.alerts import service
 from livessl.server.alerts.outbox import OutboxError
 from livessl.server.api.encode import Messages
+from livessl.server.set_up_watch import SetUpState
 from livessl.site.models import Site
 from small_site import wait_until
 
@@ -241,7 +242,7 @@ def test_finding_alerts_by_severity() -> None:
         "swaps": {"findings": {"severity": "info", "faults": ["turned"]}},
     }
     with running_desk(site(None, **rules)) as desk:
-        desk.findings.findings, desk.findings.sounds = tuple(faults), 3
+        desk.findings.state = SetUpState(3, tuple(faults))
         wait_until(lambda: len(desk.published) == 3, "the alerts")
     found = sorted((alert["rule"], alert["finding"]["fault"]) for alert in desk.published)
     assert found == [("all", "swapped"), ("all", "temperature"), ("errors", "swapped")]

@@ -132,6 +132,12 @@ def test_arrays(client: httpx.Client) -> None:
         assert array["drift_ppm"] == 0.0
         assert array["counters"]["frames"] > 10
         assert array["counters"]["marks"] > 0
+        assert len(array["channels"]) == 4
+        for channel in array["channels"]:
+            assert channel["rms_dbfs"] < channel["peak_dbfs"] < 0
+            assert (channel["clipped"], channel["faults"]) == (0, [])
+        assert array["channels_age_s"] >= 0
+        assert array["host"] is None or array["host"]["lost_blocks"] == 0
         assert set(array["counters"]) >= {"late", "rejected", "lost_frames", "overflows", "duplicates", "sequence_gaps"}
 
 
@@ -358,6 +364,10 @@ def test_metrics(client: httpx.Client) -> None:
         assert value("livessl_array_age_seconds", array=array) >= 0
         assert value("livessl_array_level_dbfs", array=array) < 0
         assert value("livessl_array_total", array=array, what="frames") > 10
+        for channel in "1234":
+            assert value("livessl_channel_rms_dbfs", array=array, channel=channel) < 0
+            assert value("livessl_channel_peak_dbfs", array=array, channel=channel) < 0
+            assert value("livessl_channel_clipped_samples_total", array=array, channel=channel) == 0
 
 
 def test_dashboard_and_its_files_are_served(client: httpx.Client) -> None:

@@ -7,6 +7,7 @@ import shutil
 import socket
 import ssl
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -16,8 +17,9 @@ from websockets.sync.client import connect
 from conftest import require
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
+from livessl.server import http
 from livessl.server.app import Server
-from small_site import HANG_S, running_server, site_of
+from small_site import HANG_S, running_server, site_of, wait_until
 
 FILES = {"server.http.certificate": "site.crt", "server.http.private_key": "site.key"}
 
@@ -47,6 +49,36 @@ def test_everything_is_encrypted(folder: Path) -> None:
             httpx.get(server.url.replace("https", "http") + "/api/v1/health")
         with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
             httpx.get(f"{server.url}/api/v1/health", verify=ssl.create_default_context())
+
+
+def test_connections_that_never_begin_tls_are_limited(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "MAX_CONNECTIONS", 3)
+    trusted = ssl.create_default_context(cafile=folder / "site.crt")
+    with running_server(site_of(FILES, folder)) as server, ExitStack() as stack:
+        address = ("127.0.0.1", int(server.url.rpartition(":")[2]))
+        for _ in range(3):
+            stack.enter_context(socket.create_connection(address, timeout=HANG_S))
+        wait_until(lambda: is_turned_away(address), "the limit")
+        stack.close()
+        wait_until(lambda: is_answered(f"{server.url}/api/v1/health", trusted), "room")
+
+
+def is_turned_away(address: tuple[str, int]) -> bool:
+    """Return whether the server closes a new connection before TLS."""
+    with socket.create_connection(address, timeout=0.3) as client:
+        try:
+            return client.recv(1) == b""
+        except TimeoutError:
+            return False
+        except ConnectionResetError:
+            return True
+
+
+def is_answered(url: str, trusted: ssl.SSLContext) -> bool:
+    try:
+        return httpx.get(url, verify=trusted).status_code == 200
+    except httpx.TransportError:
+        return False
 
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])

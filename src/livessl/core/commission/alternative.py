@@ -68,13 +68,13 @@ class Alternative:
     speed_off_m_s: float = 0.0
 
     @property
-    def concerns(self) -> tuple[str | None, str | None]:
-        """The arrays that it is about: alternatives of the same arrays are no rivals of each other."""
-        return self.array, self.other
+    def concerns(self) -> tuple[str | None, str | None, int | None]:
+        """The arrays and the channel that it is about: alternatives of the same ones are no rivals of each other."""
+        return self.array, self.other, self.channel
 
     @property
     def is_large(self) -> bool:
-        """Whether it differs from what is filed by more than a careful set-up may."""
+        """True if it differs from what is filed by more than a careful set-up may."""
         if self.fault == "turned":
             return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
         if self.fault in ("moved", "height", "geometry"):

@@ -8,6 +8,7 @@ alternative of another array.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
+from livessl.core.commission.judge import Judge
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
 from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
@@ -31,7 +33,7 @@ MIN_RATIO: Final = 1.3
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the delays of some sounds say about the set-up.
+    """The diagnosis of a set-up from the delays of some sounds.
 
     Parameters
     ----------
@@ -48,6 +50,9 @@ class Diagnosis:
     lead : float
         Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the Bayesian
         information criterion.
+    undecided : tuple of Alternative
+        Two or more that are the same fault of different arrays and explain the sounds equally well, best first: one of
+        them is true.
     """
 
     sounds: int
@@ -56,6 +61,7 @@ class Diagnosis:
     rivals: tuple[Alternative, ...]
     contradicts: bool
     lead: float = 0.0
+    undecided: tuple[Alternative, ...] = ()
 
     @property
     def confidence(self) -> float:
@@ -80,7 +86,7 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
     trial = Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
     if trial.sounds < LEAST_SOUNDS or len(microphones) < 2:
         return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    return _compared(trial)
+    return _compared(trial, Judge(microphones, delays, PlaceSearch(bounds_m, c_m_s)))
 
 
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
@@ -98,24 +104,46 @@ def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s
     return _compared(Trial(microphones, delays, KnownPlaces(places_m, c_m_s)))
 
 
-def _compared(trial: Trial) -> Diagnosis:
+def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
+    """Compare alternatives by the judge, or by their misfits alone."""
     if trial.filed.misfit_s <= MIN_RATIO * trial.floor_s:
         return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    tried = (
+    tried = [
         *trial.orders(),
         *trial.exchanges(),
         *trial.channels(),
         *trial.poses(),
         *trial.heights(),
         *trial.speeds(),
-    )
+    ]
+    filed = trial.criterion(trial.filed, 0)
+    if judge is not None:
+        filed, tried = judge.filed, [judge.judged(one) for one in tried]
     rivals = sorted(tried, key=lambda one: one.criterion)
-    gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
-    contradicts = gained > MIN_GAIN and trial.filed.misfit_s > MIN_RATIO * max(rivals[0].misfit_s, trial.floor_s)
-    best = rivals[0]
+    best, gained = rivals[0], filed - rivals[0].criterion
+    contradicts = gained > MIN_GAIN
+    if judge is None:
+        contradicts &= trial.filed.misfit_s > MIN_RATIO * max(best.misfit_s, trial.floor_s)
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
     named = contradicts and lead > MIN_LEAD and best.is_large
+    undecided = _undecided(rivals) if contradicts and not named else ()
     return Diagnosis(
-        trial.sounds, trial.filed.misfit_s, best if named else None, tuple(rivals), contradicts, min(gained, lead)
+        trial.sounds,
+        trial.filed.misfit_s,
+        best if named else None,
+        tuple(rivals),
+        contradicts,
+        min(gained, lead),
+        undecided,
     )
+
+
+def _undecided(rivals: Sequence[Alternative]) -> tuple[Alternative, ...]:
+    """Return the best alternatives if they are the same fault of different arrays, such as a shift of one of two."""
+    best = rivals[0]
+    close = [one for one in rivals if one.criterion - best.criterion <= MIN_LEAD and one.array != best.array]
+    if not close or any(one.fault != best.fault or not one.is_large for one in (best, *close)):
+        return ()
+    firsts = {one.array: one for one in reversed((best, *close))}
+    return tuple(sorted(firsts.values(), key=lambda one: one.criterion))

@@ -1,7 +1,8 @@
-"""What is wrong with a set-up, as a value."""
+"""A fault of a set-up, as a value."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -49,3 +50,9 @@ class Finding:
     message: str
     cure: str
     input: int | None = None
+
+
+def in_order(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings in the order in which they are reported: errors first, then by array and channel."""
+    weights = list(Severity)
+    return sorted(findings, key=lambda one: (weights.index(one.severity), one.array or "", one.channel or 0))

@@ -9,7 +9,7 @@ import numpy as np
 
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
-from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
 from livessl.core.commission.places import Microphones, stacked
 from livessl.core.types import BoolArray, FloatArray, Observation
 
@@ -62,7 +62,7 @@ def find_faults(
     microphones = {array: microphones[array] for array in delays}
     if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
         findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s))
-    return sorted(findings, key=lambda one: (list(Severity).index(one.severity), one.array or "", one.channel or 0))
+    return in_order(findings)
 
 
 def channel_findings(microphones: Microphones, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
@@ -195,13 +195,20 @@ def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
                 f"{what}: misfit {better}",
                 cure,
             )
+    elif diagnosis.undecided:
+        words = [_words(one) for one in diagnosis.undecided]
+        what = f"either {' or '.join(what for what, _ in words)}, which the sounds cannot tell apart"
+        better = f"{misfit_us:.0f} -> {1e6 * diagnosis.undecided[0].misfit_s:.0f} us over {diagnosis.sounds} sounds"
+        for one, (_, cure) in zip(diagnosis.undecided, words, strict=True):
+            share = 1.0 / len(words)
+            yield Finding(one.fault, one.array, one.channel, Severity.ERROR, share, f"{what}: misfit {better}", cure)
     elif diagnosis.contradicts and diagnosis.rivals[0].is_large:
         likely = " or ".join(dict.fromkeys(_words(one)[0] for one in diagnosis.rivals[:2]))
         yield Finding(
             diagnosis.rivals[0].fault,
             None,
             None,
-            Severity.WARNING,  # a doubt: some set-ups as filed contradict themselves as much
+            Severity.ERROR,
             0.5,
             f"the arrays contradict each other by {misfit_us:.0f} us over {diagnosis.sounds} sounds; perhaps {likely}",
             "clap at places that you know, and run livessl calibrate verify",
@@ -209,7 +216,7 @@ def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 
 def _words(alternative: Alternative) -> tuple[str, str]:
-    """What an alternative is, and its cure."""
+    """Describe an alternative and its cure."""
     array = alternative.array
     if alternative.fault == "swapped":
         moved = [index for index, channel in enumerate(alternative.order) if channel != index + 1]

@@ -17,7 +17,7 @@ from livessl.core.commission.channels import (
     dbfs,
     noise_over_neighbours_db,
 )
-from livessl.core.types import Float32Array, FloatArray, IntArray
+from livessl.core.types import ChannelLevel, Float32Array, FloatArray, IntArray
 
 RECENT_S: Final = 1.0
 """Sound that the level of the moment is taken from, in seconds."""
@@ -33,35 +33,16 @@ LEAST_NEIGHBOURS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class InputLevel:
+class InputLevel(ChannelLevel):
     """Level and faults of one input.
 
     Parameters
     ----------
-    peak_dbfs : float
-        Largest magnitude of a sample, dB re full scale; -200 for digital silence.
-    rms_dbfs : float
-        Root of the mean square about the mean, dB re full scale: a sine of full scale has -3.
-    clipped : int
-        Clipped samples since the beginning.
-    mean : float or None
-        Mean of the samples in the last 10 s, full scale 1. Like the figures below, None in the first second.
-    hum_hz, hum_dbfs : float or None
-        Frequency and level of hum of the mains; None if there is none, and in the first 3 s.
-    noise_dbfs : float or None
-        Noise floor: power in the quietest fifth of frames of 50 ms, dB re full scale squared.
     faults : tuple of str
         What is wrong, in the words of `livessl doctor`: dead, clipping, dc, hum, noisy.
     """
 
-    peak_dbfs: float
-    rms_dbfs: float
-    clipped: int
-    mean: float | None
-    hum_hz: float | None
-    hum_dbfs: float | None
-    noise_dbfs: float | None
-    faults: tuple[str, ...]
+    faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +85,8 @@ class LevelMeter:
         sums = _Sums(
             samples.shape[1],
             exact.sum(axis=1),
-            (exact**2).sum(axis=1),
-            np.abs(exact).max(axis=1),
+            np.einsum("ki,ki->k", exact, exact),
+            np.maximum(exact.max(axis=1), -exact.min(axis=1)),
             self._meter.clipped - before,
         )
         self._all = _joined([self._all, sums])
@@ -124,15 +105,15 @@ class LevelMeter:
 
     def _levels(self, sums: _Sums) -> tuple[InputLevel, ...]:
         figures = self._meter.figures()
-        noisy = self._noisy(figures, sums.peak)
+        over_db = self._noise_over_db(figures, sums.peak)
         variance = np.maximum(sums.squares / sums.count - (sums.total / sums.count) ** 2, 0.0)
         return tuple(
-            self._level(index, sums, float(variance[index]), figures[index] if figures else None, noisy=index in noisy)
+            self._level(index, sums, float(variance[index]), figures[index] if figures else None, over_db.get(index))
             for index in range(len(variance))
         )
 
     def _level(
-        self, index: int, sums: _Sums, variance: float, figures: ChannelFigures | None, *, noisy: bool
+        self, index: int, sums: _Sums, variance: float, figures: ChannelFigures | None, noise_over_db: float | None
     ) -> InputLevel:
         is_dead = sums.peak[index] == 0.0
         hums = figures is not None and figures.hum_hz is not None and self._meter.windows >= HUM_WINDOWS
@@ -141,7 +122,7 @@ class LevelMeter:
             "clipping": sums.clipped[index] > 0,
             "dc": figures is not None and abs(figures.mean) > MOST_CONSTANT,
             "hum": hums,
-            "noisy": noisy,
+            "noisy": noise_over_db is not None and noise_over_db > NOISY_DB,
         }
         return InputLevel(
             peak_dbfs=dbfs(float(sums.peak[index]) ** 2),
@@ -151,18 +132,18 @@ class LevelMeter:
             hum_hz=figures.hum_hz if figures is not None and hums else None,
             hum_dbfs=figures.hum_dbfs if figures is not None and hums else None,
             noise_dbfs=None if figures is None else figures.noise_dbfs,
+            noise_over_db=noise_over_db,
             faults=("dead",) if is_dead else tuple(fault for fault, is_so in found.items() if is_so),
         )
 
-    def _noisy(self, figures: Sequence[ChannelFigures], peak: FloatArray) -> set[int]:
-        """Return the inputs with far more noise than their neighbours in an array."""
-        noisy: set[int] = set()
+    def _noise_over_db(self, figures: Sequence[ChannelFigures], peak: FloatArray) -> dict[int, float]:
+        """Return how far the noise of each input is above its neighbours' in an array; silent inputs are left out."""
+        over: dict[int, float] = {}
         for inputs in self._arrays if figures else ():
             alive = [index for index in inputs if peak[index] > 0.0]
             if len(alive) >= LEAST_NEIGHBOURS:
-                over_db = noise_over_neighbours_db([figures[index] for index in alive])
-                noisy |= {index for index, over in zip(alive, over_db, strict=True) if over > NOISY_DB}
-        return noisy
+                over |= zip(alive, noise_over_neighbours_db([figures[index] for index in alive]), strict=True)
+        return over
 
 
 def _joined(parts: Sequence[_Sums]) -> _Sums:

@@ -184,7 +184,7 @@ class KnownPlaces(PlaceSearch):
 
 
 def contradictions_s(microphones: Microphones, delays: Delays, positions_m: FloatArray, c_m_s: float) -> FloatArray:
-    """What the delays of sounds at places (S, 3) are off by, (S, R) seconds; R counts all channels of all arrays."""
+    """Residuals of the delays of sounds at places (S, 3): (S, R) seconds; R counts all channels of all arrays."""
     parts = []
     for name, measured in delays.items():
         away_m = np.linalg.norm(positions_m[:, None] - microphones[name], axis=2)

@@ -57,7 +57,7 @@ class MeasuredPose:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the places determine the pose."""
+        """True if the places determine the pose."""
         return self.position_std_m <= MOST_STD_M and self.orientation_std_deg <= MOST_STD_DEG
 
 

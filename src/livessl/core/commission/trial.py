@@ -43,7 +43,7 @@ RISE_STEP_M: Final = 0.02
 _TURNED: Final = (0.02, 180.0)
 _MOVED: Final = (1.0, 1.5)
 _SPEED_STD_M_S: Final = 20.0
-"""What an alternative leaves free: standard deviations in metres, degrees and m/s."""
+"""Quantities that an alternative leaves free: standard deviations in metres, degrees and m/s."""
 
 
 class Trial:
@@ -204,7 +204,14 @@ class Trial:
         """Yield the speed of sound that the sounds say best."""
         adjusted = self._adjusted(self._microphones, self.filed.positions_m, Freedom({}, speed_std_m_s=_SPEED_STD_M_S))
         places = self._search.refine(self._microphones, self._delays, adjusted.places_m, adjusted.c_m_s)
-        yield Alternative("temperature", None, places.misfit_s, self.criterion(places, 1.0), speed_m_s=adjusted.c_m_s)
+        yield Alternative(
+            "temperature",
+            None,
+            places.misfit_s,
+            self.criterion(places, 1.0),
+            speed_m_s=adjusted.c_m_s,
+            speed_off_m_s=adjusted.c_m_s - self._search.c_m_s,
+        )
 
     def _turned(self, name: str) -> tuple[Adjusted, Rotation]:
         """Adjust the turn of an array, from the best of the turns about the vertical and upside down."""

@@ -139,4 +139,4 @@ class SearchBounds(NamedTuple):
     """Maxima of each row over the lags within each of some of the first `REACHES`, one after another, where they are
     known: (R, any number times L)."""
     reaching_known: BoolArray
-    """Whether `reaching` is known: (1,)."""
+    """True if `reaching` is known: (1,)."""

@@ -217,7 +217,7 @@ def bounds_of_rest(maxima, places, rows, rounding, cubes, bound):  # type: ignor
 
 @_compiled
 def _covered(first, extent, shape, boxes):  # type: ignore[no-untyped-def]
-    """Whether a cube of grid points lies wholly in one of the boxes."""
+    """Return whether a cube of grid points lies wholly in one of the boxes."""
     for box in boxes:
         inside = True
         for axis in range(3):

@@ -112,12 +112,12 @@ class ConfidenceFeatures:
 
     @property
     def is_sure(self) -> bool:
-        """Whether another look at the sound is not worth its time."""
+        """True if another look at the sound is not worth its time."""
         return self.confidence_of_candidates >= SURE and self.second_array >= CLEAR_PEAK_TO_RMS
 
     @property
     def has_direction(self) -> bool:
-        """Whether the position stands out from noise, so that at least its direction means something."""
+        """True if the position stands out from noise, so that at least its direction means something."""
         return self.peak_to_rms >= 1.0
 
 
@@ -145,7 +145,7 @@ class Rivals:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the position is too improbable to be reported without the other places."""
+        """True if the position is too improbable to be reported without the other places."""
         return self.share < LEAST_CONFIDENCE
 
 

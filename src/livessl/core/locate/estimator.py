@@ -135,8 +135,8 @@ class Localization:
     ambiguity : str or None
         Why there are candidates, in words; None without them.
     power : float or None
-        Greatest in-band mean power of a frame that the source has, full scale squared; None if all power is its own, or
-        cannot be divided.
+        Greatest in-band mean power of a frame that the source has, full scale squared. None if all power is its own or,
+        for one of `others`, if its share is unknown.
     """
 
     position_m: FloatArray

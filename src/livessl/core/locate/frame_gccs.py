@@ -23,6 +23,10 @@ from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array
 MAX_FRAMES: Final = 40
 """Most frames that are kept apart; those of a longer sound are merged, so that memory and time do not grow with it."""
 
+MAX_BYTES: Final = 64 << 20
+"""Most memory, in bytes, of one array's frames that are kept apart. `MAX_FRAMES` of a tetrahedron of 0.5 m at 48 kHz
+take 1 MB. Those of a joint array of 16 microphones across a room would take hundreds, so more of them are merged."""
+
 LITTLE: Final = 200.0
 """Onset weight of a frame below which it is mostly noise and counts less: noise at 10 dB gives some 30, a source in a
 clear frame thousands."""
@@ -83,7 +87,9 @@ class FrameGCCs:
 
         Pairs that are not `live` (P,) become zeros. Without a course no frame is quiet, and powers are 0.
         """
-        firsts = range(0, len(frames), -(-len(frames) // MAX_FRAMES))
+        bytes_per_frame = len(live) * len(sampling.fine_lags_s) * np.dtype(np.float32).itemsize
+        most = max(1, min(MAX_FRAMES, MAX_BYTES // bytes_per_frame))
+        firsts = range(0, len(frames), -(-len(frames) // most))
         together = [summed(frames[first : first + firsts.step]) for first in firsts]
         powers, quiet = np.zeros(len(together)), np.zeros(len(together), dtype=np.bool_)
         if course is not None:
@@ -107,9 +113,8 @@ class FrameGCCs:
     @cached_property
     def rms(self) -> FloatArray:
         """Root mean square of each frame's GCCs over the live pairs: (F,)."""
-        of_live = self.values[:, self.live]
-        square = np.einsum("fpl,fpl->f", of_live, of_live, dtype=np.float64)
-        return np.asarray(np.sqrt(square / max(1, of_live[0].size)))
+        square = np.einsum("fpl,fpl->f", self.values, self.values, dtype=np.float64)  # the other pairs add nothing
+        return np.asarray(np.sqrt(square / max(1, len(self.live) * len(self.lags_s))))
 
     def lag_indices(self, delays_s: FloatArray) -> IntArray:
         """Return the nearest lag of each delay."""
@@ -119,7 +124,7 @@ class FrameGCCs:
 
 
 class Remainder:
-    """What remains of an array's frames when a source is removed.
+    """The remainder of an array's frames when a source is removed.
 
     Parameters
     ----------

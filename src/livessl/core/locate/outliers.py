@@ -148,7 +148,7 @@ def _with_suspects(
 
 
 def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -> bool:
-    """Whether leaving out another candidate is about as good as the best one and leads elsewhere."""
+    """Return whether leaving out another candidate is about as good as the best one and leads elsewhere."""
     return any(
         place.apart_m(places[best]) > NEAR_M
         for place, loss in zip(places, losses, strict=True)

@@ -77,6 +77,8 @@ class PeakSearch:
         self._cube_places = np.zeros((total, count), np.uint16)
         self._of_cubes, self._known = np.zeros(count, np.float32), np.zeros(count, np.bool_)
         self._values, self._maxima, self._reaching, self._of_cells = _Buffer(), _Buffer(), _Buffer(), _Buffer()
+        self._kernels = kernels.in_use  # what makes the tables, and searches with them
+        self._lags_s: dict[str, FloatArray] = {}
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Among] = {}
 
@@ -95,6 +97,7 @@ class PeakSearch:
             )
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
+        self._lags_s[array] = lags_s
         block, rows = block_lags(len(lags_s)), slice(first, first + len(pairs))
         cells, microphones_m = self._cells, spec.microphones_m.astype(np.float32)
         for begin in range(0, len(cells.corners), _CUBES_AT_ONCE):
@@ -103,9 +106,9 @@ class PeakSearch:
             low, high, reach = (np.empty((len(pairs), len(corners), CELLS_PER_CUBE**3), np.uint16) for _ in range(3))
             of_cubes = cells.axes, corners, cells.strides[some], cells.edge
             of_array = CELLS_PER_CUBE, microphones_m, pairs.astype(np.int32), places.scale, places.offset
-            kernels.cell_intervals(*of_cubes, *of_array, low, high)
+            self._kernels.cell_intervals(*of_cubes, *of_array, low, high)
             for number, part in enumerate((cells.edge, (cells.edge + 1) // 2)):
-                kernels.reaches_of_parts(*of_cubes, part, *of_array, reach)
+                self._kernels.reaches_of_parts(*of_cubes, part, *of_array, reach)
                 cells.reaches[number, some, :, rows] = np.searchsorted(REACHES, reach).transpose(1, 2, 0)
             self._cube_places[rows, some] = run_places(low.min(axis=2), high.max(axis=2), block)
             low = np.minimum(low, high)  # `NO_LAG` and 0 in a cell without points
@@ -125,6 +128,10 @@ class PeakSearch:
         evidence : sequence of Evidence
             At least one, in the order in which the maps are to be summed. Each array must have been prepared.
         """
+        if self._kernels is not kernels.in_use:
+            self._kernels = kernels.in_use
+            for name, lags_s in self._lags_s.items():
+                self.prepare(name, lags_s)
         among = self._among(tuple(part.spec.name for part in evidence))
         rows = among.rows
         values = self._values.of(len(rows.site_pair), among.lags)
@@ -133,8 +140,8 @@ class PeakSearch:
             own = slice(rows.first_row[array], rows.first_row[array + 1])
             count = part.gcc.values.shape[1]
             values[own, :count], values[own, count:] = part.gcc.values, 0.0
-        kernels.running_maxima(values, among.block, maxima)
-        kernels.upper_bounds(maxima, self._cube_places, rows, self._of_cubes)
+        self._kernels.running_maxima(values, among.block, maxima)
+        self._kernels.upper_bounds(maxima, self._cube_places, rows, self._of_cubes)
         self._known[:] = False
         of_cells = self._of_cells.of(len(self._known) * CELLS_PER_CUBE**3, len(evidence) + 1)
         bounds = SearchBounds(
@@ -152,7 +159,7 @@ class PeakSearch:
             found: list[Peak] = []
             for _ in range(count):
                 left_out = np.array(boxes, dtype=np.int64).reshape(-1, 3, 2)
-                point, power = kernels.highest(values, maxima, rows, self._cells, bounds, left_out, rounding)
+                point, power = self._kernels.highest(values, maxima, rows, self._cells, bounds, left_out, rounding)
                 if power == -np.inf:
                     break
                 stride = self._stride_at(int(point))

@@ -49,7 +49,7 @@ class Place:
 
     @property
     def stands_out_everywhere(self) -> bool:
-        """Whether every array's peak-to-RMS ratio there is at least 1, that of noise."""
+        """True if every array's peak-to-RMS ratio there is at least 1, that of noise."""
         return min(self.peak_to_rms) >= 1.0
 
     def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:

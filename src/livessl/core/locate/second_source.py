@@ -8,7 +8,7 @@ half of the arrays, and is the highest place of all that remains.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -103,7 +103,7 @@ class TwoSources:
 
     @property
     def stand_out_everywhere(self) -> bool:
-        """Whether every array has a peak at both places."""
+        """True if every array has a peak at both places."""
         return self.first.stands_out_everywhere and self.second.stands_out_everywhere
 
 
@@ -116,14 +116,14 @@ class Separation:
     first : Place
     judgement : Judgement
         Judgement of the first place.
-    power : float
-        Greatest in-band power of a frame that the first source has, full scale squared.
+    power : float or None
+        Greatest in-band power of a frame that the first source has, full scale squared; None if it is unknown.
     second : Localization
     """
 
     first: Place
     judgement: Judgement
-    power: float
+    power: float | None
     second: Localization
 
 
@@ -172,13 +172,22 @@ class SecondSourceSearch:
             used = _separable(tried, sounds)
             if not used:
                 return None
-            first = replace(consensus.place, evidence=used, functional=SRPFunctional(used, self._c_m_s))
+            first = self._at_the_place(consensus.place, used)
             frames = [frames_of(part) for part in used]
             found = self.find(first, frames)
             disputed = consensus.refused is not None or len(tried) > len(agreeing)
             if found is not None and (found.stand_out_everywhere or not disputed):
                 return self._separation(consensus, found, frames, keeps_first=not disputed)
         return None
+
+    def _at_the_place(self, place: Place, evidence: tuple[Evidence, ...]) -> Place:
+        """Return a place with its power, and that of its rival, in the maps of other arrays than it was found by."""
+        if [part.spec.name for part in evidence] == [part.spec.name for part in place.evidence]:
+            return place
+        functional = SRPFunctional(evidence, self._c_m_s)
+        power = float(functional.value(place.position_m[None])[0])
+        rival_power = refine.rival_power(self._search.among(evidence), self._grid, place.position_m)
+        return Place(evidence, functional, place.position_m, power, rival_power)
 
     def _separation(
         self, consensus: Consensus, found: TwoSources, frames: Sequence[FrameGCCs], *, keeps_first: bool
@@ -303,21 +312,23 @@ def _delays_s(place: Place) -> list[FloatArray]:
     return [term.lags_s for term in place.functional.pair_terms(place.position_m)]
 
 
-def _powers(first: Place, second: Place, frames: Sequence[FrameGCCs]) -> tuple[float, float]:
-    """Greatest power of a frame that each source has, full scale squared.
+def _powers(first: Place, second: Place, frames: Sequence[FrameGCCs]) -> tuple[float | None, float | None]:
+    """Greatest power of a frame that each source has, full scale squared; None if it is unknown.
 
     A frame's power is divided in proportion to the heights of both where the second source is clear, and belongs to the
-    first one elsewhere.
+    first one elsewhere. A second source that is clear in no frame gets its share of every frame instead.
     """
-    powers = np.zeros(2)
+    of_first, of_second, unclear = 0.0, 0.0, 0.0
     for each, first_s, second_s in zip(frames, _delays_s(first), _delays_s(second), strict=True):
         remainder = each.without(first_s)
         heights = np.maximum(remainder.heights(second_s)[0], 0.0)
         share = heights / np.maximum(heights + remainder.removed_heights, 1e-9)
-        share = np.where(remainder.prominences(second_s)[0] >= CLEAR, share, 0.0)
+        clear = np.where(remainder.prominences(second_s)[0] >= CLEAR, share, 0.0)
         of_sound = np.where(each.quiet, 0.0, each.powers)
-        powers = np.maximum(powers, [(of_sound * (1.0 - share)).max(), (of_sound * share).max()])
-    return float(powers[0]), float(powers[1])
+        of_first = max(of_first, float((of_sound * (1.0 - clear)).max()))
+        of_second = max(of_second, float((of_sound * clear).max()))
+        unclear = max(unclear, float((of_sound * share).max()))
+    return of_first or None, of_second or unclear or None
 
 
 def _separable(evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:

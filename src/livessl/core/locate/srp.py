@@ -88,12 +88,13 @@ class SRPMapper:
                 place = place + len(lags_s) * np.minimum(len(ascending_hz) - free, len(cut_offs_hz))
             table[first : first + len(points_m)] = place.T
         self._weight = np.float32(pair_weight(len(spec.microphones_m)))
-        self._table = kernels.look_up_table(table, columns)
+        self._kernels = kernels.in_use  # the table is in its form
+        self._table = self._kernels.look_up_table(table, columns)
 
     def add(self, power: Float32Array, *gccs: GCC) -> None:
         """Add the power of a GCC, followed by those below each cut-off, to the power (G,) at every grid point."""
         values = gccs[0].values if len(gccs) == 1 else np.concatenate([gcc.values for gcc in gccs], axis=1)
-        kernels.add_power(np.ascontiguousarray(values, dtype=np.float32), self._table, self._weight, power)
+        self._kernels.add_power(np.ascontiguousarray(values, dtype=np.float32), self._table, self._weight, power)
 
     def __call__(self, *gccs: GCC) -> Float32Array:
         """Return the power (G,) at every grid point."""

@@ -56,7 +56,7 @@ class ArrayState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """What else is known of an array: by its node's messages that are not sound, by past sounds, and by the operator.
+    """Further knowledge of an array: from its node's messages without sound, from past sounds, and from the operator.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.locate.estimator import Course, Estimator
-from livessl.core.stream.evidence import BackfilledSound
+from livessl.core.stream.excerpt import BackfilledSound
 from livessl.core.stream.pending_event import PendingEvent, RequestedFrames
 from livessl.core.stream.segmenter import RECENT_S
 from livessl.core.stream.site_state import SiteState
@@ -162,7 +162,7 @@ def is_sure(event: Event) -> bool:
     return (
         event.status is Status.LOCATED
         and event.estimate is not None
-        and event.estimate.confidence >= SURE_WITHOUT_BACKFILL
+        and event.estimate.sound_confidence >= SURE_WITHOUT_BACKFILL
     )
 
 
@@ -172,4 +172,4 @@ def is_better(event: Event, than: Event) -> bool:
 
 
 def _worth(event: Event) -> tuple[int, float]:
-    return _RANK[event.status], 0.0 if event.estimate is None else event.estimate.confidence
+    return _RANK[event.status], 0.0 if event.estimate is None else event.estimate.sound_confidence

@@ -96,7 +96,7 @@ class _Likeness:
 
 @dataclass(slots=True)
 class _Channels:
-    """What is known of one array's channels, which are counted from 0."""
+    """State of one array's channels, which are counted from 0."""
 
     last_active: int | None = None
     active_frames: int = 0  # of the sound that goes on

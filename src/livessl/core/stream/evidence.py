@@ -1,4 +1,4 @@
-"""Collects what an event or a window is located from: sounds, correlations, and the powers of their frames.
+"""Collects the excerpts that an event or a window is located from.
 
 It also decides which samples are kept while a sound goes on, and correlates frames before a sound begins, so that the
 sound does not have to wait for its pre-roll.
@@ -6,20 +6,20 @@ sound does not have to wait for its pre-roll.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Final, overload
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 
 from livessl.core.correlate.onset_gcc import OnsetGCC
-from livessl.core.locate.estimator import Course, Sound
+from livessl.core.locate.estimator import Course
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.alignment import Alignment
 from livessl.core.stream.array_stream import ArrayStream
+from livessl.core.stream.excerpt import Excerpt, Segments, Sounds
 from livessl.core.stream.load_policy import Clearest
 from livessl.core.stream.site_state import SiteState
-from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Float32Array, FloatArray, Frame
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Frame
 
 KEPT_ARRAYS: Final = 24
 """Number of arrays whose samples are kept while a sound goes on: those with the greatest onset strength so far, half as
@@ -27,184 +27,6 @@ many again as an estimator uses. Only correlations are kept for the others, beca
 
 RELEASE_FRAMES: Final = 10
 """Number of frames between two updates of that choice."""
-
-
-class Segments(Sequence[Float32Array]):
-    """Segments of one array's samples, each (K, n), which are joined from frames when they are read.
-
-    Samples are thus never copied for all arrays at once, and not at all if they are not used. Frames whose samples were
-    released, which are the first ones, are left out.
-    """
-
-    def __init__(self, segments: Iterable[Sequence[Frame]]) -> None:
-        kept = ([frame for frame in segment if frame.samples.size] for segment in segments)
-        self._segments = [segment for segment in kept if segment]
-
-    @overload
-    def __getitem__(self, index: int) -> Float32Array: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Float32Array]: ...
-    def __getitem__(self, index: int | slice) -> Float32Array | Sequence[Float32Array]:
-        if isinstance(index, slice):
-            return Segments(self._segments[index])
-        return np.concatenate([frame.samples for frame in self._segments[index]], axis=1)
-
-    def __len__(self) -> int:
-        return len(self._segments)
-
-
-class Sounds(Mapping[str, Sound]):
-    """The sound of each array, as an estimator takes it.
-
-    Parameters
-    ----------
-    sources : int
-        Number of sources to search for.
-    suspects : collection of str
-        Names of the suspect arrays.
-    ended : bool
-        Whether the sound has ended, so that each array's sound is complete.
-    """
-
-    def __init__(self, sources: int, suspects: Collection[str] = (), *, ended: bool = True) -> None:
-        self.sources = sources
-        self.suspects = suspects
-        self.ended = ended
-        self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
-        self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
-        self._courses: dict[str, Course] = {}
-        self._requested: set[str] = set()
-
-    def add(
-        self,
-        array: str,
-        segments: Sequence[Sequence[Frame]],
-        onsets: tuple[OnsetGCC, ...],
-        course: Course,
-        *,
-        requested: bool = False,
-    ) -> None:
-        """Add the sound of an array: its segments of frames, at least one, and its frames' correlations and course.
-
-        `requested` if the array did not detect the sound, and its frames were requested.
-        """
-        self._segments[array], self._onsets[array], self._courses[array] = segments, onsets, course
-        if requested:
-            self._requested.add(array)
-
-    def copy(self) -> Sounds:
-        """Return a copy that sounds can be added to."""
-        copy = Sounds(self.sources, self.suspects, ended=self.ended)
-        copy._segments |= self._segments
-        copy._onsets |= self._onsets
-        copy._courses |= self._courses
-        copy._requested |= self._requested
-        return copy
-
-    def without(self, arrays: Collection[str]) -> Sounds:
-        """Return a copy without the sounds of some arrays."""
-        copy = self.copy()
-        for array in arrays:
-            copy._segments.pop(array, None)
-            copy._onsets.pop(array, None)
-            copy._courses.pop(array, None)
-        return copy
-
-    @property
-    def has_onsets(self) -> bool:
-        """True if the estimator correlates every frame, and thus weights each array by what it received."""
-        return any(self._onsets.values())
-
-    def __getitem__(self, array: str) -> Sound:
-        segments = self._segments[array]
-        return Sound(
-            Segments(segments),
-            segments[0][0].sample_rate_hz,
-            self._onsets[array],
-            array in self.suspects,
-            self.sources,
-            self.ended,
-            array not in self._requested,
-            self._courses[array],
-        )
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._segments)
-
-    def __len__(self) -> int:
-        return len(self._segments)
-
-
-@dataclass(frozen=True, slots=True)
-class BackfilledSound:
-    """The sound of an array that was requested: its frames from the event's start on.
-
-    The correlations and their course include the pre-roll.
-    """
-
-    frames: list[Frame]
-    onsets: tuple[OnsetGCC, ...]
-    course: Course
-
-
-@dataclass(slots=True)
-class Excerpt:
-    """The part of all arrays' sound that an event or a window is located from.
-
-    Parameters
-    ----------
-    sounds : Sounds
-    start_ns, end_ns : int
-        Site time of its first frame's start and of its last frame's end.
-    powers : dict of array to (n,) float64
-        In-band mean power of each frame, full scale squared, of every array that detected it: also of those that it is
-        not located from, because it is clearer to enough others.
-    """
-
-    sounds: Sounds
-    start_ns: int = 2**63 - 1
-    end_ns: int = -(2**63)
-    powers: dict[str, FloatArray] = field(default_factory=dict)
-
-    def add(
-        self,
-        array: str,
-        segments: Sequence[Sequence[Frame]],
-        onsets: tuple[OnsetGCC, ...],
-        course: Course,
-        powers: FloatArray,
-    ) -> None:
-        """Add the sound of an array: see `Sounds.add`; `powers` (n,) are those of its frames, full scale squared."""
-        self.sounds.add(array, segments, onsets, course)
-        self.powers[array] = powers
-
-    def extend(self, start_ns: int, end_ns: int) -> None:
-        """Let the excerpt begin at `start_ns` at the latest, and end at `end_ns` at the earliest."""
-        self.start_ns, self.end_ns = min(self.start_ns, start_ns), max(self.end_ns, end_ns)
-
-    @property
-    def middle_ns(self) -> int:
-        """Site time of its middle."""
-        return (self.start_ns + self.end_ns) // 2
-
-    @property
-    def greatest_power(self) -> float:
-        """Greatest power of a frame, full scale squared."""
-        return max(float(power.max()) for power in self.powers.values())
-
-    def without(self, arrays: Collection[str]) -> Excerpt:
-        """Return this excerpt without the sounds of some arrays; the times stay."""
-        powers = {name: power for name, power in self.powers.items() if name not in arrays}
-        return Excerpt(self.sounds.without(arrays), self.start_ns, self.end_ns, powers)
-
-    def with_backfill(self, backfilled: Mapping[str, BackfilledSound]) -> Excerpt:
-        """Return this excerpt with the sounds of requested frames added; the times stay."""
-        joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
-        for name, sound in backfilled.items():
-            powers = np.array([frame.power for frame in sound.frames])
-            joined.sounds.add(name, [sound.frames], sound.onsets, sound.course, requested=True)
-            joined.powers[name] = powers
-        return joined
 
 
 class EvidenceCollector:

@@ -1,4 +1,4 @@
-"""What is shed while the sound arrives faster than it can be located: a table of levels, and which one applies.
+"""Work that is shed while the sound arrives faster than it can be located: a table of levels, and which one applies.
 
 It reads no clock. `LEVELS` is the order in which work is given up, the least missed first. `LoadPolicy` moves along the
 table by the delay of the sound, with hysteresis.
@@ -50,7 +50,7 @@ may take. The other half is needed to locate and to deliver."""
 
 @dataclass(frozen=True, slots=True)
 class Relief:
-    """What is shed.
+    """The work that is shed.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Relief:
 
     @property
     def shed(self) -> tuple[str, ...]:
-        """What is shed, by the names that the API uses."""
+        """The work that is shed, by the names that the API uses."""
         which = {
             "updates": self.update_every != 1,
             "maps": not self.maps,
@@ -96,8 +96,8 @@ LEVELS: Final = (
     Relief(update_every=10, maps=False, arrays=4, ahead=False),
     Relief(update_every=None, maps=False, arrays=3, ahead=False),
 )
-"""What is shed at each level: updates first, then maps, then arrays of little evidence, then frames of quiet. With the
-defaults an update every 0.1 s becomes one every 0.2, 0.5 and 1 s."""
+"""The work that is shed at each level: updates first, then maps, then arrays of little evidence, then frames of quiet.
+With the defaults an update every 0.1 s becomes one every 0.2, 0.5 and 1 s."""
 
 
 class LoadPolicy:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from livessl.core.stream.evidence import Excerpt
+from livessl.core.stream.excerpt import Excerpt
 from livessl.core.types import Event, Frame
 
 

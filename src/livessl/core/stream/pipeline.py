@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.level_reports import LevelReports
 from livessl.core.stream.segmenter import Segmenter
 from livessl.core.stream.timeline import Framer
-from livessl.core.types import ArraySpec, BackfillRequest, Block, IntArray, Message
+from livessl.core.types import ArraySpec, BackfillRequest, Block, IntArray, Mark, Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +38,23 @@ class Pipeline:
         Nominal rate of the device.
     parameters : ActivityParameters
         Parameters of the activity rule, which separates sound from the background.
+    reports_levels : bool
+        Whether marks carry the levels of the channels once a second, which a node's do.
     """
 
-    def __init__(self, wirings: Sequence[Wiring], sample_rate_hz: float, parameters: ActivityParameters) -> None:
+    def __init__(
+        self,
+        wirings: Sequence[Wiring],
+        sample_rate_hz: float,
+        parameters: ActivityParameters,
+        *,
+        reports_levels: bool = False,
+    ) -> None:
         self.sample_rate_hz = sample_rate_hz
         self.framer = Framer(sample_rate_hz)
         self._segmenters = [Segmenter(wiring.spec, wiring.channels, sample_rate_hz, parameters) for wiring in wirings]
+        channels = {wiring.spec.name: wiring.channels for wiring in wirings}
+        self._levels = LevelReports(channels, sample_rate_hz) if reports_levels else None
 
     @property
     def arrays(self) -> list[str]:
@@ -51,12 +63,13 @@ class Pipeline:
 
     def push(self, block: Block) -> list[Message]:
         """Return the messages that a block completes."""
-        return [
-            message
-            for cut in self.framer.push(block)
-            for segmenter in self._segmenters
-            for message in segmenter.push(cut, self.framer)
-        ]
+        messages: list[Message] = []
+        for cut in self.framer.push(block):
+            if self._levels is not None:
+                self._levels.push(cut.samples)
+            for segmenter in self._segmenters:
+                messages += map(self._with_levels, segmenter.push(cut, self.framer))
+        return messages
 
     def backfill(self, request: BackfillRequest) -> list[Message]:
         """Return the remembered frames that a request names; none where the array is on another device."""
@@ -66,6 +79,13 @@ class Pipeline:
             if segmenter.array == request.array
             for message in segmenter.backfill(request.first, request.last)
         ]
+
+    def _with_levels(self, message: Message) -> Message:
+        """Add the levels that wait to a mark of their array."""
+        if self._levels is None or not isinstance(message, Mark):
+            return message
+        levels = self._levels.take(message.array)
+        return replace(message, levels=levels) if levels else message
 
     def flush(self) -> list[Message]:
         """Return the messages held back, at the end of the sound."""

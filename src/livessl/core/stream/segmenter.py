@@ -22,11 +22,6 @@ WARM_UP_FRAMES: Final = 10
 """Number of frames held back at the start; the quietest of them is the first estimate of the background."""
 
 
-NEW_HUM: Final = 0.25
-"""Ratio of a frame's level, with the background known then, to its level with the background known before it, below
-which a hum has just been recognized: what the activity rule knows of levels is then no longer true."""
-
-
 class Segmenter:
     """Decides what is sound, and keeps what came just before it.
 
@@ -75,18 +70,18 @@ class Segmenter:
         if self._frame_index is not None and cut.frame_index != self._frame_index + 1:
             self._pre_roll.clear()  # frames before a gap are no pre-roll of a sound after it
             self._recent.clear()
+            self._background.skip()
             self._quiet_frames = self._hang_over + 1
         self._frame_index = cut.frame_index
         samples = self._selected(cut)
         plain = scipy.fft.rfft(samples, axis=1)
         power = spectrum_power(plain, samples.shape[1], self._rate_hz, self._spec.band_hz)
         spectrum, mean = self._background.spectrum(samples, plain), float(power.mean())
-        before = self._background.changing_power(spectrum, mean)
-        self._background.learn(spectrum)
+        found_hum = self._background.learn(spectrum)
         if self._warm_up is None:
+            if found_hum:
+                self._activity.restart(self._background.usual_power, self._background.changing_maximum)
             level = self._background.changing_power(spectrum, mean)
-            if level < NEW_HUM * before:
-                self._activity.restart(level, self._background.changing_maximum)
             return self._decide(cut, power, level, framer)
         self._warm_up.append((cut, power, spectrum))
         return self.flush(framer) if len(self._warm_up) >= WARM_UP_FRAMES else []

@@ -34,6 +34,9 @@ class SiteState:
         Offsets of the arrays' clocks, learned from events; None takes all clocks to agree.
     for_each : ForEach or None
         Correlates several arrays, perhaps in parallel; None does one after the other.
+    free_axes : sequence of int
+        Axes along which the search volume is not flat: those of a position's set-up error where an estimator returns no
+        covariance.
     """
 
     def __init__(
@@ -45,8 +48,10 @@ class SiteState:
         *,
         clock_offsets: ClockOffsets | None = None,
         for_each: ForEach | None = None,
+        free_axes: Sequence[int] = (0, 1, 2),
     ) -> None:
         self.site = site
+        self.free_axes = free_axes
         self.arrays = {spec.name: spec for spec in arrays}
         self.estimator = estimator
         self.parameters = parameters or FusionParameters()
@@ -57,7 +62,7 @@ class SiteState:
         self._answering: set[str] = set()
         self._excluded: Collection[str] = ()
         self.relief = NOTHING_SHED
-        """What is shed while the server is overloaded."""
+        """The work that is shed while the server is overloaded."""
 
     def relieve(self, relief: Relief) -> None:
         """Shed this from now on."""

@@ -3,8 +3,10 @@
 A mains hum, a fan's tone or rumble can be far above everything else in the band, so that a sound which is 30 dB above
 all the rest hardly raises the level. The background is therefore tracked in every bin of the frames' spectra, as the
 least power of a few seconds. Bins whose background stands far above the others' are *loud*; in them only what exceeds
-their usual power by far counts. Bins outside the band may be loud, too, and leak into it, which the window prevents.
-Without loud bins the level is the plain power in the band.
+their usual power by far counts. Bins outside the band may be loud as well and leak into it, which a Hann window
+prevents. That window hides what is short and lies at the edge of a frame. While something is loud, the power is
+therefore the mean of two windows: that of the frame, and one half a frame earlier. Without loud bins the level is the
+plain power in the band.
 """
 
 from __future__ import annotations
@@ -29,6 +31,10 @@ frames."""
 
 BEYOND: Final = 1.25
 """Ratio to the band's upper edge of the highest frequency at which a tone may leak into the band."""
+
+NEW_HUM: Final = 0.25
+"""Ratio of the usual level without the bins that are loud now to that without those that were loud before, below which
+a hum has just been recognized."""
 
 _SMOOTHING: Final = 5
 """Number of frames averaged before the minimum is taken: as in `livessl.core.stream.activity`."""
@@ -63,6 +69,8 @@ class SteadyBackground:
         bins = min(self._count // 2 + 1, round(BEYOND * self._band.stop))
         self._bins = slice(0, bins)
         self._zero = np.zeros(bins)
+        self._half = self._count // 2
+        self._before: Float32Array | None = None  # the last half of the frame before
         self._latest: deque[FloatArray] = deque(maxlen=_SMOOTHING)
         self._blocks: deque[FloatArray] = deque(maxlen=max(1, round(window_s / FRAME_S / _BLOCK) - 1))
         self._of_blocks: FloatArray | None = None  # the least of all of them
@@ -75,7 +83,7 @@ class SteadyBackground:
         self._maximum: FloatArray = np.zeros(bins)
 
     def spectrum(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
-        """Return the power of a frame in each bin, mean over the channels, full scale squared: (F,).
+        """Return the power of the next frame in each bin, mean over the channels, full scale squared: (F,).
 
         Parameters
         ----------
@@ -84,15 +92,39 @@ class SteadyBackground:
             Its spectra without a window, from which those with one follow: the window is a constant and one cosine.
         """
         if samples.shape[1] == self._count:
-            spectra = _windowed(plain, self._bins.stop, self._count)
+            power = self._power(_windowed(plain, self._bins.stop, self._count))
         else:
-            frame = samples[:, : self._count]
-            spectra = scipy.fft.rfft(frame * self._window[: frame.shape[1]], self._count, axis=1)[:, self._bins]
-        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=0, dtype=np.float64)
-        return np.asarray(power * (self._scale / len(samples)))
+            power = self._power(self._spectra(samples[:, : self._count]))
+        if self._before is not None and self._loud.any():
+            across = np.concatenate([self._before, samples[:, : self._count - self._half]], axis=1)
+            power = 0.5 * (power + self._power(self._spectra(across)))
+        self._before = samples[:, -self._half :]
+        return power
 
-    def learn(self, spectrum: FloatArray) -> None:
-        """Take in the spectrum of the next frame."""
+    def skip(self) -> None:
+        """Note that frames are missing before the next one."""
+        self._before = None
+
+    def _spectra(self, samples: Float32Array) -> ComplexArray:
+        """Return the spectra with a window of at most `_count` samples: (K, F)."""
+        windowed = samples * self._window[: samples.shape[1]]
+        return np.asarray(scipy.fft.rfft(windowed, self._count, axis=1)[:, self._bins])
+
+    def _power(self, spectra: ComplexArray) -> FloatArray:
+        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=0, dtype=np.float64)
+        return np.asarray(power * (self._scale / len(spectra)))
+
+    def learn(self, spectrum: FloatArray) -> bool:
+        """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
+
+        Then the usual level without what is loud now is far below the usual level without what was loud until now, and
+        what is known of levels is no longer true. The sound that is going on plays no part in it.
+        """
+        loud = self._loud
+        self._learn(spectrum)
+        return loud is not self._loud and self._usual_power(self._loud) < NEW_HUM * self._usual_power(loud)
+
+    def _learn(self, spectrum: FloatArray) -> None:
         self._maximum = np.maximum(self._keep * self._maximum, spectrum)
         self._latest.append(spectrum)
         if len(self._latest) < _SMOOTHING:
@@ -114,6 +146,14 @@ class SteadyBackground:
             self._usual = np.minimum.reduce(list(self._means))
         elif not self._means:
             self._usual = self._sum / self._frames
+
+    @property
+    def usual_power(self) -> float:
+        """Usual level, full scale squared, without what is loud and steady now."""
+        return self._usual_power(self._loud)
+
+    def _usual_power(self, loud: BoolArray) -> float:
+        return float(self._usual[self._band][~loud[self._band]].sum())
 
     @property
     def changing_maximum(self) -> float:

@@ -113,7 +113,7 @@ class _Measurement:
     def of(cls, estimate: Estimate, *, probable: bool) -> _Measurement:
         covariance_m2 = estimate.sound_covariance_m2
         spread_m = float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1])))
-        wrong = 1.0 - estimate.confidence if probable else 0.0
+        wrong = 1.0 - estimate.sound_confidence if probable else 0.0
         least_m2 = MIN_STD_M**2 + wrong * WRONG_STD_M**2
         noise_m2 = covariance_m2 + least_m2 * np.eye(3)
         return cls(estimate.time_ns, estimate.position_m, noise_m2, spread_m <= GATE_M)

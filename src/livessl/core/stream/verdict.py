@@ -13,11 +13,12 @@ import numpy as np
 
 from livessl.core.commission.observe import receive
 from livessl.core.geometry import direction_deg
+from livessl.core.locate.confidence import NEAR_M
 from livessl.core.locate.contributing import NO_EVIDENCE
 from livessl.core.locate.estimator import Localization
 from livessl.core.locate.map_estimator import MapEstimator
-from livessl.core.locate.set_up_error import set_up_covariance_m2
-from livessl.core.stream.evidence import BackfilledSound, Excerpt
+from livessl.core.locate.set_up_error import half_axis_m, probability_within, set_up_covariance_m2
+from livessl.core.stream.excerpt import BackfilledSound, Excerpt
 from livessl.core.stream.pending_event import PendingEvent
 from livessl.core.stream.site_state import SiteState
 from livessl.core.types import (
@@ -127,7 +128,8 @@ class Verdicts:
         estimate = self._estimate(found, used)
         status, reason = self._judged(estimate, found)
         heard = self._received(found, received, faults)
-        reason, power = _joined(reason, faults) or None, found.power or first.power
+        reason = _joined(reason, faults) or None
+        power = first.power if found.power is None else found.power
         first = replace(first, status=status, reason=reason, power=power, received=heard)
         if status is not Status.REFUSED:
             contributions = self._contributions(used.powers, estimate, found, backfilled)
@@ -138,13 +140,13 @@ class Verdicts:
                 id=f"{first.id}-{source}",
                 source=source,
                 status=Status.LOCATED,
-                reason=_joined(None, faults) or None,
+                reason=_joined(_limit_of_set_up(place), faults) or None,
                 received=(),
-                estimate=self._estimate(other, used),
-                power=other.power or first.power,
-                contributions=self._contributions(used.powers, self._estimate(other, used), found, backfilled),
+                estimate=place,
+                power=other.power,
+                contributions=self._contributions(used.powers, place, found, backfilled),
             )
-            for source, other in enumerate(self._others(found, used), 2)
+            for source, (other, place) in enumerate(self._others(found, used), 2)
         )
         return Verdict([first, *others], found)
 
@@ -194,7 +196,7 @@ class Verdicts:
             power=excerpt.greatest_power,
             contributions=self._contributions(excerpt.powers, estimate, found),
             complete_ns=excerpt.end_ns,
-            others=tuple(self._estimate(other, excerpt) for other in self._others(found, excerpt)),
+            others=tuple(place for _, place in self._others(found, excerpt)),
         ), found
 
     def count_votes(self, event: PendingEvent, excerpt: Excerpt, verdict: Verdict) -> None:
@@ -202,9 +204,10 @@ class Verdicts:
         if verdict.found is not None and verdict.events[0].status is not Status.REFUSED:
             self._state.votes.count(event.start, verdict.found, excerpt.sounds)
 
-    def _others(self, found: Localization, excerpt: Excerpt) -> tuple[Localization, ...]:
-        """Return those further sources of the same sound that are positions."""
-        return tuple(o for o in found.others if self._judged(self._estimate(o, excerpt), o)[0] is Status.LOCATED)
+    def _others(self, found: Localization, excerpt: Excerpt) -> list[tuple[Localization, Estimate]]:
+        """Return those further sources of the same sound that are positions, and their estimates."""
+        others = [(other, self._estimate(other, excerpt)) for other in found.others]
+        return [(other, place) for other, place in others if self._judged(place, other)[0] is Status.LOCATED]
 
     def _located(self, excerpt: Excerpt) -> Localization:
         """Locate, and refuse an answer of numbers that are none, as methods of others may give."""
@@ -226,21 +229,28 @@ class Verdicts:
         arrays = _used(found, excerpt.sounds)
         of_set_up_m2 = np.zeros((3, 3))
         if arrays:
-            axes = np.flatnonzero(np.diag(found.covariance_m2))
-            of_set_up_m2 = set_up_covariance_m2(self._state.specs(arrays), found.position_m, axes.tolist())
+            axes = np.flatnonzero(np.diag(found.covariance_m2)).tolist() or self._state.free_axes
+            of_set_up_m2 = set_up_covariance_m2(self._state.specs(arrays), found.position_m, axes)
+        covariance_m2, confidence = found.covariance_m2 + of_set_up_m2, found.confidence
+        if found.features is not None and of_set_up_m2.any():  # otherwise it is no probability, or that of the sound
+            of_sound = probability_within(NEAR_M, found.covariance_m2)
+            confidence *= min(1.0, probability_within(NEAR_M, covariance_m2) / max(of_sound, 1e-9))
         return Estimate(
             excerpt.middle_ns,
             found.position_m,
-            found.covariance_m2 + of_set_up_m2,
-            found.confidence,
+            covariance_m2,
+            confidence,
             arrays,
             found.candidates,
             of_set_up_m2,
+            found.confidence,
         )
 
     def _judged(self, estimate: Estimate, found: Localization) -> tuple[Status, str | None]:
         status, reason = judged(found, self._state.specs(estimate.arrays))
         least = self._state.parameters.min_arrays
+        if status is Status.LOCATED:
+            reason = "; ".join(filter(None, [reason, _limit_of_set_up(estimate)])) or None
         if status is Status.REFUSED or len(estimate.arrays) >= least:
             return status, reason
         names = " and ".join(map(repr, estimate.arrays))
@@ -306,3 +316,15 @@ def _dissent(found: Localization) -> str | None:
         return None
     each = " and ".join(f"{name!r} ({off_deg:.0f}° off)" for name, off_deg in sorted(found.outliers.items()))
     return f"located without the {'outlier' if len(found.outliers) == 1 else 'outliers'} {each}"
+
+
+def _limit_of_set_up(estimate: Estimate) -> str | None:
+    """Return a reason that gives the error of the set-up; None if it allows a position to be right to `NEAR_M`."""
+    off_m = half_axis_m(estimate.set_up_covariance_m2)
+    if off_m <= NEAR_M:
+        return None
+    names = " and ".join(map(repr, estimate.arrays))
+    return (
+        f"the set-up alone allows an error of {off_m:.1f} m here (90 %); measure the poses of {names}, "
+        "and enter how well they are known (arrays.NAME.uncertainty)"
+    )

@@ -11,6 +11,7 @@ from livessl.core.types.arrays import (
     UInt16Array,
     read_only,
 )
+from livessl.core.types.report import ChannelLevel, HostState
 from livessl.core.types.results import (
     BackfillRequest,
     Candidate,
@@ -55,6 +56,7 @@ __all__ = [
     "Block",
     "BoolArray",
     "Candidate",
+    "ChannelLevel",
     "ClockState",
     "ComplexArray",
     "Contribution",
@@ -64,6 +66,7 @@ __all__ = [
     "Float32Array",
     "FloatArray",
     "Frame",
+    "HostState",
     "IntArray",
     "Mark",
     "Message",

@@ -60,8 +60,9 @@ class Estimate:
         Square metres; of the position's whole error. Rows and columns are zero along an axis on which the search volume
         is flat.
     confidence : float
-        0 to 1. With `onset`, the probability that the position is right to within 0.5 m. With other methods, the margin
-        of the map's peak over the next best place; it is not a probability.
+        0 to 1. With `onset`, the probability that the position is right to within 0.5 m, with a set-up as uncertain as
+        the site file says. With other methods, the margin of the map's peak over the next best place; it is not a
+        probability.
     arrays : tuple of str
         Arrays from which the position was computed.
     candidates : tuple of Candidate
@@ -70,6 +71,8 @@ class Estimate:
     set_up_covariance_m2 : (3, 3) float64
         The part of `covariance_m2` that comes from poses and the speed of sound, as uncertain as the site file says.
         All sounds from one place have this error in common.
+    confidence_of_sound : float or None
+        The confidence with an exact set-up; None if it is `confidence`.
 
     Raises
     ------
@@ -84,6 +87,12 @@ class Estimate:
     arrays: tuple[str, ...]
     candidates: tuple[Candidate, ...] = ()
     set_up_covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    confidence_of_sound: float | None = None
+
+    @property
+    def sound_confidence(self) -> float:
+        """The confidence that does not count the error of the set-up."""
+        return self.confidence if self.confidence_of_sound is None else self.confidence_of_sound
 
     @property
     def sound_covariance_m2(self) -> FloatArray:
@@ -171,11 +180,13 @@ class Event:
     status : Status
         Whether `estimate` is a position, a direction only, or missing.
     reason : str or None
-        Why the status is not `located`, or which outliers were excluded; None otherwise.
+        Why the status is not `located`, which outliers were excluded, or by how much the set-up alone may be wrong if
+        that is more than 0.5 m; None otherwise.
     estimate : Estimate or None
         None if it was refused.
-    power : float
-        Greatest in-band frame power over all arrays, full scale squared.
+    power : float or None
+        Greatest in-band frame power over all arrays, full scale squared. Of two sources that sounded at the same time,
+        each has its share; None for a second source whose share cannot be determined.
     method : str
         Name of the localization method.
     contributions : tuple of Contribution
@@ -203,7 +214,7 @@ class Event:
     status: Status
     reason: str | None
     estimate: Estimate | None
-    power: float
+    power: float | None
     method: str
     contributions: tuple[Contribution, ...] = ()
     heard_by: tuple[str, ...] = ()

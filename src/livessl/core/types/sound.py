@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.types.arrays import BoolArray, Float32Array, FloatArray, IntArray, RealArray, read_only
+from livessl.core.types.report import ChannelLevel, HostState
 
 FRAME_NS: Final = 50_000_000
 """Length of a frame, and step of the grid of frames in site time, in nanoseconds: the paper's 50 ms."""
@@ -157,6 +158,10 @@ class Mark:
         Rate of the device's clock against site time, parts per million; 0 until it is known.
     clock : ClockState
         State of the mapping from sample index to site time.
+    levels : tuple of ChannelLevel
+        Level of each channel, in the first mark after each second of sound; empty in all others.
+    host : HostState or None
+        State of the node's machine, in marks with levels of a node that captures now; None in all others.
     """
 
     array: str
@@ -169,6 +174,8 @@ class Mark:
     lost_frames: int = 0
     drift_ppm: float = 0.0
     clock: ClockState = ClockState.SETTLING
+    levels: tuple[ChannelLevel, ...] = ()
+    host: HostState | None = None
 
 
 Message = Frame | Mark
@@ -312,7 +319,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What the channels of one array received of one sound, measured without knowing where the microphones are.
+    """Delays and levels of one sound in the channels of one array, measured without knowing where the microphones are.
 
     Parameters
     ----------
@@ -348,7 +355,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What one array received of one sound, from which an `Observation` is made when it is needed.
+    """One array's reception of one sound, from which an `Observation` is made when it is needed.
 
     Parameters
     ----------

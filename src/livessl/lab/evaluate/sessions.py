@@ -192,7 +192,10 @@ def _output_row(output: Output) -> Row | None:
                 return row
             c = estimate.sound_covariance_m2  # the set-up is exact here
             spread = dict(zip(COVARIANCE, (c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]), strict=True))
-            return row | {"confidence": estimate.confidence, **{f"c{axes}_m2": value for axes, value in spread.items()}}
+            return row | {
+                "confidence": estimate.sound_confidence,
+                **{f"c{axes}_m2": value for axes, value in spread.items()},
+            }
         case Track(state=state) if state is not TrackState.END:
             time_s = (output.time_ns - START_NS) / 1e9
             return row_of("track", output.id, time_s, output.position_m) | {"begin_s": time_s}

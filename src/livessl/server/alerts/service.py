@@ -294,8 +294,8 @@ class Alerts:
                 self._missed = None if newest == before_ns else (before_ns, newest)
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
-            watch = self._set_up_watch
-            findings = watch.findings if watch.sounds >= LEAST_SOUNDS else None
+            set_up = self._set_up_watch.state
+            findings = set_up.findings if set_up.sounds >= LEAST_SOUNDS else None
             arrays = self._array_states.describe(levels=False)
             self._announce(self._judge.judge_conditions(arrays, findings, now_ns))
         days = self._site.store.retention_days

@@ -139,7 +139,8 @@ class Finding(BaseModel):
     kind: Literal["finding"]
     fault: str = Field(
         description="Code of the fault: `dead`, `deaf`, `level`, `inverted`, `duplicate`, `swapped`, `mirrored`, "
-        "`exchanged`, `late_channel`, `geometry`, `turned`, `moved` or `temperature`; others may be added.",
+        "`exchanged`, `late_channel`, `geometry`, `turned`, `moved`, `temperature`, `clipping`, `dc`, `hum`, `noisy`, "
+        "`ntp` or `cpu`; others may be added.",
         examples=["swapped"],
     )
     array: str | None = Field(description="The array; null for the whole site.", examples=["south"])
@@ -219,7 +220,7 @@ class Refused(BaseModel):
 
 
 class LoadState(StrEnum):
-    """Whether the server keeps up with the sound: `normal`, or `overloaded` while it sheds work."""
+    """State of the server: `normal` while it keeps up with the sound, `overloaded` while it sheds work."""
 
     NORMAL = "normal"
     OVERLOADED = "overloaded"

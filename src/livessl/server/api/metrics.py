@@ -12,6 +12,7 @@ from prometheus_client.registry import Collector
 from livessl.core.commission.finding import Severity
 from livessl.server.api.alert_metrics import alert_metrics
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.report_metrics import report_metrics
 from livessl.server.parts import Parts
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -47,17 +48,20 @@ class _Metrics(Collector):
         yield from server_metrics(self._parts)
         yield from event_metrics(self._parts)
         yield from alert_metrics(self._parts)
-        yield from array_metrics(self._parts.array_states.describe())
+        arrays = self._parts.array_states.describe()
+        yield from array_metrics(arrays)
+        yield from report_metrics(arrays)
 
 
 def server_metrics(parts: Parts) -> Iterator[Metric]:
     """Gauges and counters of connections, maps and refusals."""
     yield GaugeMetricFamily("livessl_uptime_seconds", "Seconds since the server started.", parts.site_time.uptime_s())
     findings = GaugeMetricFamily(
-        "livessl_findings", "Faults of the set-up that the last sounds show.", labels=["severity"]
+        "livessl_findings", "Faults of the set-up that sounds and nodes show.", labels=["severity"]
     )
+    found = parts.set_up_watch.state.findings
     for severity in Severity:
-        findings.add_metric([severity], sum(one.severity is severity for one in parts.set_up_watch.findings))
+        findings.add_metric([severity], sum(one.severity is severity for one in found))
     yield findings
     yield GaugeMetricFamily("livessl_websocket_clients", "Connected live subscribers.", parts.fanout.clients)
     yield GaugeMetricFamily("livessl_map_watchers", "Connected subscribers to power maps.", parts.maps.watchers)

@@ -110,9 +110,9 @@ def state_routes(parts: Parts) -> APIRouter:
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
         """Faults of the set-up that the last sounds show, errors first."""
-        watch = parts.set_up_watch
-        findings = [{"kind": "finding", **asdict(finding)} for finding in watch.findings]
-        return as_json({"v": API_VERSION, "sounds": watch.sounds, "findings": findings})
+        state = parts.set_up_watch.state
+        findings = [{"kind": "finding", **asdict(finding)} for finding in state.findings]
+        return as_json({"v": API_VERSION, "sounds": state.sounds, "findings": findings})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:

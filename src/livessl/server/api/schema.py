@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, Field
 
 from livessl.core.types import ClockState, Status, TrackState
+from livessl.server.api.report_schema import Channel, Host
 
 Version = Annotated[
     Literal[1],
@@ -200,7 +201,9 @@ class Event(BaseModel):
         examples=[None],
     )
     heard_by: ArrayNames = Field(description="Arrays that detected the sound by themselves.")
-    level_dbfs: LevelDbfs | None = Field(description="Level of the loudest 50 ms; null for digital silence.")
+    level_dbfs: LevelDbfs | None = Field(
+        description="Level of the loudest 50 ms; null for digital silence, and for a second source of unknown share."
+    )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
@@ -326,4 +329,11 @@ class Array(BaseModel):
     agreement: Agreement
     clock_offset: ClockOffset | None = Field(description="Null until three sounds have been measured.")
     counters: Counters
+    channels: list[Channel] = Field(
+        description="Level of each channel in the site file's order; empty until its node has reported them."
+    )
+    channels_age_s: float | None = Field(
+        ge=0, description="Seconds since that report; null if there is none.", examples=[0.6]
+    )
+    host: Host | None = Field(description="State of its node's machine; null if it is not reported.")
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])

@@ -21,6 +21,9 @@ const PROBLEMS = {
   sequence_gaps: "sequence gap",
 };
 
+/** Codes of findings about channels, in words; others are shown as they are. */
+const FAULTS = { clipping: "clips", dc: "constant", hum: "hums", noisy: "noisy", level: "level differs" };
+
 /** A level's place on the level bar, 0 to 100. */
 const place = (dbfs) => (Number.isFinite(dbfs) ? Math.min(100, Math.max(0, (1 - dbfs / LEAST_DBFS) * 100)) : 0);
 
@@ -106,7 +109,7 @@ export class ArraysPanel {
     card.button.setAttribute("aria-label", `${action} ${array.name}`);
     card.button.hidden = !this.mayChange;
     this.#fillLevel(card, array);
-    this.#fillChannels(card, array.channel_levels_dbfs);
+    this.#fillChannels(card, array);
     fillFacts(card.facts, [...problems(array), ...facts(array)]);
   }
 
@@ -124,33 +127,63 @@ export class ArraysPanel {
     write(card.context, threshold === null ? "" : `noise ${number(noise, 0)}, threshold ${number(threshold, 0)}`);
   }
 
-  #fillChannels(card, levels) {
+  #fillChannels(card, { name, channel_levels_dbfs: levels, channels: reports = [] }) {
     while (card.bars.length < levels.length) {
       const fill = el("span", { className: "fill" });
-      const bar = el("span", { className: "channel" }, fill);
-      card.bars.push({ bar, fill });
+      const peak = el("span", { className: "peak" });
+      const bar = el("span", { className: "channel", "data-testid": `channel-${name}-${card.bars.length + 1}` }, fill, peak);
+      card.bars.push({ bar, fill, peak });
       card.channels.append(bar);
     }
     while (card.bars.length > levels.length) card.bars.pop().bar.remove();
     levels.forEach((level, index) => {
-      const { bar, fill } = card.bars[index];
+      const { bar, fill, peak } = card.bars[index];
+      const report = reports[index];
       fill.style.height = `${place(level)}%`;
+      peak.hidden = typeof report?.peak_dbfs !== "number";
+      peak.style.bottom = `${place(report?.peak_dbfs)}%`;
       bar.classList.toggle("silent", level === null);
-      bar.title = `channel ${index + 1}: ${level === null ? "digital silence" : `${number(level, 1)} dBFS`}`;
+      bar.classList.toggle("faulty", Boolean(report?.faults.length));
+      bar.title = channelText(index, level, report);
     });
-    card.channels.setAttribute("aria-label", `levels of ${levels.length} channels`);
+    const faulty = reports.flatMap(({ faults }, index) => faults.map((fault) => `channel ${index + 1}: ${fault}`));
+    card.channels.setAttribute("aria-label", [`levels of ${levels.length} channels`, ...faulty].join("; "));
     card.channels.hidden = levels.length === 0;
   }
 }
 
+/** A channel in words, a line for each: its level in the array's band, then what its node reports of the whole band. */
+function channelText(index, level, report) {
+  const lines = [`channel ${index + 1}: ${level === null ? "digital silence" : `${number(level, 1)} dBFS in the band`}`];
+  if (!report) return lines[0];
+  const add = (text, value, digits = 1) => value !== null && lines.push(`${text} ${number(value, digits)} dBFS`);
+  add("peak", report.peak_dbfs);
+  add("RMS", report.rms_dbfs);
+  add("noise floor", report.noise_dbfs);
+  if (report.hum_hz !== null) add(`hum at ${number(report.hum_hz, 0)} Hz`, report.hum_dbfs);
+  if (report.mean !== null) lines.push(`DC ${signed(100 * report.mean, 2)} %`);
+  lines.push(`${report.clipped} clipped samples`);
+  if (report.faults.length) lines.push(`faults: ${report.faults.join(", ")}`);
+  return lines.join("\n");
+}
+
 /** An array's problems, as facts: see `fillFacts`. */
-function problems({ counters: { frames, marks, backfilled, asked, helped, ...others } }) {
-  return Object.entries(others).filter(([, count]) => count > 0)
+function problems({ counters: { frames, marks, backfilled, asked, helped, ...others }, channels = [], host }) {
+  const found = Object.entries(others).filter(([, count]) => count > 0)
     .map(([key, count]) => ({ text: counted(count, PROBLEMS[key] ?? key.replaceAll("_", " ")), problem: true }));
+  channels.forEach(({ faults }, index) => faults.forEach((fault) => {
+    found.push({ text: `channel ${index + 1}: ${FAULTS[fault] ?? fault}`, title: "The findings have the cure", problem: true });
+  }));
+  if (host?.lost_blocks) {
+    const title = "Blocks of sound that its node's machine was too busy to read";
+    found.push({ text: counted(host.lost_blocks, "block") + " not read in time", title, problem: true });
+  }
+  return found;
 }
 
 /** An array's properties and statistics, as facts: see `fillFacts`. */
-function facts({ drift_ppm: drift, clock, clock_offset: offset, sample_rate_hz: rate, node, agreement, counters }) {
+function facts(array) {
+  const { drift_ppm: drift, clock, clock_offset: offset, sample_rate_hz: rate, node, agreement, counters, host } = array;
   const { frames, marks, backfilled, asked, helped } = counters;
   const { agreed, disagreed } = agreement;
   const found = [];
@@ -159,6 +192,7 @@ function facts({ drift_ppm: drift, clock, clock_offset: offset, sample_rate_hz: 
   if (clock !== null) add(`clock ${clock}`, "State of the device's clock against the server's time", clock === "stepped");
   if (offset !== null) add(offsetText(offset), "Clock offset measured from events", Math.abs(offset.offset_s) > FRAME_S);
   if (rate !== null) add(`${number(rate / 1000, 2)} kHz`, "Sample rate of the device");
+  if (host?.synchronized != null) add(hostText(host), "Whether the clock of the node's machine follows another one");
   if (node !== null) add(`node ${node}`, "The capture node that sends this array's sound");
   if (agreed + disagreed > 0) {
     const text = `consistent in ${agreed} of ${agreed + disagreed} events`;
@@ -172,6 +206,13 @@ function facts({ drift_ppm: drift, clock, clock_offset: offset, sample_rate_hz: 
     add(text, "Requests for frames of events that this array did not detect itself");
   }
   return found;
+}
+
+function hostText({ synchronized, service, reference, error_s: error }) {
+  if (!synchronized) return "machine's clock not synchronized";
+  const from = [service === "kernel" ? "" : service, reference].filter(Boolean).join(" ");
+  const within = error === null ? "" : `, ± ${number(1000 * error, error < 0.01 ? 1 : 0)} ms`;
+  return `machine's clock synchronized${from ? ` by ${from}` : ""}${within}`;
 }
 
 function offsetText({ offset_s: offset, std_s: std, sounds, reference }) {

@@ -121,4 +121,5 @@ def _site_state(
         parameters,
         clock_offsets=clock_offsets,
         for_each=for_each,
+        free_axes=search_grid(site).free_axes,
     )

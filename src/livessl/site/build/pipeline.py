@@ -25,7 +25,9 @@ def activity_parameters(site: Site) -> ActivityParameters:
     )
 
 
-def make_pipeline(site: Site, channels: Mapping[str, Sequence[int]], sample_rate_hz: float) -> Pipeline:
+def make_pipeline(
+    site: Site, channels: Mapping[str, Sequence[int]], sample_rate_hz: float, *, reports_levels: bool = False
+) -> Pipeline:
     """Return the pipeline of the arrays that share one device's clock.
 
     Parameters
@@ -36,8 +38,10 @@ def make_pipeline(site: Site, channels: Mapping[str, Sequence[int]], sample_rate
         processed as one.
     sample_rate_hz : float
         Nominal rate of the device.
+    reports_levels : bool
+        Whether marks carry the levels of the channels.
     """
     wirings = [
         Wiring(site.array(name), np.array(numbers) - 1) for name, numbers in site.joined_channels(channels).items()
     ]
-    return Pipeline(wirings, sample_rate_hz, activity_parameters(site))
+    return Pipeline(wirings, sample_rate_hz, activity_parameters(site), reports_levels=reports_levels)

@@ -1,0 +1,94 @@
+"""At the first start on a machine the server works on NumPy until a process of its own has compiled the kernels."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from livessl.core.kernels import with_numba
+from livessl.server.compiling import machine_code_folder
+
+SCRIPT = """
+import logging, shutil, sys, threading
+from pathlib import Path
+import numpy as np
+from livessl.core.geometry import Grid, posed, tetrahedron
+from livessl.core.kernels import kernels, with_numba
+from livessl.core.locate.peak_search import PeakSearch
+from livessl.core.types import ArraySpec
+from livessl.server.compiling import load_kernels, machine_code_folder
+
+logging.basicConfig(level="INFO", stream=sys.stdout, format="%(message)s")
+folder = machine_code_folder(with_numba)
+folder.mkdir(parents=True, exist_ok=True)
+compiler = load_kernels([sys.executable, "-c", sys.argv[1]])
+assert kernels.NAME == "NumPy"
+spec = ArraySpec("a", posed(tetrahedron(0.5), (1.0, 1.0, 1.0)), (100.0, 6000.0))
+PeakSearch([spec], Grid(((0.0, 2.0), (0.0, 2.0), (0.0, 2.0)), 0.5), 343.0).prepare("a", np.arange(-700, 701) / 4e5)
+if len(sys.argv) > 2:  # what the compiler would have made
+    for path in Path(sys.argv[2]).glob("*.nb?"):
+        shutil.copy2(path, folder)
+if "sleep" not in sys.argv[1]:
+    next(thread for thread in threading.enumerate() if thread.name == "compiling").join()
+compiler.stop()
+print("kernels of", kernels.NAME, "now")
+"""
+
+AGAIN = """
+import logging, shutil, subprocess, sys
+from pathlib import Path
+from livessl.core.kernels import kernels, with_numba
+from livessl.server.compiling import COMPILE, load_kernels, machine_code_folder
+
+logging.basicConfig(level="INFO", stream=sys.stdout, format="%(message)s")
+folder = machine_code_folder(with_numba)
+folder.mkdir(parents=True, exist_ok=True)
+for path in Path(sys.argv[1]).glob("*.nb?"):
+    shutil.copy2(path, folder)
+subprocess.run(COMPILE, check=True)
+assert load_kernels([sys.executable, "-c", "raise SystemExit('nothing is left to compile')"]) is None
+print("kernels of", kernels.NAME, "at once")
+"""
+
+
+def run(script: str, tmp_path: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def first_start(tmp_path: Path, *arguments: str) -> str:
+    said = run(SCRIPT, tmp_path, *arguments)
+    assert "First start: compiling kernels in the background" in said
+    return said
+
+
+def test_compiled_kernels_are_used_once_they_are_there(tmp_path: Path) -> None:
+    said = first_start(tmp_path, "print('compiled')", str(machine_code_folder(with_numba)))
+    assert "The kernels are compiled and in use." in said
+    assert "kernels of numba now" in said
+
+
+def test_failed_compiler_leaves_numpy_in_use_and_is_told(tmp_path: Path) -> None:
+    said = first_start(tmp_path, "raise SystemExit(3)")
+    assert "compiling kernels failed with exit code 3: NumPy goes on" in said
+    assert "kernels of NumPy now" in said
+
+
+def test_server_that_stops_ends_its_compiler(tmp_path: Path) -> None:
+    assert "kernels of NumPy now" in first_start(tmp_path, "import time; time.sleep(3600)")
+
+
+def test_kernels_that_were_compiled_before_are_loaded_at_once(tmp_path: Path) -> None:
+    said = run(AGAIN, tmp_path, str(machine_code_folder(with_numba)))
+    assert "compiling" not in said
+    assert "kernels of numba at once" in said

@@ -1,0 +1,135 @@
+"""The examination of the set-up in a server: its state is one value, and findings do not flap."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from world import HandClock
+
+from livessl.core.commission import observe
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
+from livessl.core.commission.steady import MOST_CONFIRMING
+from livessl.server.overload import Overload
+from livessl.server.set_up_watch import KEPT_SOUNDS, SetUpWatch
+from livessl.site.build import set_up
+from small_site import site_of
+
+TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turned", "turn it back")
+CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
+WEAK = Finding("level", "north", 2, Severity.WARNING, 0.9, "channel 2 of 'north' is weaker", "set the gains alike")
+SOUND = cast(Any, SimpleNamespace(source=1, received=("north", "south")))
+
+
+class Desk:
+    """A watch whose examinations find what a test says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.found: Sequence[Finding] = ()
+        self.examined: list[int] = []
+        monkeypatch.setattr(observe, "observe", lambda received: received)
+        monkeypatch.setattr(set_up, "find_set_up_faults", self._find)
+        self.watch = SetUpWatch(site_of(), Overload(HandClock()))
+
+    def hear(self, found: Sequence[Finding], sounds: int = 1) -> None:
+        """Some sounds come, and examinations find this from now on."""
+        self.found = found
+        for _ in range(sounds):
+            self.watch.take(SOUND)
+            self.watch.examine()
+
+    def _find(self, _site: object, sounds: Sequence[object]) -> list[Finding]:
+        self.examined.append(len(sounds))
+        return list(self.found)
+
+
+@pytest.fixture
+def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
+    return Desk(monkeypatch)
+
+
+def test_fault_of_a_new_server_is_published_with_the_third_sound(desk: Desk) -> None:
+    desk.hear([TURNED], LEAST_SOUNDS - 1)
+    assert (desk.watch.state.findings, desk.examined) == ((), [])
+    desk.hear([TURNED])
+    assert (desk.watch.state.sounds, desk.watch.state.findings) == (LEAST_SOUNDS, (TURNED,))
+    assert desk.watch.finding_of("south") == "'south' is turned; turn it back"
+    assert desk.watch.finding_of("north") is None
+
+
+def test_at_most_the_last_sounds_are_examined(desk: Desk) -> None:
+    desk.hear([], KEPT_SOUNDS + 5)
+    assert max(desk.examined) == desk.watch.state.sounds == KEPT_SOUNDS
+
+
+def test_finding_that_comes_and_goes_is_published_and_logged_once(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        desk.hear([TURNED], KEPT_SOUNDS)
+        states = []
+        for _ in range(10):
+            desk.hear([])
+            states.append(desk.watch.state.findings)
+            desk.hear([TURNED])
+            states.append(desk.watch.state.findings)
+    assert set(states) == {(TURNED,)}
+    assert caplog.text.count("'south' is turned") == 1
+
+
+def test_finding_ends_when_the_set_up_is_mended(desk: Desk) -> None:
+    desk.hear([TURNED], KEPT_SOUNDS)
+    desk.hear([], MOST_CONFIRMING - 1)
+    assert desk.watch.state.findings == (TURNED,)
+    desk.hear([])
+    assert (desk.watch.state.findings, desk.watch.state.errors) == ((), {})
+
+
+def test_contradiction_without_a_culprit_concerns_all_arrays_and_a_warning_none(desk: Desk) -> None:
+    desk.hear([CONTRADICTION, WEAK], LEAST_SOUNDS)
+    assert desk.watch.state.findings == (CONTRADICTION, WEAK)
+    assert set(desk.watch.state.errors) == {"north", "south"}
+
+
+def test_another_run_begins_without_findings(desk: Desk) -> None:
+    desk.hear([TURNED], KEPT_SOUNDS)
+    desk.watch.forget()
+    assert (desk.watch.state.sounds, desk.watch.state.findings, desk.watch.state.errors) == (0, (), {})
+    desk.hear([], LEAST_SOUNDS)
+    assert desk.watch.state.findings == ()
+
+
+def test_what_the_site_file_alone_shows_is_there_from_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+    flat = {f"arrays.{name}.geometry": {"circle": {"radius_m": 0.2, "count": 4}} for name in ("north", "south")}
+    heights = {"arrays.north.position_m": [1.9, 1.3, 1.5], "arrays.south.position_m": [2.2, 3.8, 1.5]}
+    watch = SetUpWatch(site_of(flat | heights), Overload(HandClock()))
+    assert [one.fault for one in watch.state.findings] == ["ambiguous_geometry"]
+    watch.forget()
+    assert [one.fault for one in watch.state.findings] == ["ambiguous_geometry"]
+
+
+def test_reader_never_sees_the_findings_of_one_state_with_the_sounds_of_another(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def numbered(_site: object, sounds: Sequence[object]) -> list[Finding]:
+        return [Finding("turned", "south", None, Severity.ERROR, 0.9, f"{len(sounds)}", "")]
+
+    monkeypatch.setattr(set_up, "find_set_up_faults", numbered)
+    torn, done = [], threading.Event()
+
+    def read() -> None:
+        while not done.is_set():
+            state = desk.watch.state
+            if any(one.message != f"{state.sounds}" for one in state.findings):
+                torn.append(state)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(60):
+        desk.hear([], KEPT_SOUNDS)
+        desk.watch.forget()
+    done.set()
+    reader.join()
+    assert torn == []
