@@ -26,6 +26,7 @@ from livessl.clock import utc_ns, utc_text
 from livessl.server.api import history_routes
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
+from livessl.server.store import Store
 from livessl.site.tokens import add_token
 from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
 
@@ -212,7 +213,7 @@ def test_unchanged_answer_is_not_sent_again(client: httpx.Client) -> None:
         assert client.get(f"/api/v1/{path}", headers={"If-None-Match": '"other"'}).status_code == 200
 
 
-def test_exports_are_files_of_the_same_events(client: httpx.Client) -> None:
+def test_exports_are_files_of_the_same_events(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     events = get(client, "events")["events"]
     lines = client.get("/api/v1/events.jsonl")
     assert [json.loads(line) for line in lines.text.splitlines()] == events
@@ -221,6 +222,9 @@ def test_exports_are_files_of_the_same_events(client: httpx.Client) -> None:
     assert [row["id"] for row in csv.DictReader(io.StringIO(table.text, newline=""))] == [events[0]["id"]]
     assert client.get("/api/v1/events.parquet").content.startswith(b"PAR1")
     assert client.get("/api/v1/events.csv", params={"limit": 1}).status_code == 422
+    monkeypatch.setattr(Store, "scan", None)  # HEAD reads no event
+    head = client.head("/api/v1/events.csv")
+    assert (head.status_code, head.headers["Content-Disposition"]) == (200, table.headers["Content-Disposition"])
 
 
 def test_export_without_its_library_says_what_to_install(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,13 +145,14 @@ def _add_exports(router: APIRouter, parts: Parts, searched: Any) -> None:
     def add(form: str) -> None:
         media_type, encode = FORMATS[form]
 
-        def export(query: EventQuery = searched) -> Response:
+        def export(request: Request, query: EventQuery = searched) -> Response:
             if form == "parquet" and find_spec("pyarrow") is None:
                 raise HTTPException(501, "Parquet needs the package pyarrow; pip install 'livessl[export]'")
-            pages = parts.store.scan(query)
             name = f"{parts.site.site}-events.{form}".encode("ascii", "replace").decode().replace('"', "_")
             headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-            return StreamingResponse(encode(pages), media_type=media_type, headers=headers)
+            if "head_only" in request.scope:  # nothing of a long stream would be sent
+                return Response(media_type=media_type, headers=headers)
+            return StreamingResponse(encode(parts.store.scan(query)), media_type=media_type, headers=headers)
 
         router.get(
             f"/api/v1/events.{form}",

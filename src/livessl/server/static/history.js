@@ -12,6 +12,8 @@ import { readColours } from "./theme.js";
 const API = new URL("api/v1/", document.baseURI);
 /** Events on a page. */
 const PAGE = 50;
+/** Least width or height of the heat map's picture, in pixels. */
+const SHARP_PIXELS = 1000;
 /** Pause after typing, in milliseconds, before the text is searched. */
 const TYPING_MS = 300;
 const FILTERS = ["since", "until", "zone", "array", "status", "min_confidence", "min_level_dbfs", "text"];
@@ -148,11 +150,21 @@ function paintHeat() {
     }
   }
   context.putImageData(image, 0, 0);
-  heatImage = canvas;
+  heatImage = enlarged(canvas);
   write(find("ramp-text"), `events: 1 → ${most}`);
   const elsewhere = heat.elsewhere ? `, ${heat.elsewhere} without a place here` : "";
   write(find("heat-text"), counted(heat.events, "event") + elsewhere);
   draw();
+}
+
+/** The picture with sharp cells: a plan smooths what it enlarges. */
+function enlarged(canvas) {
+  const factor = Math.max(1, Math.round(SHARP_PIXELS / Math.max(canvas.width, canvas.height)));
+  const large = el("canvas", { width: factor * canvas.width, height: factor * canvas.height });
+  const context = large.getContext("2d");
+  context.imageSmoothingEnabled = false;
+  context.drawImage(canvas, 0, 0, large.width, large.height);
+  return large;
 }
 
 function draw() {
@@ -194,8 +206,10 @@ async function save(format) {
 
 async function start() {
   try {
-    const site = await getJson("site");
+    const [site, { arrays }] = await Promise.all([getJson("site"), getJson("arrays")]);
     model.site = site;
+    model.arrays = arrays.map((array) => ({ array, sentMs: Date.now() }));
+    model.link = "live";
     write(find("site-name"), site.site);
     const [x, y] = site.room.size_m;
     find("floor-frame").style.setProperty("--aspect", String(x / y));
