@@ -9,8 +9,9 @@ Each seed is a room of 8 x 10 x 4 m with RT60 0.3, 0.5 or 0.8 s, tetrahedra of 0
 sounds. A fault counts as named if a finding has its code, its array and, where it has one, its channel. With `--live`
 the events go one by one to the examination of a running server, which is looked at after each.
 
-Rows are appended to `rows.jsonl` as they come, and those that are there already are not made again, so that a campaign
-can be interrupted. Observations are kept in `--cache`, if given: then only conclusions are drawn again.
+Except for clocks, the examinations of two arrays use what they observed beside the third one. Rows are appended to
+`rows.jsonl` as they come, and those that are there already are not made again, so that a campaign can be interrupted.
+Observations are kept in `--cache`, if given: then only conclusions are drawn again.
 """
 
 from __future__ import annotations
@@ -289,7 +290,10 @@ class Rooms:
         return self._room
 
     def gathered(self, seed: int, fault: Fault, arrays: int) -> tuple[Site, Gathered]:
-        """The site file, and what its examination rests on."""
+        """The site file, and what its examination rests on; what fewer arrays observed is that beside all others."""
+        if arrays < len(POSITIONS_M) and "clock" not in fault.expected:
+            site = site_of(arrays, seed, **fault.filed)
+            return site, _of_arrays(self.gathered(seed, fault, len(POSITIONS_M))[1], set(site.arrays))
         path = None if self._cache is None else self._cache / f"{seed}-{arrays}-{fault.name.replace(' ', '_')}.pickle"
         if path is not None and path.exists():
             gathered = pickle.loads(path.read_bytes())  # noqa: S301 - written below
@@ -300,6 +304,13 @@ class Rooms:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickle.dumps(gathered))
         return site, gathered
+
+
+def _of_arrays(gathered: Gathered, arrays: set[str]) -> Gathered:
+    """Return what some arrays observed."""
+    sounds = (tuple(one for one in sound if one.array in arrays) for sound in gathered.sounds)
+    findings = tuple(one for one in gathered.findings if one.array in arrays)
+    return replace(gathered, sounds=tuple(sound for sound in sounds if sound), findings=findings)
 
 
 def verdict(fault: Fault, findings: Sequence[Finding]) -> dict[str, bool]:

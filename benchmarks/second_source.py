@@ -32,6 +32,7 @@ from livessl.lab.evaluate.job import read_clips
 from livessl.lab.evaluate.localizer import half_of
 from livessl.lab.evaluate.paper import CLASSES
 from livessl.lab.evaluate.scenarios import HALVES
+from livessl.lab.evaluate.statistics import wilson
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from mixtures import RATE_HZ, Case, apart_m, simulated
@@ -156,15 +157,6 @@ def fit(rows: Sequence[Mapping[str, Any]]) -> FloatArray:
             break
     scaled = weights[1:] / deviation
     return np.array([weights[0] - scaled @ mean, *scaled])
-
-
-def wilson(count: int, total: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share by Wilson (1927)."""
-    z2 = 1.96**2
-    share = count / total
-    centre = (share + z2 / (2.0 * total)) / (1.0 + z2 / total)
-    half = np.sqrt(z2 * (share * (1.0 - share) / total + z2 / (4.0 * total**2))) / (1.0 + z2 / total)
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
 
 
 def report(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -9,13 +9,14 @@ import pytest
 
 import second_source
 from livessl.core.locate.second_source import SecondSourceFeatures
+from livessl.lab.evaluate.statistics import wilson
 
 
 @pytest.mark.parametrize(
     ("count", "total", "low", "high"), [(0, 30, 0.0, 0.1135), (173, 200, 0.8106, 0.9055), (30, 30, 0.8865, 1.0)]
 )
 def test_intervals_are_those_of_wilson(count: int, total: int, low: float, high: float) -> None:
-    assert second_source.wilson(count, total) == pytest.approx((low, high), abs=5e-4)
+    assert wilson(count, total) == pytest.approx((low, high), abs=5e-4)
 
 
 def test_the_fit_recovers_the_log_odds_that_sounds_were_drawn_by() -> None:

@@ -13,6 +13,7 @@ from livessl.core.commission.channels import ChannelMeter
 from livessl.core.commission.clocks import find_clock_faults
 from livessl.core.commission.crosstalk import CrosstalkMeter
 from livessl.core.commission.finding import Finding, Severity, in_order
+from livessl.core.commission.findings import OF_SET_UP
 from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 from livessl.recordings.assign import AssignedRecording
@@ -119,8 +120,8 @@ def conclude(site: Site, gathered: Gathered) -> Examination:
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
     """Leave out what follows from another finding.
 
-    That is whatever a silent channel shows, the noise of a loud channel, and crosstalk of a channel with the signal of
-    another.
+    That is whatever a silent channel shows, the noise of a loud channel, crosstalk of a channel with the signal of
+    another, and the poses where clocks differ so much that arrays receive different sounds at one time.
     """
     faults: dict[tuple[str | None, int | None], set[str]] = {}
     for one in findings:
@@ -131,6 +132,7 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
         if "dead" not in (others := faults[one.array, one.channel] - {one.fault})
         and not (one.fault == "noisy" and others & {"level", "clipping"})
         and not (one.fault == "crosstalk" and others & {"duplicate", "deaf"})
+        and not (one.fault in OF_SET_UP and "clock" in faults.get((None, None), set()))
     ]
 
 

@@ -86,7 +86,7 @@ def test_measured_poses_mend_a_wrong_site_file(run: Run, claps: Recorded, tmp_pa
     assert wrong.code == 1
     done = run("calibrate", "poses", *session, "--place-std", "0.01", "--write", written, "--json")
     assert done.code == 0
-    assert "name it in the site file as calibration: FILE" in done.err
+    assert "name it in the site file as calibration: calibration/lab.yaml" in done.err
     poses = {one["array"]: one for one in done.objects}
     assert poses["south"]["turn_deg"] == pytest.approx([0.0, 0.0, -TURN_DEG], abs=2.0)
     assert poses["south"]["misfit_us"][1] < 20.0 < poses["south"]["misfit_us"][0]
@@ -113,6 +113,34 @@ def test_a_calibration_file_is_put_back(run: Run, claps: Recorded, tmp_path: Pat
     again = run("calibrate", "poses", *session, "--write", written, "--undo")
     assert again.code == 2
     assert "there is none" in again.err
+
+
+def test_the_site_file_says_where_its_calibration_is_written_and_put_back(
+    run: Run, claps: Recorded, tmp_path: Path
+) -> None:
+    site = turned_site(tmp_path)
+    session = ["--site", site, "--session", claps.directory, *places(claps)]
+    assert run("calibrate", "poses", *session, "--write").code == 0
+    written = tmp_path / "calibration" / "small.yaml"
+    site.write_text(yaml.safe_dump(yaml.safe_load(site.read_text()) | {"calibration": "calibration/small.yaml"}))
+    first = yaml.safe_load(written.read_text())
+    first["arrays"]["north"]["position_std_m"] = 0.05
+    written.write_text(yaml.safe_dump({**first, "arrays": {"north": first["arrays"]["north"]}}))
+    again = run("calibrate", "poses", *session, "--write")
+    assert (again.code, "name it in the site file" in again.err) == (0, False)
+    second = yaml.safe_load(written.read_text())
+    assert set(second["arrays"]) == {"north", "south"}
+    assert np.shape(second["arrays"]["south"]["covariance"]) == (6, 6)
+    assert run("calibrate", "poses", "--site", site, "--undo").code == 0
+    assert set(yaml.safe_load(written.read_text())["arrays"]) == {"north"}
+    assert run("calibrate", "refine", "--site", site, "--undo").code == 2
+    assert run("calibrate", "refine", "--undo").code == 2
+
+
+def test_eight_sounds_are_too_few_to_refine(run: Run, claps: Recorded) -> None:
+    done = run("calibrate", "refine", "--session", claps.directory)
+    assert done.code == 1
+    assert "expected 10 sounds or more that another array received, got 8; make 20 short sounds" in done.err
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,7 @@ class Ailing:
     sample_rate_hz = float(RATE_HZ)
     channels = 8
     problem: str | None = None
+    lost_blocks = 0
 
     def __enter__(self) -> Self:
         return self

@@ -121,6 +121,13 @@ def test_pages_in_both_directions_hold_what_a_plain_search_finds(
             if (before := page.older) is None:
                 break
         assert older == wanted
+        oldest_first, before = [], None
+        while True:
+            page = stored.page(replace(query, before=before, oldest_first=True))
+            oldest_first += [row.event for row in page.rows]
+            if (before := page.older) is None:
+                break
+        assert oldest_first == wanted[::-1]
         newer: list[JsonObject] = []
         after = Cursor(-1, 0)
         while (page := stored.page(replace(query, after=after))).rows:

@@ -32,7 +32,10 @@ def action(**keys: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("alerts", "fault"),
     [
-        ({"rules": {"door": {}}}, "alerts.rules.door: expected exactly one of events, arrays, findings; got none"),
+        (
+            {"rules": {"door": {}}},
+            "alerts.rules.door: expected exactly one of events, tracks, arrays, findings; got none",
+        ),
         ({"rules": {"door": {"events": {}, "arrays": {}}}}, "findings; got events, arrays"),
         ({"rulez": {}}, "alerts.rulez: unknown key 'rulez'; did you mean 'rules'?"),
         ({"rules": {"a/b": {"events": {}}}}, "alerts.rules.a/b: expected a name of 1 to 64 letters, digits"),

@@ -4,27 +4,42 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from livessl.cli import argument, progress
+from livessl.cli import argument, calibration_file, progress
+from livessl.cli.calibration_words import (
+    clap_line,
+    clap_object,
+    pose_line,
+    pose_object,
+    speed_line,
+    speed_object,
+)
 from livessl.cli.doctor import add_recordings, finding_line, recordings_given
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_json
-from livessl.cli.output import complain, print_warnings, xyz
-from livessl.clock import SystemClock, utc_text
+from livessl.cli.options import add_json, read_site
+from livessl.cli.output import complain, print_warnings
+from livessl.cli.server_answers import add_server
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
-    from livessl.calibration import Clap
-    from livessl.core.commission.resection import MeasuredPose
+    from livessl.calibration import Clap, HeardSound
+    from livessl.cli.server_sounds import ServerSounds
+    from livessl.core.commission.resection import MeasuredSetUp
+    from livessl.recordings.assign import AssignedRecording
     from livessl.site.models import Site
 
-LARGE_ERROR_M: Final = 0.3
-"""Error at a known place, in metres, from which `verify` fails even if nothing explains it."""
+WAIT_S: Final = 120.0
+"""Default of --wait: time to measure the next place and to walk there, seconds."""
+
+POSITION_STD_M: Final = 0.1
+"""Default of --position-std, metres."""
+
+REFINED_SOUNDS: Final = 20
+"""Default of --sounds."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -35,18 +50,19 @@ def add_arguments(parser: Any) -> None:
         sub = actions.add_parser(
             name,
             help=text,
-            description=text[0].upper() + text[1:] + ".",
+            description=f"{text[0].upper()}{text[1:]}. With a running server it asks for each clap: give its site file "
+            "by --site, or its address by --url. With a recording of the claps, give --session or --wav.",
             epilog=f"example: livessl calibrate {example}",
         )
         sub.set_defaults(act=act)
         add_recordings(sub)
+        add_server(sub, "it asks for each clap and waits for it")
         sub.add_argument(
-            "--at",
-            action="append",
-            type=argument.place,
-            required=True,
-            metavar="X,Y,Z",
-            help="place of a clap in metres; repeat for each, in the order in which they were made",
+            "--wait",
+            type=argument.above_zero,
+            default=WAIT_S,
+            metavar="S",
+            help=f"longest wait for each sound of a running server, seconds (default {WAIT_S:g})",
         )
         return sub
 
@@ -54,15 +70,17 @@ def add_arguments(parser: Any) -> None:
         "verify",
         _verify,
         "print the error at places that you know, and what explains it",
-        "verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
+        "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
+    _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
     add_json(sub, "print one JSON object for each clap and each finding")
     sub = action(
         "poses",
         _poses,
         "measure where the arrays are, by claps at places that you know",
-        "poses --session session/ --at 2,3,1.2 --at 6,8,1.2 … --write calibration/lab.yaml",
+        "poses --site site.yaml --at 2,3,1.2 --at 6,8,1.2 … --write",
     )
+    _add_places(sub, "place of a clap in metres; repeat for each. With a running server, places are proposed without")
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -70,153 +88,218 @@ def add_arguments(parser: Any) -> None:
         metavar="M",
         help="how exactly you know the places, standard deviation in metres (default 0.03)",
     )
-    sub.add_argument(
-        "--write",
-        type=Path,
-        metavar="FILE",
-        help="calibration file to write; name it in the site file as calibration: FILE",
+    calibration_file.add_file(sub)
+    add_json(sub, "print one JSON object for each clap, each array and the speed of sound")
+    sub = action(
+        "refine",
+        _refine,
+        "measure where the arrays are, by sounds at unknown places, with one array known",
+        "refine --site site.yaml --known north --write",
     )
-    sub.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
-    add_json(sub, "print one JSON object for each array")
+    sub.add_argument(
+        "--known",
+        action="append",
+        default=[],
+        metavar="ARRAY",
+        help="array that is where the site file says; repeatable (default: the first)",
+    )
+    sub.add_argument(
+        "--position-std",
+        type=argument.above_zero,
+        default=POSITION_STD_M,
+        metavar="M",
+        help="how exactly the site file's positions are known, standard deviation in metres "
+        f"(default {POSITION_STD_M:g}, a tape)",
+    )
+    sub.add_argument(
+        "--sounds",
+        type=argument.positive,
+        default=REFINED_SOUNDS,
+        metavar="N",
+        help=f"number of sounds to wait for with a running server (default {REFINED_SOUNDS})",
+    )
+    calibration_file.add_file(sub)
+    add_json(sub, "print one JSON object for each array and the speed of sound")
+
+
+def _add_places(parser: Any, text: str) -> None:
+    parser.add_argument("--at", action="append", type=argument.place, default=[], metavar="X,Y,Z", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.calibration import MOST_CLAPS
 
-    if len(arguments.at) > MOST_CLAPS:
+    if getattr(arguments, "undo", False):
+        return calibration_file.undo(arguments)
+    if len(getattr(arguments, "at", [])) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
     return int(arguments.act(arguments))
 
 
-def _claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
+def _is_live(arguments: argparse.Namespace) -> bool:
+    """Return whether a running server is meant: --url, or --site without recordings."""
+    recorded = bool(arguments.session or arguments.wav)
+    if arguments.url and recorded:
+        raise UseError(
+            "calibrate: expected a running server (--url) or recordings (--session, --wav); give one of them"
+        )
+    return bool(arguments.url) or (arguments.site is not None and not recorded)
+
+
+def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
+    """Return the site, and the sounds of the running server."""
+    from livessl.cli.server_sounds import ServerSounds
+
+    if arguments.site is None:
+        sounds = ServerSounds(arguments.url, arguments.token_file, arguments.wait)
+        return sounds.site(), sounds
+    site = read_site(arguments)
+    print_warnings(site)
+    http = site.server.http
+    host = "127.0.0.1" if http.host in ("0.0.0.0", "::") else http.host  # noqa: S104 - where the server listens
+    if arguments.url is None and http.port == 0:
+        raise UseError("calibrate: the site file leaves the server's port open; give its address as --url")
+    scheme = "http" if http.certificate is None else "https"
+    url = arguments.url or f"{scheme}://{f'[{host}]' if ':' in host else host}:{http.port}"
+    sounds = ServerSounds(url, arguments.token_file, arguments.wait)
+    mine, served = ({spec.name: len(spec.microphones_m) for spec in one.processed} for one in (site, sounds.site()))
+    if mine != served:
+        raise UseError(
+            f"--site: expected the site file that the server at {url} runs, with the arrays {_counted(served)}, got "
+            f"{_counted(mine)}; give that file, or --url alone"
+        )
+    return site, sounds
+
+
+def _counted(arrays: dict[str, int]) -> str:
+    return ", ".join(f"{name} ({count} microphones)" for name, count in arrays.items())
+
+
+def _recorded(arguments: argparse.Namespace) -> tuple[Site, list[HeardSound], Sequence[AssignedRecording]]:
+    """Return the site, the sounds in recordings, and the recordings."""
+    from livessl.calibration import sounds_of
+
+    site, parts, span = recordings_given(arguments, "calibrate", ", or --site FILE or --url for a running server")
+    print_warnings(site)
+    with progress.timed("locating", *span) as bar:
+        return site, sounds_of(site, parts, bar), parts
+
+
+def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
     import numpy as np
 
     from livessl.calibration import claps_of
 
-    site, parts, span = recordings_given(arguments, "calibrate")
-    print_warnings(site)
-    with progress.timed("locating", *span) as bar:
-        return site, claps_of(site, parts, np.array(arguments.at), bar)
+    _require_places(arguments)
+    site, sounds, _ = _recorded(arguments)
+    return site, claps_of(sounds, np.array(arguments.at))
+
+
+def _require_places(arguments: argparse.Namespace) -> None:
+    if not arguments.at:
+        raise UseError("calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres")
 
 
 def _verify(arguments: argparse.Namespace) -> int:
     from livessl.calibration import verified
-    from livessl.core.commission.finding import Severity
+    from livessl.core.commission.verification import SetUpVerdict, set_up_verdict
 
-    site, claps = _claps(arguments)
-    for clap in claps:
-        print(json.dumps(_clap_object(clap)) if arguments.json else _clap_line(clap), flush=True)
+    def show(clap: Clap) -> None:
+        print(json.dumps(clap_object(clap)) if arguments.json else clap_line(clap), flush=True)
+
+    _require_places(arguments)
+    if _is_live(arguments):
+        from livessl.cli.guided import claps_at
+
+        site, sounds = _server(arguments)
+        claps = claps_at(sounds, arguments.at, show)
+    else:
+        site, claps = _recorded_claps(arguments)
+        for clap in claps:
+            show(clap)
     findings = verified(site, claps)
     for finding in findings:
         print(json.dumps({"kind": "finding"} | asdict(finding)) if arguments.json else finding_line(finding))
-    errors_m = [math.inf if clap.error_m is None else clap.error_m for clap in claps]
-    is_wrong = any(finding.severity is Severity.ERROR for finding in findings)
-    if not is_wrong and max(errors_m) > LARGE_ERROR_M:
+    verdict = set_up_verdict(findings, [clap.error_m for clap in claps])
+    if verdict is SetUpVerdict.UNEXPLAINED:
         complain("nothing explains the errors; check that the places were measured from the corner that is the origin")
-        return FAILED
-    return FAILED if is_wrong else OK
-
-
-def _clap_object(clap: Clap) -> dict[str, Any]:
-    estimate = clap.event.estimate
-    return {
-        "kind": "clap",
-        "place_m": clap.place_m.tolist(),
-        "start_s": clap.event.start_ns / 1e9,
-        "position_m": None if estimate is None else estimate.position_m.tolist(),
-        "error_m": clap.error_m,
-        "status": str(clap.event.status),
-        "reason": clap.event.reason,
-    }
-
-
-def _clap_line(clap: Clap) -> str:
-    estimate = clap.event.estimate
-    found = xyz(None if estimate is None else estimate.position_m.tolist())
-    error = "not located" if clap.error_m is None else f"{clap.error_m:.2f} m off"
-    return f"{xyz(clap.place_m.tolist())}  found {found:<22}  {error}"
+    return OK if verdict is SetUpVerdict.OK else FAILED
 
 
 def _poses(arguments: argparse.Namespace) -> int:
-    if arguments.undo:
-        return _undo(arguments.write)
     from livessl.calibration import measured_poses
+
+    if _is_live(arguments):
+        from livessl.cli.guided import claps_for_poses
+
+        def show(clap: Clap) -> None:
+            print(json.dumps(clap_object(clap)) if arguments.json else clap_line(clap), flush=True)
+
+        site, sounds = _server(arguments)
+        claps = claps_for_poses(sounds, site, arguments.at, arguments.place_std, show)
+    else:
+        site, claps = _recorded_claps(arguments)
+    measured = measured_poses(site, claps, arguments.place_std)
+
+    def cure() -> str:
+        import numpy as np
+
+        from livessl.cli.guided import next_place
+
+        place_m = next_place(site, np.array([clap.place_m for clap in claps]), arguments.place_std)
+        where = "" if place_m is None else f", next at {', '.join(f'{x:.1f}' for x in place_m)}"
+        return f"clap at more places, on all its sides, near and far, high and low{where}"
+
+    return _told(arguments, site, measured, "poses", cure)
+
+
+def _refine(arguments: argparse.Namespace) -> int:
+    from livessl.calibration import refined
+
+    parts: Sequence[AssignedRecording] = ()
+    if _is_live(arguments):
+        site, server = _server(arguments)
+        sounds = _kept_and_new(server, arguments.sounds)
+    else:
+        site, sounds, parts = _recorded(arguments)
+    names = [spec.name for spec in site.processed]
+    stranger = next((name for name in arguments.known if name not in names), None)
+    if stranger is not None:
+        raise UseError(f"--known: expected an array of the site ({', '.join(names)}), got {stranger!r}")
+    known = arguments.known or names[:1]
+    if not arguments.known:
+        complain(f"{known[0]!r} is taken to be where the site file says; --known ARRAY names another", kind="note")
+    measured = refined(site, sounds, known, arguments.position_std, parts)
+    return _told(arguments, site, measured, "refine", lambda: "make more sounds, all over the room, near and far")
+
+
+def _kept_and_new(server: ServerSounds, count: int) -> list[HeardSound]:
+    """Return the sounds that the server keeps and, if they are too few, new ones as they come in."""
+    from livessl.cli.guided import ask_for, is_clear
+
+    sounds = [sound for sound in server.kept() if is_clear(sound)]
+    while len(sounds) < count:
+        prompt = f"clap anywhere, each time at another place ({len(sounds)} of {count})"
+        sounds.append(server.next_sound(partial(ask_for, prompt), "a sound", is_clear))
+    return sounds
+
+
+def _told(
+    arguments: argparse.Namespace, site: Site, measured: MeasuredSetUp, action: str, cure: Callable[[], str]
+) -> int:
+    """Print what was measured, store it if that is wanted, and return the exit code."""
     from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M
 
-    site, claps = _claps(arguments)
-    poses = measured_poses(site, claps, arguments.place_std)
-    for name, pose in poses.items():
-        print(json.dumps(_pose_object(name, pose)) if arguments.json else _pose_line(name, pose), flush=True)
-    doubtful = [name for name, pose in poses.items() if not pose.is_determined]
+    for name, pose in measured.poses.items():
+        print(json.dumps(pose_object(name, pose)) if arguments.json else pose_line(name, pose), flush=True)
+    print(json.dumps(speed_object(measured, site.c_m_s)) if arguments.json else speed_line(measured, site.c_m_s))
+    doubtful = [name for name, pose in measured.poses.items() if not pose.is_determined]
     for name in doubtful:
         complain(
-            f"array {name!r}: expected claps that determine its pose to {MOST_STD_M:g} m and {MOST_STD_DEG:g} degrees; "
-            "clap at more places, on all its sides, near and far, high and low"
+            f"array {name!r}: expected sounds that determine its pose to {MOST_STD_M:g} m and {MOST_STD_DEG:g} "
+            f"degrees; {cure()}"
         )
     if arguments.write is not None and not doubtful:
-        _write(arguments.write, site, len(claps), poses)
+        calibration_file.write(arguments, site, action, measured)
     return FAILED if doubtful else OK
-
-
-def _pose_object(name: str, pose: MeasuredPose) -> dict[str, Any]:
-    return {
-        "kind": "pose",
-        "array": name,
-        "microphones_m": pose.microphones_m.round(4).tolist(),
-        "shift_m": pose.shift_m.round(4).tolist(),
-        "turn_deg": [round(math.degrees(angle), 2) for angle in pose.turn.as_rotvec().tolist()],
-        "position_std_m": round(pose.position_std_m, 4),
-        "orientation_std_deg": round(pose.orientation_std_deg, 2),
-        "misfit_us": [round(1e6 * pose.misfit_before_s, 1), round(1e6 * pose.misfit_s, 1)],
-        "determined": pose.is_determined,
-    }
-
-
-def _pose_line(name: str, pose: MeasuredPose) -> str:
-    shift = ", ".join(f"{x:+.3f}" for x in pose.shift_m)
-    return (
-        f"{name}: shifted by ({shift}) m, turned by {math.degrees(pose.turn.magnitude()):.1f} degrees "
-        f"(known to {pose.position_std_m:.3f} m and {pose.orientation_std_deg:.1f} degrees), "
-        f"misfit {1e6 * pose.misfit_before_s:.0f} -> {1e6 * pose.misfit_s:.0f} us"
-    )
-
-
-def _write(path: Path, site: Site, sounds: int, poses: Mapping[str, MeasuredPose]) -> None:
-    """Write a calibration file, and keep the one that it replaces."""
-    import yaml
-
-    arrays = {
-        name: {
-            "microphones_m": pose.microphones_m.round(4).tolist(),
-            "position_std_m": round(pose.position_std_m, 4),
-            "orientation_std_deg": round(pose.orientation_std_deg, 2),
-            "misfit_us": [round(1e6 * pose.misfit_before_s, 1), round(1e6 * pose.misfit_s, 1)],
-        }
-        for name, pose in poses.items()
-    }
-    measured = {"measured_utc": utc_text(SystemClock().now_ns()), "sounds": sounds, "arrays": arrays}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            path.replace(_kept(path))
-        path.write_text(yaml.safe_dump(measured, sort_keys=False, default_flow_style=None), encoding="utf-8")
-    except OSError as error:
-        raise UseError(f"--write: cannot write {path}: {error.strerror}") from error
-    named = site.calibration is not None and site.file(site.calibration).resolve() == path.resolve()
-    hint = "" if named else "; name it in the site file as calibration: FILE, relative to the site file"
-    complain(f"written to {path}{hint}", kind="note")
-
-
-def _undo(path: Path | None) -> int:
-    if path is None:
-        raise UseError("--undo: expected --write FILE, the calibration file to put back")
-    if not _kept(path).exists():
-        raise UseError(f"--undo: expected {_kept(path)}, the file that --write has replaced; there is none")
-    _kept(path).replace(path)
-    complain(f"{path} is as it was before", kind="note")
-    return OK
-
-
-def _kept(path: Path) -> Path:
-    return path.with_suffix(path.suffix + ".before")

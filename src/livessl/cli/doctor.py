@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import urllib.error
-import urllib.request
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.errors import RunError, UseError
+from livessl.cli.server_answers import add_server, ask
+from livessl.errors import UseError
 
 if TYPE_CHECKING:
     from livessl.core.commission.finding import Finding
@@ -22,19 +21,11 @@ if TYPE_CHECKING:
     from livessl.recordings.assign import AssignedRecording
     from livessl.site.models import Site
 
-ANSWER_S: Final = 10.0
-"""Longest wait for a server's answer, seconds."""
-
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_recordings(parser)
-    parser.add_argument(
-        "--url", help="running server to ask, such as http://127.0.0.1:8000; it examines its last sounds"
-    )
-    parser.add_argument(
-        "--token-file", type=Path, metavar="FILE", help="file that holds a token for the server, where it wants one"
-    )
+    add_server(parser, "it examines its last sounds")
     add_json(parser, "print one JSON object per finding")
 
 
@@ -82,25 +73,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
     from livessl.core.commission.finding import Finding, Severity
     from livessl.examination import Examination
 
-    address = f"{url.rstrip('/')}/api/v1/findings"
-    if not address.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
-    headers = {}
-    if token_file is not None:
-        try:
-            headers["Authorization"] = f"Bearer {token_file.read_text(encoding='utf-8').strip()}"
-        except OSError as error:
-            raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
-    request = urllib.request.Request(address, headers=headers)  # noqa: S310 - the address begins with http
-    try:
-        with urllib.request.urlopen(request, timeout=ANSWER_S) as response:  # noqa: S310
-            answer = json.load(response)
-    except urllib.error.HTTPError as error:
-        cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
-        raise RunError(f"{address}: the server answered {error.code} {error.reason}{cure}") from error
-    except (OSError, ValueError) as error:
-        why = getattr(error, "reason", error)
-        raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
+    answer = ask(url, "findings", token_file)
     for finding in answer["findings"]:
         del finding["kind"]
         finding["severity"] = Severity(finding["severity"])

@@ -19,11 +19,14 @@ from livessl.cli.options import add_json
 from livessl.cli.output import complain
 from livessl.lab.evaluate.layout import layout_of
 from livessl.lab.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
-from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
+from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, NOISE, ROOMS, SCENARIOS, SESSION_SNR_DB, SESSIONS
 from livessl.site.load import load_site
 
 REPORT: Final = "report"
 """Name of the experiment that simulates nothing and reports the results of earlier ones."""
+
+ALONE: Final = (NOISE, *SESSIONS)
+"""Scenarios of the localizer that are campaigns of their own."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -85,7 +88,7 @@ def _add_comparison(group: Any) -> None:
         default=ROOMS,
         metavar="NAME[,NAME…]",
         help=f"one or more of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); "
-        f"or one of {', '.join(SESSIONS)} alone",
+        f"or one of {', '.join(ALONE)} alone",
     )
 
 
@@ -191,6 +194,8 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int
     from livessl.lab.evaluate.campaign import run_campaign
     from livessl.lab.evaluate.job import Job, read_clips
     from livessl.lab.evaluate.localizer_report import write_localizer_report
+    from livessl.lab.evaluate.noise import NoiseSettings
+    from livessl.lab.evaluate.noise_report import write_noise_report
     from livessl.lab.evaluate.sessions import SessionSettings
     from livessl.lab.evaluate.sessions_report import write_sessions_report
 
@@ -199,18 +204,28 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     job = Job(settings, clips)
     results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
-    write = write_sessions_report if isinstance(settings, SessionSettings) else write_localizer_report
+    reports = {SessionSettings: write_sessions_report, NoiseSettings: write_noise_report}
+    write = reports.get(type(settings), write_localizer_report)
     return [results, *write(arguments.out)]
 
 
 def _localizer_settings(arguments: argparse.Namespace) -> Any:
     """Return the settings of the experiment that compares methods, in rooms or in sessions."""
-    from livessl.lab.evaluate import localizer, sessions
+    from livessl.lab.evaluate import localizer, noise, sessions
 
     names = _scenarios(arguments.scenario)
     rt60s_s = None if arguments.rt is None else reverberation_times_s(arguments.rt)
     snrs_db = None if arguments.snr is None else levels_db(arguments.snr)
     common = {"seed": arguments.seed, "sample_rate_hz": float(arguments.sample_rate), "half": arguments.half}
+    if names[0] == NOISE:
+        if rt60s_s is not None:
+            raise ValueError(f"--rt: the rooms of {NOISE} have reverberation times of their own; remove --rt")
+        return noise.NoiseSettings(
+            positions=arguments.positions or noise.POSITIONS,
+            snrs_db=snrs_db or noise.SNRS_DB,
+            spacing_m=arguments.grid or localizer.SPACING_M,
+            **common,
+        )
     if names[0] in SESSIONS:
         return sessions.SessionSettings(
             positions=arguments.positions or sessions.POSITIONS,
@@ -279,11 +294,11 @@ def _one_level_db(text: str | None) -> float | None:
 
 def _scenarios(text: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    unknown = [name for name in names if name not in SCENARIOS and name not in SESSIONS]
+    unknown = [name for name in names if name not in SCENARIOS and name not in ALONE]
     if unknown:
-        known = ", ".join([*SCENARIOS, *SESSIONS])
+        known = ", ".join([*SCENARIOS, *ALONE])
         raise ValueError(f"--scenario: expected some of {known}, got {', '.join(unknown)}")
-    if len(names) > 1 and any(name in SESSIONS for name in names):
-        alone = " and ".join(name for name in names if name in SESSIONS)
-        raise ValueError(f"--scenario: {alone}: each of {', '.join(SESSIONS)} is run alone, got {', '.join(names)}")
+    if len(names) > 1 and any(name in ALONE for name in names):
+        alone = " and ".join(name for name in names if name in ALONE)
+        raise ValueError(f"--scenario: {alone}: each of {', '.join(ALONE)} is run alone, got {', '.join(names)}")
     return names

@@ -17,6 +17,7 @@ from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.service import Clips
 from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
@@ -34,7 +35,11 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.zones.book import ZoneBook
+from livessl.server.zones.presence import Presence
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
+from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
 
 SWITCH_S: Final = 0.0005
@@ -73,8 +78,8 @@ def assemble(
 
     Raises
     ------
-    BindError, ConfigError
-        See `Receiver` and `Alerts`.
+    BindError, ConfigError, ClipsError
+        See `Receiver`, `Alerts` and `Clips`.
     """
 
     def publish_event(event: JsonObject) -> None:
@@ -88,17 +93,35 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
-        latency, maps, tracks = Latency(clock, receiver.arrivals), Maps(clock), Tracks()
+        zone_book = ZoneBook(site, publish)
+
+        def zones() -> ZoneMap:
+            return zone_book.current
+
+        latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
         overload = Overload(clock)
         set_up_watch = SetUpWatch(site, overload)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
         undo.callback(alerts.stop)
+
+        def publish_change(change: JsonObject, time_ns: int) -> None:
+            if not site_time.is_replay:
+                alerts.take_change(change, time_ns)
+            publish(change)
+
+        presence = Presence(zones, publish_change)
+        tracks = Tracks(presence)
+        kept = site.server.clips
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch
+            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
-        engine = Engine(site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload)
+        engine = Engine(
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, clips
+        )
+        floor_plan = read_floor_plan(site)
         undo.pop_all()
     return Parts(
         site=site,
@@ -110,6 +133,7 @@ def assemble(
         array_states=array_states,
         event_log=event_log,
         alerts=alerts,
+        clips=clips,
         tracks=tracks,
         maps=maps,
         latency=latency,
@@ -118,6 +142,9 @@ def assemble(
         store=store,
         sinks=sinks,
         fanout=fanout,
+        zone_book=zone_book,
+        presence=presence,
+        floor_plan=floor_plan,
     )
 
 
@@ -143,8 +170,8 @@ class Server:
         If an address is taken.
     ConfigError
         If the server would be open to the network, or keys, tokens or certificate cannot be used.
-    StoreError, SinkError, OutboxError
-        If the event database, a sink or the outbox of the alerts cannot be used.
+    StoreError, SinkError, OutboxError, ClipsError
+        If the event database, a sink, the outbox of the alerts or the folder of clips cannot be used.
     """
 
     def __init__(
@@ -208,6 +235,8 @@ class Server:
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
             self.parts.alerts.stop()
+            if self.parts.clips is not None:
+                self.parts.clips.stop()
             self.parts.receiver.stop()
             self.parts.store.close()
             self.parts.sinks.close()
@@ -229,6 +258,8 @@ class Server:
         self.parts.maps.start()
         self.parts.set_up_watch.start()
         self.parts.alerts.start()
+        if self.parts.clips is not None:
+            self.parts.clips.start()
         if not self._stepped:
             self.parts.store.backlog.start()
             self.parts.engine.start()

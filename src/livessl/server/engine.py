@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -19,6 +20,7 @@ from livessl.server.publisher import Publisher
 from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
@@ -44,6 +46,10 @@ class Engine:
     maps : Maps
     publisher : Publisher
     overload : Overload
+    zones : callable
+        Returns the zones that are in force.
+    clips : Clips or None
+        Gets every frame, for what is kept of events.
     """
 
     def __init__(
@@ -57,6 +63,8 @@ class Engine:
         maps: Maps,
         publisher: Publisher,
         overload: Overload,
+        zones: Callable[[], ZoneMap],
+        clips: Clips | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
@@ -67,6 +75,8 @@ class Engine:
         self._maps = maps
         self._publisher = publisher
         self._overload = overload
+        self._zones = zones
+        self._clips = clips
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -198,9 +208,11 @@ class Engine:
                 return
             recorded_ns = min(message.frame_index for message in batch) * FRAME_NS
             origin_ns = recorded_ns if self._site_time.is_replay else self._site_time.started_ns
-            run.begin(origin_ns)
+            run.begin(origin_ns, self._zones)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
+        if self._clips is not None:
+            self._clips.take(batch, run.fusion.settled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

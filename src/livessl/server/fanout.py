@@ -92,7 +92,11 @@ class Numbered:
     def subject(self) -> Hashable | None:
         """The subject whose state this is; a later message on it replaces this one. None for what stays."""
         kind = self.message["kind"]
-        return None if kind in ("event", "alert") else (kind, self.message.get("event_id") or self.message.get("id"))
+        return (
+            None
+            if kind in ("event", "alert", "zone")
+            else (kind, self.message.get("event_id") or self.message.get("id"))
+        )
 
 
 @dataclass(slots=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from livessl.clock import Clock
 from livessl.server.alerts.service import Alerts
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
@@ -20,6 +21,9 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.zones.book import ZoneBook
+from livessl.server.zones.presence import Presence
+from livessl.site.floor_plan import FloorPicture
 from livessl.site.models import Site
 
 
@@ -36,6 +40,7 @@ class Parts:
     array_states: ArrayStates
     event_log: EventLog
     alerts: Alerts
+    clips: Clips | None
     tracks: Tracks
     maps: Maps
     latency: Latency
@@ -44,9 +49,13 @@ class Parts:
     store: Store
     sinks: Sinks
     fanout: Fanout
+    zone_book: ZoneBook
+    presence: Presence
+    floor_plan: FloorPicture | None
 
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        threads = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.store.backlog)
-        return next((thread.failure for thread in threads if thread.failure is not None), None)
+        parts = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips, self.store.backlog)
+        failures = (thread.failure for thread in parts if thread is not None)
+        return next((failure for failure in failures if failure is not None), None)

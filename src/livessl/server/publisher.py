@@ -8,6 +8,7 @@ from typing import assert_never
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import BackfillRequest, Event, Output, Track, Update, Window
 from livessl.server.api.encode import JsonObject
+from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -36,6 +37,8 @@ class Publisher:
         Knows whether maps are drawn.
     set_up_watch : SetUpWatch
         Examines the set-up with the final events.
+    clips : Clips or None
+        Keeps the sound of the final events.
     """
 
     def __init__(
@@ -49,6 +52,7 @@ class Publisher:
         latency: Latency,
         overload: Overload,
         set_up_watch: SetUpWatch,
+        clips: Clips | None = None,
     ) -> None:
         self._publish = publish
         self._request = request
@@ -59,6 +63,7 @@ class Publisher:
         self._latency = latency
         self._overload = overload
         self._set_up_watch = set_up_watch
+        self._clips = clips
 
     def publish(self, outputs: Iterable[Output | FinalResults], run: Run) -> None:
         """Publish what one step of a run has found; a run that has not received anything finds nothing."""
@@ -71,6 +76,8 @@ class Publisher:
                     self._event_log.add_final(output, messages, run.clock_offsets.state())
                     for event in output.events:
                         self._set_up_watch.take(event)
+                        if self._clips is not None:
+                            self._clips.take_final(event, run.clock_offsets)
                 case Event():
                     self._event_log.add_early(output, messages)
                 case Update():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from livessl.core.stream.clock_offsets import ClockOffsets
@@ -10,6 +10,7 @@ from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import Messages
 from livessl.server.store import Finalized
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.build.fusion import make_clock_offsets, make_two_pass_fusion
 from livessl.site.models import Site
 
@@ -33,9 +34,9 @@ class Run:
     clock_offsets: ClockOffsets
     messages: Messages | None = None
 
-    def begin(self, origin_ns: int) -> None:
+    def begin(self, origin_ns: int, zones: Callable[[], ZoneMap]) -> None:
         """Start to encode messages, with their `start_s` counted from `origin_ns` of site time."""
-        self.messages = Messages(self.site, origin_ns, utc=True)
+        self.messages = Messages(self.site, origin_ns, utc=True, zones=zones)
 
 
 def live_run(site: Site, done: Finalized, for_each: ForEach) -> Run:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
 from livessl.core.commission.steady import SteadyFindings
-from livessl.core.types import Event, Observation, Received
+from livessl.core.types import Event, Observation
+from livessl.server.heard_sounds import HeardSounds
 from livessl.server.overload import Overload
 from livessl.site.build.layout import layout_findings
 from livessl.site.models import Site
@@ -64,7 +64,9 @@ class SetUpWatch:
         self._site = site
         self._overload = overload
         self._lock = threading.Lock()
-        self._new: deque[Sequence[Received]] = deque(maxlen=KEPT_SOUNDS)
+        self.heard = HeardSounds()
+        """The last sounds, for whoever calibrates."""
+        self._examined = 0  # number of the last sound that was examined
         self._sounds: Sequence[Sequence[Observation]] = ()
         self._unjudged = 0  # sounds since findings were last looked for
         self._run = 0  # number of times that all sounds were forgotten
@@ -86,8 +88,7 @@ class SetUpWatch:
     def take(self, event: Event) -> None:
         """Take in a final event."""
         if event.source == 1 and len(event.received) > 0:
-            with self._lock:
-                self._new.append(event.received)
+            self.heard.take(event)
 
     def note_reports(self, findings: Sequence[Finding]) -> None:
         """Take in what the reports of the nodes show now; new faults are logged."""
@@ -98,8 +99,8 @@ class SetUpWatch:
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
+        self.heard.forget()
         with self._lock:
-            self._new.clear()
             self._sounds, self._unjudged = (), 0
             self._run += 1
             self._steady = SteadyFindings()
@@ -119,14 +120,15 @@ class SetUpWatch:
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
-            new, known, run = list(self._new), list(self._sounds), self._run
-            self._new.clear()
+            known, run = list(self._sounds), self._run
+        new = self.heard.after(self._examined)
         if not new:
             return
-        from livessl.core.commission.observe import observe  # scipy's optimizer takes memory, and no event needs it
+        # imported late: scipy's optimizer takes memory, and no event needs it
         from livessl.site.build.set_up import find_set_up_faults
 
-        sounds = [*known, *(observe(received) for received in new)][-KEPT_SOUNDS:]
+        self._examined = new[-1].number
+        sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
         findings = find_set_up_faults(self._site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
             if run != self._run:

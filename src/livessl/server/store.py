@@ -18,7 +18,7 @@ from livessl.server.history.database import CURE, Database, StoreError
 from livessl.server.history.heat_map import Cells, HeatMap, count_by_cell
 from livessl.server.history.query import Cursor, Page, Query, Row
 from livessl.server.history.search import page_statement
-from livessl.server.history.tables import disabled, early, events, progress
+from livessl.server.history.tables import disabled, events, progress
 from livessl.site.history_place import history_place
 from livessl.site.models import Site
 
@@ -196,9 +196,9 @@ class Store:
     def early_events(self) -> list[tuple[int, JsonObject]]:
         """Return the events that are still early, oldest first, each with its start in nanoseconds of site time."""
         self.backlog.settle()
-        query = select(events.c.time_ns, events.c.body).join(early, early.c.id == events.c.id)
+        query = select(events.c.time_ns, events.c.body).order_by(events.c.time_ns)
         with self._database.reading() as connection:
-            rows = connection.execute(query.order_by(events.c.time_ns)).all()
+            rows = connection.execute(query.where(events.c.id.in_(records.early_ids(connection)))).all()
         return [(time_ns, orjson.loads(body)) for time_ns, body in rows]
 
     def expire(self, before_ns: int) -> int:
@@ -235,7 +235,7 @@ class Store:
         return Page(rows, rows[-1].cursor if has_more else None, rows[0].cursor if rows else None)
 
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
-        """Return events, newest first by their start, and the cursor of the next page or None."""
+        """Return events, newest first unless the query says otherwise, and the cursor of the next page or None."""
         page = self.page(query)
         return [row.event for row in page.rows], page.older
 

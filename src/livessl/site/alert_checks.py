@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from livessl.site.alert_models import AlertRule
 from livessl.site.findings import unknown_array
 from livessl.site.history_place import history_place
 from livessl.site.models import Site
@@ -38,13 +39,7 @@ def alert_faults(site: Site) -> Iterator[Finding]:
     processed = [spec.name for spec in site.processed]
     for name, rule in site.alerts.rules.items():
         here: Place = ("alerts", "rules", name)
-        for zone in () if rule.events is None else rule.events.zones:
-            if zone not in site.zones:
-                yield (
-                    (*here, "events", "zones"),
-                    f"expected one of the zones {', '.join(site.zones) or '(there are none)'}, got {zone!r}; correct "
-                    "the name or add the zone",
-                )
+        yield from (((*here, rule.kind, "zones"), what) for what in _zone_faults(site, rule))
         for array in () if rule.arrays is None else rule.arrays.names:
             if array not in processed:
                 yield (*here, "arrays", "names"), unknown_array(array, processed)
@@ -58,6 +53,21 @@ def alert_faults(site: Site) -> Iterator[Finding]:
         twice = next((action for action in rule.actions if rule.actions.count(action) > 1), None)
         if twice is not None:
             yield (*here, "actions"), f"expected each action once, got {twice!r} twice; remove one"
+
+
+def _zone_faults(site: Site, rule: AlertRule) -> Iterator[str]:
+    zones = site.all_zones
+    for name in rule.zones:
+        zone = zones.get(name)
+        if zone is None:
+            yield (
+                f"expected one of the zones {', '.join(zones) or '(there are none)'}, got {name!r}; correct the name "
+                "or add the zone"
+            )
+        elif zone.exclude:
+            yield f"zone {name!r} is excluded, and nothing there alerts; remove it, or its exclude"
+        elif rule.tracks is not None and "loiter" in rule.tracks.changes and zone.loiter_s is None:
+            yield f"zone {name!r} does not say how long loitering is; add loiter_s to it"
 
 
 def alert_warnings(site: Site) -> Iterator[str]:

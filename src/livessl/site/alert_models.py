@@ -96,6 +96,13 @@ class EventCondition(Model):
         return self
 
 
+class TrackCondition(Model):
+    """Which changes of tracks alert: what a track does in one of the zones."""
+
+    zones: Annotated[tuple[str, ...], AfterValidator(_not_empty)]
+    changes: Annotated[tuple[Literal["enter", "leave", "loiter"], ...], AfterValidator(_not_empty)] = ("enter",)
+
+
 class ArrayCondition(Model):
     """Which conditions of which arrays alert; no names stand for all arrays."""
 
@@ -118,6 +125,7 @@ class AlertRule(Model):
     """When to alert, and which actions to take."""
 
     events: EventCondition | None = None
+    tracks: TrackCondition | None = None
     arrays: ArrayCondition | None = None
     findings: FindingCondition | None = None
     schedule: tuple[ScheduleSpan, ...] = ()
@@ -127,15 +135,23 @@ class AlertRule(Model):
 
     @model_validator(mode="after")
     def _one(self) -> AlertRule:
-        _exactly_one(self, ("events", "arrays", "findings"))
+        _exactly_one(self, ("events", "tracks", "arrays", "findings"))
         return self
 
     @property
-    def kind(self) -> Literal["events", "arrays", "findings"]:
+    def kind(self) -> Literal["events", "tracks", "arrays", "findings"]:
         """Key of what the rule watches."""
         if self.events is not None:
             return "events"
+        if self.tracks is not None:
+            return "tracks"
         return "arrays" if self.arrays is not None else "findings"
+
+    @property
+    def zones(self) -> tuple[str, ...]:
+        """Names of the zones that the rule watches."""
+        condition = self.events or self.tracks
+        return () if condition is None else condition.zones
 
 
 class WebhookConfig(Model):

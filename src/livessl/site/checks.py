@@ -25,12 +25,15 @@ from livessl.site.guesses import box_cure, position_cure, rate_cure, unlikely
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 from livessl.site.place import Finding, Place
+from livessl.site.zone_models import Zone
 
 COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
 
 SAMPLED_GRID_POINTS: Final = 500
 """Approximate number of grid points at which `wide_arrays` compares the grid with an array: enough for a median."""
+
+BAD_NAME: Final = "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -51,9 +54,12 @@ def cross_faults(site: Site) -> Iterator[Finding]:
             f"expected at most the number of arrays, {count}{' (joint ones are one)' if site.joint else ''}, "
             f"got {site.fusion.min_arrays}",
         )
-    boxes = {("zones", name, "bounds_m"): zone.bounds_m for name, zone in site.zones.items()}
-    for place, bounds in ((("grid", "bounds_m"), site.grid.bounds_m), *boxes.items()):
-        yield from ((place, what) for what in _outside(site, bounds))
+    yield from ((("grid", "bounds_m"), what) for what in _outside(site, site.grid.bounds_m))
+    for name, zone in site.zones.items():
+        yield from zone_faults(site, name, zone)
+    for name in site.drawn_zones:
+        if name in site.zones:
+            yield ("zones", name), f"{site.zones_file} has a drawn zone of the same name; rename one of them"
     for spec in site.specs:
         yield from ((("arrays", spec.name), what) for what in _array_faults(site, spec))
     for one, other in combinations(site.specs, 2):
@@ -62,6 +68,19 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
     yield from alert_faults(site)
+    if site.privacy == "positions-only" and site.server.clips is not None:
+        yield (
+            ("server", "clips"),
+            "with privacy: positions-only no sound may be stored on a disk; remove it, or set privacy: recording",
+        )
+
+
+def zone_faults(site: Site, name: str, zone: Zone) -> Iterator[Finding]:
+    """Yield faults of a zone that only show beside its name and the room."""
+    if not _NAME.fullmatch(name):
+        yield ("zones", name), BAD_NAME
+    key = "bounds_m" if zone.polygon_m is None else "polygon_m"
+    yield from ((("zones", name, key), what) for what in _outside(site, zone.box_m(site.room.size_m[2])))
 
 
 def warnings_of(site: Site) -> tuple[str, ...]:
@@ -101,10 +120,10 @@ def unprotected_addresses(site: Site) -> list[Fault]:
 
 
 def _name_faults(site: Site) -> Iterator[Finding]:
-    for kind, names in (("arrays", site.arrays), ("joint", site.joint), ("nodes", site.nodes), ("zones", site.zones)):
+    for kind, names in (("arrays", site.arrays), ("joint", site.joint), ("nodes", site.nodes)):
         for name in names:
             if not _NAME.fullmatch(name):
-                yield (kind, name), "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
+                yield (kind, name), BAD_NAME
             elif name == "fused" and kind in ("arrays", "joint"):
                 yield (kind, name), "expected another name: 'fused' is the map of all arrays together; rename it"
 

@@ -17,6 +17,20 @@ FileName = Annotated[str, Field(min_length=1)]
 """Path of a file or folder; `Site.file` resolves it from the site file's folder."""
 
 
+def ordered(bounds: Bounds) -> Bounds:
+    """Return bounds whose lower ends are not above the upper ones.
+
+    Raises
+    ------
+    ValueError
+        If they are not.
+    """
+    for axis, (low, high) in zip("xyz", bounds, strict=True):
+        if low > high:
+            raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
+    return bounds
+
+
 class Model(BaseModel):
     """Base of all models of the site file: frozen, and without unknown keys."""
 

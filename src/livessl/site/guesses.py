@@ -192,7 +192,7 @@ def _lengths(site: Site) -> Iterator[str]:
             f"grid.spacing_m: grid points {spacing_m:g} m apart are unlikely; did you mean "
             f"{spacing_m / per_metre:g}, from {unit}?"
         )
-    boxes = {f"zones.{name}": zone.bounds_m for name, zone in site.zones.items()}
+    boxes = {f"zones.{name}": zone.box_m(size_m[2]) for name, zone in site.zones.items() if zone.bounds_m is not None}
     if site.grid.bounds_m is not None:
         boxes["grid"] = site.grid.bounds_m
     for key, bounds_m in boxes.items():

@@ -22,9 +22,11 @@ from livessl.site.findings import (
     validation_findings,
     value_of,
 )
+from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site, SiteFile
 from livessl.site.place import Finding, Place
 from livessl.site.slips import quote_keys
+from livessl.site.zones_file import read_zones
 
 
 def load_site(path: Path | str, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
@@ -113,6 +115,15 @@ def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, lis
     if file is None or not file.arrays:
         return None, findings
     site, faults = build_site(file, directory)
+    if file.zones_file is not None:
+        try:
+            site = site.model_copy(update={"drawn_zones": read_zones(directory / file.zones_file)})
+        except ConfigError as error:
+            findings.append((("zones_file",), "; ".join(str(fault) for fault in error.faults)))
+    try:
+        read_floor_plan(site)
+    except ConfigError as error:
+        findings += [(("floor_plan", "image"), fault.what) for fault in error.faults]
     faulty = set(data["arrays"]) - set(file.arrays)
     findings += [finding for finding in (*faults, *cross_faults(site)) if not _follows_from(faulty, finding[0])]
     return site, findings

@@ -18,22 +18,16 @@ from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, Uncertainty
 from livessl.site.alert_models import AlertsConfig
-from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive
+from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive, ordered
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
+from livessl.site.zone_models import FloorPlan, Zone
 
 _ACTIVITY: Final = ActivityParameters()
 _FUSION: Final = FusionParameters()
 _UNCERTAINTY: Final = Uncertainty()
 
 MicrophonesM = Annotated[list[Position], Field(min_length=MIN_MICROPHONES, max_length=MAX_MICROPHONES)]
-
-
-def _ordered(bounds: Bounds) -> Bounds:
-    for axis, (low, high) in zip("xyz", bounds, strict=True):
-        if low > high:
-            raise ValueError(f"expected lower <= upper on {axis}, got [{low:g}, {high:g}]; swap them")
-    return bounds
 
 
 def _celsius(temperature_c: float) -> float:
@@ -67,7 +61,7 @@ class GridConfig(Model):
     @field_validator("bounds_m")
     @classmethod
     def _ordered(cls, bounds: Bounds | None) -> Bounds | None:
-        return None if bounds is None else _ordered(bounds)
+        return None if bounds is None else ordered(bounds)
 
 
 class Tetrahedron(Model):
@@ -120,12 +114,15 @@ class CalibratedArray(Model):
     position_std_m: Annotated[float, Field(ge=0)] = 0.0
     orientation_std_deg: Annotated[float, Field(ge=0)] = 0.0
     misfit_us: list[Annotated[float, Field(ge=0)]] = Field(default_factory=list)
+    covariance: list[list[float]] = Field(default_factory=list)
 
 
 class CalibrationFile(Model):
     """A file that `livessl calibrate` writes: it takes the place of the site file's positions of these arrays."""
 
     measured_utc: str = ""
+    method: str = ""
+    speed_of_sound_m_s: Annotated[float, Field(ge=0)] = 0.0
     sounds: Annotated[int, Field(ge=0)] = 0
     arrays: Annotated[dict[str, CalibratedArray], Field(min_length=1)]
 
@@ -206,21 +203,6 @@ class FusionConfig(Model):
     live_sources: Annotated[int, Field(ge=1, le=2)] = _FUSION.live_sources
 
 
-class Zone(Model):
-    """A named box of interest."""
-
-    bounds_m: Bounds
-
-    @field_validator("bounds_m")
-    @classmethod
-    def _ordered(cls, bounds: Bounds) -> Bounds:
-        return _ordered(bounds)
-
-    def contains(self, position_m: Sequence[float]) -> bool:
-        """Return True if a position lies inside the box or on its surface."""
-        return all(low <= x <= high for x, (low, high) in zip(position_m, self.bounds_m, strict=True))
-
-
 class SiteFile(Model):
     """A whole site file, as it is written.
 
@@ -246,6 +228,8 @@ class SiteFile(Model):
     activity: ActivityConfig = ActivityConfig()
     fusion: FusionConfig = FusionConfig()
     zones: dict[str, Zone] = Field(default_factory=dict)
+    zones_file: FileName | None = None
+    floor_plan: FloorPlan | None = None
     alerts: AlertsConfig = AlertsConfig()
 
     @field_validator("*", mode="wrap")
@@ -276,10 +260,6 @@ class SiteFile(Model):
         first = self.members(array)[0]
         return next((name for name, node in self.nodes.items() if first in node.arrays), None)
 
-    def zones_of(self, position_m: Sequence[float] | None) -> list[str]:
-        """Return the names of the zones that hold a position."""
-        return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
-
 
 class Site(SiteFile):
     """A site file with the values that were built from it; `livessl.site.load` makes it.
@@ -296,6 +276,8 @@ class Site(SiteFile):
         The arrays as they are processed: a joint array takes the place of its members.
     warnings : tuple of str
         Settings that are valid but unlikely to work.
+    drawn_zones : mapping of str to Zone
+        The zones of `zones_file`, as it was when the site file was read.
     """
 
     directory: Annotated[Path, Field(exclude=True)]
@@ -303,8 +285,20 @@ class Site(SiteFile):
     specs: Annotated[tuple[ArraySpec, ...], Field(exclude=True)]
     processed: Annotated[tuple[ArraySpec, ...], Field(exclude=True)]
     warnings: Annotated[tuple[str, ...], Field(exclude=True)] = ()
+    drawn_zones: Annotated[Mapping[str, Zone], Field(exclude=True)] = Field(default_factory=dict)
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    def zones_of(self, position_m: Sequence[float] | None) -> list[str]:
+        """Return the names of the zones that hold a position."""
+        return (
+            [] if position_m is None else [name for name, zone in self.all_zones.items() if zone.contains(position_m)]
+        )
+
+    @property
+    def all_zones(self) -> dict[str, Zone]:
+        """The zones of the site file, and those that operators have drawn."""
+        return {**self.zones, **self.drawn_zones}
 
     def file(self, name: str) -> Path:
         """Return the path of a file or folder that the site file names, relative to the site file's folder."""

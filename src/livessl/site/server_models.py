@@ -61,6 +61,17 @@ class SinkConfig(Model):
     path: FileName
 
 
+class ClipsConfig(Model):
+    """What is kept of the sound of located events."""
+
+    folder: FileName
+    pre_s: Annotated[float, Field(ge=0, le=5)] = 1.0
+    post_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    max_age_days: Positive | None = 30.0
+    max_bytes: Annotated[int, Field(ge=1_000_000)] = 10_000_000_000
+    enhanced: bool = True
+
+
 class ServerConfig(Model):
     """The fusion server."""
 
@@ -68,6 +79,7 @@ class ServerConfig(Model):
     http: HttpConfig = HttpConfig()
     events_db: Annotated[str | None, AfterValidator(check_history_place)] = None
     sinks: tuple[SinkConfig, ...] = ()
+    clips: ClipsConfig | None = None
 
     @field_validator("bind")
     @classmethod

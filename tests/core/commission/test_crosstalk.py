@@ -78,7 +78,7 @@ def test_channel_that_receives_all_others_is_named_alone() -> None:
     samples[1] += np.float32(0.1) * samples[[0, 2, 3]].sum(axis=0)
     (found,) = faults_of(samples)
     assert found.channel == 2
-    assert "channels 1 and 3 and 4" in found.message
+    assert "channels 1, 3 and 4 leak" in found.message
 
 
 def test_same_signal_is_another_fault() -> None:
@@ -89,7 +89,7 @@ def test_same_signal_is_another_fault() -> None:
 
 def test_a_fan_in_the_middle_between_two_microphones_is_no_crosstalk() -> None:
     samples = recording(7)
-    samples[2:] += (2e-3 * np.random.default_rng(8).standard_normal(samples.shape[1])).astype(np.float32)
+    samples[2:] += np.float32(2e-3) * np.random.default_rng(8).standard_normal(samples.shape[1], dtype=np.float32)
     assert faults_of(samples) == []
 
 

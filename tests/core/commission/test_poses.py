@@ -11,7 +11,7 @@ from set_ups import BOUNDS_M, C_M_S, delays_of, set_up, sources
 
 from livessl.core.commission.places import PlaceSearch
 from livessl.core.commission.poses import Freedom, adjust
-from livessl.core.commission.resection import from_known_places, measure_pose
+from livessl.core.commission.resection import from_known_places, measure_pose, measure_poses
 from livessl.core.types import FloatArray
 
 few = settings(deadline=None, max_examples=3)
@@ -84,3 +84,20 @@ def test_a_line_of_microphones_has_no_direction_to_begin_with() -> None:
     rng = np.random.default_rng(4)
     line_m = np.column_stack([np.linspace(0.0, 0.3, 4), np.zeros(4), np.zeros(4)])
     assert from_known_places(line_m, np.zeros((5, 4)), sources(rng, 5)) is None
+
+
+@few
+@given(seed=st.integers(0, 10_000))
+def test_claps_tell_the_poses_of_all_arrays_and_the_speed_of_sound(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = set_up(rng, 3)
+    places_m = sources(rng, 8)
+    delays = delays_of(true, places_m, rng)
+    delays["west"][2:] = np.nan  # too few for this array
+    filed = {name: moved(at_m, rng.normal(0.0, 1.0, 3), rng.normal(0.0, 1.5, 3)) for name, at_m in true.items()}
+    found = measure_poses(filed, delays, places_m, C_M_S + 4.0, 0.01)
+    assert set(found.poses) == {"north", "south"}
+    for name, pose in found.poses.items():
+        assert np.abs(pose.microphones_m - true[name]).max() < max(0.08, 3.0 * pose.position_std_m)
+    assert abs(found.c_m_s - C_M_S) < max(2.0, 3.0 * found.c_std_m_s)
+    assert found.c_std_m_s < 2.0

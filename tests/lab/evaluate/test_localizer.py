@@ -165,7 +165,7 @@ def test_fit_recovers_the_odds_that_made_the_events() -> None:
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        (["--scenario", "poses,walking"], "walking: each of clocks, two-sources, walking is run alone"),
+        (["--scenario", "poses,walking"], "walking: each of noise, clocks, two-sources, walking is run alone"),
         (["--scenario", "nowhere"], "expected some of rooms, arrays, .*, got nowhere"),
         (["--snr", "loud"], "expected decibels such as 20 or inf,20,10, got 'loud'"),
         (["--snr", "nan"], "got 'nan'"),

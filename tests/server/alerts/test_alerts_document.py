@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import hmac
 import re
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import httpx
 import yaml
 
 from alert_desk import PATIENT, alert_site, running_desk, sound
@@ -62,3 +67,31 @@ def test_default_patience_lasts_as_long_as_documented() -> None:
     waits_s = [min(config.first_wait_s * 2**n, config.longest_wait_s) for n in range(config.attempts - 1)]
     assert "over about four hours" in PAGE
     assert 4.0 <= sum(waits_s) / 3600 < 4.6
+
+
+def test_documented_receiver_refuses_what_is_stale_or_forged(tmp_path: Path) -> None:
+    """What it does not accept it must not confirm: the alert would be lost."""
+    port = free_port()
+    secret = b"0123456789abcdef0123456789abcdef"
+    (tmp_path / "hook.secret").write_text(f"whsec_{base64.b64encode(secret).decode()}\n", encoding="utf-8")
+    receiver = block("python").replace("9000", str(port))
+    body = b'{"data": {"text": "a sound"}}'
+
+    def status(age_s: int, key: bytes = secret) -> int:
+        when = str(int(time.time()) - age_s)
+        digest = hmac.digest(key, f"alert_1.{when}.".encode() + body, "sha256")
+        signature = "v1," + base64.b64encode(digest).decode()
+        headers = {"webhook-id": "alert_1", "webhook-timestamp": when, "webhook-signature": signature}
+        return httpx.post(f"http://127.0.0.1:{port}/", content=body, headers=headers, timeout=60).status_code
+
+    def answers() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    with started(sys.executable, "-c", receiver, **pipes) as process:
+        wait_until(answers, "the receiver")
+        assert [status(600), status(0, b"wrong"), status(0), status(0)] == [401, 401, 204, 204]
+        process.terminate()
+        assert process.stdout is not None
+        assert process.stdout.read() == "a sound\n"

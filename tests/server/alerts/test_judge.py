@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
 from alert_desk import (
     ELSEWHERE,
+    IN_DOOR,
     Desk,
     after,
     alert_site,
@@ -23,11 +27,15 @@ from alert_desk import (
     sound,
 )
 from livessl.core.commission.finding import Finding, Severity
-from livessl.core.types import Event
-from livessl.server.alerts import service
-from livessl.server.alerts.outbox import OutboxError
-from livessl.server.api.encode import Messages
+from livessl.core.stream.final_pass import FinalResults
+from livessl.core.types import Event, Track, TrackState
+from livessl.server.alerts import backlog, history
+from livessl.server.alerts.outbox import DeliveryState, OutboxError
+from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.set_up_watch import SetUpState
+from livessl.server.store import Store, StoreError
+from livessl.server.zones.presence import Presence
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
 from small_site import wait_until
 
@@ -143,7 +151,7 @@ def test_history_from_before_there_were_alerts_does_not_alert(tmp_path: Path) ->
 def test_events_that_do_not_fit_into_the_queue_are_counted_and_alert_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service, "MAX_QUEUE", 3)
+    monkeypatch.setattr(backlog, "MAX_QUEUE", 3)
     desk = Desk(site(tmp_path))
     events = [sound(number) for number in range(8)]
     for event in events:  # the thread does not run yet: nothing takes from the queue
@@ -156,6 +164,85 @@ def test_events_that_do_not_fit_into_the_queue_are_counted_and_alert_all_the_sam
     wait_until(lambda: len(alerted(desk)) == 9, "an alert about an event that fits")
     desk.close()
     assert alerted_ids(desk) == [f"small-{number}" for number in range(9)]
+
+
+def test_missed_events_alert_although_the_store_took_them_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full while the queue is: what did not fit is in the store only later."""
+    monkeypatch.setattr(backlog, "MAX_QUEUE", 2)
+    desk = Desk(site(tmp_path))
+    with patch.object(desk.store, "finalize", side_effect=StoreError("disk full")):
+        for number in range(5):
+            desk.finish(sound(number))
+        desk.alerts.start()
+        wait_until(lambda: len(alerted(desk)) == 2, "what is in the queue")
+        wait_until(lambda: not len(desk.alerts._backlog), "a look at what was missed")
+        desk.finish(sound(5))
+    desk.finish(sound(6))  # the store takes everything
+    wait_until(lambda: len(alerted(desk)) == 7, "all alerts")
+    desk.close()
+    assert alerted_ids(desk) == [f"small-{number}" for number in range(7)]
+
+
+def test_older_event_that_is_missed_later_alerts_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backlog, "MAX_QUEUE", 1)
+    desk = Desk(site(tmp_path))
+    messages = Messages(desk.site, 0, utc=True)
+    for step, number in enumerate((3, 5, 1, 7)):  # the third one is of a node that was away
+        desk.log.add_final(FinalResults((sound(number),), after(sound(8 + step))), messages, {})
+    desk.alerts.take_final([], after(sound(20)))  # quiet goes on
+    desk.alerts.start()
+    wait_until(lambda: len(alerted(desk)) == 4, "all alerts")
+    desk.close()
+    assert alerted_ids(desk) == ["small-3", "small-1", "small-5", "small-7"]
+
+
+def test_missed_events_are_judged_page_by_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history, "PAGE", 2)
+    first = Desk(site(tmp_path))
+    first.alerts.outbox.commit([], {}, 0, ("small", 0))
+    first.finish(*(sound(number) for number in range(7)))
+    first.close()  # nobody has judged
+    with running_desk(site(tmp_path)) as desk:
+        wait_until(lambda: len(alerted(desk)) == 7, "all alerts")
+    assert alerted_ids(desk) == [f"small-{number}" for number in range(7)]
+    with closing(Store(tmp_path / "events.sqlite")) as store:
+        batches = [(len(page), until_ns) for page, until_ns in history.past_pages(store, 0, 2**62)]
+    assert [size for size, _ in batches] == [2, 2, 2, 1]
+    assert [until_ns for _, until_ns in batches] == [*(sound(number).start_ns for number in (1, 3, 5)), 2**62]
+
+
+@pytest.mark.parametrize("between", [{}, {"arrays": {"arrays": {}}}])
+def test_rules_that_come_back_do_not_alert_about_the_time_between(tmp_path: Path, between: dict[str, Any]) -> None:
+    with running_desk(site(tmp_path)) as desk:
+        desk.finish(sound(1))
+        wait_until(lambda: desk.published, "the first alert")
+    without = alert_site(tmp_path, {"server.events_db": "events.sqlite"}, rules=between)
+    with running_desk(without) as desk:
+        desk.finish(sound(2), sound(3))
+    with running_desk(site(tmp_path)) as desk:
+        desk.finish(sound(4))
+        wait_until(lambda: desk.published, "the next alert")
+    assert alerted_ids(desk) == ["small-4"]
+
+
+@pytest.mark.parametrize("rules", [{}, {"door": DOOR}])
+def test_alerts_of_a_removed_action_are_dead_letters_that_can_be_dismissed(
+    tmp_path: Path, rules: dict[str, Any]
+) -> None:
+    kept = {"server.events_db": "events.sqlite"}
+    guard = {"guard": {"command": ["false"], "first_wait_s": 1000}}
+    door = {"door": {**DOOR, "actions": ["guard"]}}
+    with running_desk(alert_site(tmp_path, kept, actions=guard, rules=door)) as desk:
+        desk.finish(sound(1))
+        wait_until(lambda: desk.alerts.couriers["guard"].failed, "a failed attempt")
+    with running_desk(alert_site(tmp_path, kept, rules=rules)) as desk:
+        assert desk.alerts.counts() == {("guard", DeliveryState.DEAD): 1}
+        assert desk.alerts.problems == ["alerts.actions.guard: 1 alert was given up; see GET alerts/dead-letters"]
+        [(letter, _)] = desk.alerts.outbox.dead(10)
+        with pytest.raises(LookupError, match="'guard', which the site file does not have; add it"):
+            desk.alerts.resend(letter.number)
+        desk.alerts.outbox.dismiss(letter.number)
+        assert desk.alerts.problems == []
 
 
 def test_what_the_outbox_does_not_take_is_judged_when_it_does() -> None:
@@ -246,3 +333,58 @@ def test_finding_alerts_by_severity() -> None:
         wait_until(lambda: len(desk.published) == 3, "the alerts")
     found = sorted((alert["rule"], alert["finding"]["fault"]) for alert in desk.published)
     assert found == [("all", "swapped"), ("all", "temperature"), ("errors", "swapped")]
+
+
+def test_events_in_an_excluded_zone_are_kept_flagged_and_never_alert(tmp_path: Path) -> None:
+    """The fan stands in the door's zone; what comes from beside it alerts."""
+    fan = {"polygon_m": [[0.7, 0.6], [1.0, 0.6], [1.0, 1.0], [0.7, 1.0]], "exclude": True}
+    zones = {"zones.fan": fan, "server.events_db": "events.sqlite"}
+    rules = {"door": DOOR, "any": {"events": {"early": True}, "hold_off_s": 0}}
+    with running_desk(alert_site(tmp_path, zones, rules=rules)) as desk:
+        for number, place in enumerate(((0.85, 0.8, 1.0), (0.3, 0.3, 1.0))):
+            publish_early(desk, sound(number, place))
+        desk.finish(sound(0, (0.85, 0.8, 1.0)), sound(1, (0.3, 0.3, 1.0)))
+        wait_until(lambda: len(desk.published) == 2, "the alerts")
+        kept = [desk.store.get(f"small-{number}") for number in range(2)]
+    assert {(alert["rule"], alert["event"]["id"]) for alert in desk.published} == {
+        ("any", "small-1"),
+        ("door", "small-1"),
+    }
+    flags = [(event["excluded"], event["excluded_by"], event["zones"]) for event in kept if event is not None]
+    assert flags == [(True, ["fan"], ["door", "fan"]), (False, [], ["door"])]
+
+
+def test_tracks_alert_by_what_they_do_in_a_zone(tmp_path: Path) -> None:
+    zones = {"zones.door.loiter_s": 5, "server.events_db": "events.sqlite"}
+    rules = {
+        "in": {"tracks": {"zones": ["door"]}, "hold_off_s": 0},
+        "stay": {"tracks": {"zones": ["door"], "changes": ["loiter", "leave"]}, "hold_off_s": 60},
+    }
+    with running_desk(alert_site(tmp_path, zones, rules=rules)) as desk:
+        reports = list(walk(desk.site))
+        for report, time_ns in reports:
+            desk.alerts.take_change(report, time_ns)
+        wait_until(lambda: desk.alerts.states["stay"].suppressed, "the last verdict")
+    assert [report["change"] for report, _ in reports] == ["enter", "loiter", "leave"]
+    assert [(alert["rule"], alert["change"]) for alert in desk.published] == [
+        ("in", reports[0][0]),
+        ("stay", reports[1][0]),
+    ]
+    entered, stayed = desk.published
+    assert entered["text"] == "track 4 has entered zone 'door', at (0.50, 0.50, 1.00) m"
+    assert stayed["text"] == "track 4 stays in zone 'door' after 6.0 s, at (0.50, 0.50, 1.00) m"
+    assert (entered["zones"], entered["event"], entered["time_utc"]) == (["door"], None, reports[0][0]["time_utc"])
+    assert desk.alerts.states["stay"].suppressed == {"held-off": 1}
+
+
+def walk(watched: Site) -> Iterator[tuple[JsonObject, int]]:
+    """What is reported of a track that comes into the door, stays for six seconds, and leaves."""
+    reports: list[tuple[JsonObject, int]] = []
+    zones = ZoneMap(watched)
+    presence = Presence(lambda: zones, lambda report, time_ns: reports.append((report, time_ns)))
+    messages = Messages(watched, 0, utc=True)
+    for second, place in ((0, ELSEWHERE), (1, IN_DOOR), (7, IN_DOOR), (8, ELSEWHERE)):
+        time_ns = sound(second).start_ns
+        track = Track(4, TrackState.UPDATE, time_ns, np.array(place), np.zeros(3), 0.0025 * np.eye(3))
+        presence.take(track, messages.track(track))
+    yield from reports

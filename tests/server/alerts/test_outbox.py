@@ -93,6 +93,31 @@ def test_only_a_dead_letter_can_be_sent_again() -> None:
     assert not outbox.resend(99, 20)
 
 
+def test_what_waits_for_an_action_that_is_gone_is_a_dead_letter_until_it_is_dismissed() -> None:
+    outbox = Outbox()
+    outbox.commit([raised(number, ("guard", "mail")) for number in range(2)], {}, 10)
+    due = outbox.due("mail", 10, HOUR_NS)
+    assert due is not None
+    outbox.delivered(due.number)
+    assert outbox.abandon(["guard"]) == 1
+    assert outbox.counts() == {("guard", "waiting"): 2, ("mail", "dead"): 1, ("mail", "delivered"): 1}
+    [(letter, _)] = outbox.dead(10)
+    assert letter.error == outbox_module.NO_ACTION
+    assert outbox.dismiss(letter.number) == 1
+    assert outbox.dismiss(letter.number) == 0
+    assert outbox.dead(10) == []
+    assert outbox.action_of_dead(letter.number) is None
+
+
+def test_dead_letters_are_dismissed_by_action_or_all_at_once() -> None:
+    outbox = Outbox()
+    outbox.commit([raised(number, ("guard", "mail", "home")) for number in range(3)], {}, 10)
+    assert outbox.abandon([]) == 9
+    assert outbox.dismiss(action="mail") == 3
+    assert {letter.action for letter, _ in outbox.dead(10)} == {"guard", "home"}
+    assert outbox.dismiss() == 6
+
+
 def test_a_wait_beyond_all_waits_means_that_the_clock_was_set_back() -> None:
     outbox = Outbox()
     outbox.commit([raised()], {}, 100 * HOUR_NS)

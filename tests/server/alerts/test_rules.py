@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,10 +12,11 @@ from hypothesis import strategies as st
 
 from alert_desk import ELSEWHERE, alert_site, encoded, refused, sound
 from livessl.core.types import Event, Status
-from livessl.server.alerts.rules import RuleState, Verdict, Zones, judge_event, match
+from livessl.server.alerts.rules import RuleState, Verdict, judge_event, match
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.alert_models import AlertRule
 
-ZONES = Zones(alert_site())
+ZONES = ZoneMap(alert_site())
 EAGER = {"hold_off_s": 0}
 
 
@@ -68,7 +70,7 @@ def test_uncertain_position_is_in_the_zone_only_with_enough_probability(std_m: f
     condition = rule({"zones": ["door"], "probability": threshold}).events
     assert condition is not None
     event = encoded(sound(std_m=std_m))
-    probability = ZONES.probability("door", event)
+    probability = ZONES.probability("door", event["position_m"], event["covariance_m2"])
     found = match(condition, event, ZONES)
     assert (found is not None) is (probability >= threshold)
     assert found is None or found.zones == {"door": probability}
@@ -140,10 +142,48 @@ def test_a_final_event_takes_the_place_of_the_early_one_that_it_replaces() -> No
     assert judge_event(counting, state, encoded(other), other.start_ns, "UTC")[0] is Verdict.ALERT
 
 
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, 8), min_size=1, max_size=30), st.integers(2, 4), st.sampled_from([0.0, 1e-3]))
+def test_an_event_counts_towards_one_alert_however_often_it_is_judged(
+    numbers: list[int], count: int, hold_off_s: float
+) -> None:
+    counting = rule({"count": count, "within_s": 1000}, hold_off_s=hold_off_s)
+    found = verdicts(counting, *(sound(number) for number in numbers))
+    assert found.count(Verdict.ALERT) == len(set(numbers)) // count
+
+
+def test_final_events_count_no_more_if_their_early_ones_have() -> None:
+    counting = rule({"count": 3, "within_s": 60, "early": True}, hold_off_s=10)
+    early, finals, new = ([sound(first + number) for number in range(3)] for first in (0, 10, 20))
+    state = RuleState()
+    for event in early:
+        verdict, state = judge_event(counting, state, encoded(event), event.start_ns, "UTC")
+    assert verdict is Verdict.ALERT
+    for event, before in zip(finals, early, strict=True):
+        again = encoded(event, [before.id])
+        assert judge_event(counting, state, again, before.start_ns, "UTC")[0] is Verdict.COUNTED
+        _, state = judge_event(counting, state, again, before.start_ns, "UTC")
+    assert verdicts(counting, *finals, *new, state=state) == [*["counted"] * 3, "counting", "counting", "alert"]
+
+
+def test_match_that_does_not_alert_is_counted_once_as_suppressed() -> None:
+    held = rule({"early": True}, hold_off_s=60)
+    state = RuleState()
+    for event in (sound(0), sound(1), sound(2), sound(1), sound(2)):
+        _, state = judge_event(held, state, encoded(event), event.start_ns, "UTC")
+    assert state.suppressed == {"held-off": 2}
+
+
 def test_state_survives_its_text() -> None:
     state = RuleState(armed=False, armed_since_ns=5, alerted_ns=(7,), recent=((1, "a"),), ongoing=("north",), alerts=3)
+    state = replace(state, counted=("b",), noted=("c", "d"))
     state = state.noting(Verdict.HELD_OFF, 9)
     assert RuleState.restored(state.as_json()) == state
+
+
+def test_state_of_an_older_version_can_be_read() -> None:
+    stored = {name: value for name, value in RuleState(alerts=3).as_json().items() if name not in ("counted", "noted")}
+    assert RuleState.restored(stored) == RuleState(alerts=3)
 
 
 def test_events_in_any_order_within_the_span_alert_once() -> None:

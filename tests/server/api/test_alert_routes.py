@@ -153,7 +153,35 @@ def test_dead_letters_are_listed_degrade_health_and_are_sent_again(tmp_path: Pat
         assert other["number"] < letter["number"] == page["next_before"]
 
 
-@pytest.mark.parametrize("method_and_path", ["PUT rules/door/armed", "POST dead-letters/1/resend"])
+def test_operator_dismisses_dead_letters(tmp_path: Path) -> None:
+    with alerting(tmp_path, "false") as server:
+        finish(server, *(sound(number) for number in range(3)))
+        wait_until(lambda: server.parts.alerts.counts() == {("run", "dead"): 3}, "the end of all attempts")
+        [letter] = get(server, "alerts/dead-letters", limit=1)["dead_letters"]
+        url = f"{server.url}/api/v1/alerts/dead-letters"
+        assert httpx.delete(f"{url}/{letter['number']}").json() == {"v": 1, "dismissed": 1}
+        assert httpx.delete(f"{url}/{letter['number']}").status_code == 404
+        assert httpx.delete(url, params={"action": "other"}).json()["dismissed"] == 0
+        assert len(get(server, "alerts/dead-letters")["dead_letters"]) == 2
+        assert httpx.delete(url).json()["dismissed"] == 2
+        assert get(server, "alerts/dead-letters")["dead_letters"] == []
+        assert "given up" not in " ".join(get(server, "health")["reasons"])
+        states = {each["state"] for alert in get(server, "alerts")["alerts"] for each in alert["deliveries"]}
+    assert states == {"dismissed"}
+
+
+def test_second_dry_run_at_a_time_is_sent_away(tmp_path: Path) -> None:
+    with alerting(tmp_path) as server:
+        url = f"{server.url}/api/v1/alerts/rules/door/dry-run"
+        with server.parts.alerts._trying:
+            busy = httpx.get(url, timeout=HANG_S)
+        assert (busy.status_code, busy.headers["Retry-After"]) == (503, "5")
+        assert httpx.get(url, timeout=HANG_S).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "method_and_path", ["PUT rules/door/armed", "POST dead-letters/1/resend", "DELETE dead-letters/1"]
+)
 def test_viewer_may_look_and_not_change(tmp_path: Path, method_and_path: str) -> None:
     method, path = method_and_path.split()
     tokens = {role: add_token(tmp_path / "tokens.yaml", role, role) for role in ("viewer", "operator")}

@@ -81,6 +81,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Secured]:
 
 PUBLIC = {"/", "/static/app.js", "/static/index.html", "/api/v1/health"}
 FOR_ADMINS = {"/api/v1/access"}
+FOR_OPERATORS = {"/api/v1/events/small-0/clips/north", "/api/v1/events/small-0/clips/keep"}
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -91,7 +92,7 @@ def test_every_route_is_for_its_roles(secured: Secured, role: Role | None) -> No
             assert status == 200, path
         elif role is None:
             assert status == 401, path
-        elif path in FOR_ADMINS and role < Role.ADMIN:
+        elif (path in FOR_ADMINS and role < Role.ADMIN) or (path in FOR_OPERATORS and role < Role.OPERATOR):
             assert status == 403, path
         else:
             assert status in (200, 204, 307, 404, 405), path

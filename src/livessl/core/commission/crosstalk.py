@@ -1,8 +1,10 @@
 """Finds crosstalk: channels that receive each other's sound through the interface or the cable, without delay.
 
 Through the air a sound reaches two microphones with a delay that depends on where it is. Through the interface it
-arrives at once, from whatever place. The phases between two channels, all bins of the spectrum alike, therefore have a
-common part at delay 0 that remains when many windows of different sounds are combined.
+arrives at once, from whatever place, and the noise of the other channel does as well. The phases between two channels,
+all bins of the spectrum alike, therefore have a common part at delay 0 that remains when many windows are combined.
+Something steady in the middle between two microphones, such as a fan, looks the same in pauses, but not while there are
+sounds: the common part must be there with sounds as well.
 """
 
 from __future__ import annotations
@@ -28,8 +30,10 @@ LEAST_WINDOWS: Final = 6
 """Fewest windows with sound from which anything is concluded."""
 
 LOUD: Final = 10.0
-"""Power of a window with sound relative to the quietest fifth of windows. Others show a fan, or interference of the
-mains, rather than crosstalk of sounds."""
+"""Power of a window with sound relative to the quietest fifth of windows."""
+
+WITH_SOUND: Final = 0.5
+"""Least common part in windows with sound, relative to that in all windows."""
 
 LEAST_LAG: Final = 6
 """Smallest delay, in samples, between two microphones that are compared: with less, delay 0 does not stand out."""
@@ -44,7 +48,7 @@ MOST_SHARE: Final = 0.5
 """Common part above which two channels have the same signal, which is another fault."""
 
 STANDING: Final = 5.0
-"""Least ratio of the common part at delay 0 to the median at other delays; chance alone gives 4.5 once in 10^6."""
+"""Least ratio of the common part at delay 0 to the median at other delays; random phases exceed 4.5 once in 10^6."""
 
 _BESIDE: Final = 2
 """Delay, in samples, from which the common part does not reach."""
@@ -102,10 +106,13 @@ class CrosstalkMeter:
         correlations = np.array([correlation for _, correlation in self._windows])
         found = {}
         for index, ((i, k), most) in enumerate(zip(self._pairs, self._lags, strict=True)):
-            used = correlations[loud[:, i] | loud[:, k], index]
-            if len(used) >= LEAST_WINDOWS:
-                share, standing = _common_part(used, min(most, max(self._lags)))
-                if LEAST_SHARE <= share < MOST_SHARE and standing >= STANDING:
+            with_sound = correlations[loud[:, i] | loud[:, k], index]
+            if len(with_sound) < LEAST_WINDOWS:
+                continue
+            share, standing = _common_part(correlations[:, index], most)
+            if LEAST_SHARE <= share < MOST_SHARE and standing >= STANDING:
+                there, _ = _common_part(with_sound, most)
+                if there >= WITH_SOUND * share:
                     found[i, k] = share
         return found
 
@@ -116,15 +123,15 @@ class CrosstalkMeter:
         for index in sorted(common or {index for pair in shares for index in pair}):
             partners = {k if i == index else i: share for (i, k), share in shares.items() if index in (i, k)}
             level_db = 20.0 * float(np.log10(max(partners.values()) / _SHARE_OF_LEVEL))
-            names = " and ".join(f"{other + 1}" for other in sorted(partners))
-            others = f"channel{'s' if len(partners) > 1 else ''} {names}"
+            *others, last = (f"{other + 1}" for other in sorted(partners))
+            names = f"channels {', '.join(others)} and {last}" if others else f"channel {last}"
             yield Finding(
                 "crosstalk",
                 array,
                 index + 1,
                 Severity.WARNING,
                 0.95,
-                f"channel {index + 1} of {array!r} and {others} leak into each other at about {level_db:.0f} dB",
+                f"channel {index + 1} of {array!r} and {names} leak into each other at about {level_db:.0f} dB",
                 "keep their cables apart, check the plugs and the ground, and switch off mixing in the interface",
             )
 

@@ -16,16 +16,21 @@ import numpy as np
 
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
-from livessl.core.commission.judge import Judge
+from livessl.core.commission.judge import COSTS, Judge
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
 from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
 
-MIN_GAIN: Final = 12.0
-"""Least gain in the Bayesian information criterion for which a set-up is said to be other than filed."""
+MIN_GAIN: Final = 4.0
+"""Least gain in the criterion of sounds at unknown places, for each array beyond the first, for which a set-up is said
+to be other than filed."""
 
-MIN_LEAD: Final = 6.0
-"""Least lead in the same measure over the best alternative of another array, or of the whole site."""
+MIN_LEAD: Final = 3.0
+"""Least lead in the same measure over the best alternative about another array or channel."""
+
+KNOWN_MIN_GAIN: Final = 12.0
+KNOWN_MIN_LEAD: Final = 6.0
+"""The same for sounds at places that somebody measured, in the Bayesian information criterion."""
 
 MIN_RATIO: Final = 1.3
 """Least ratio between the misfit as filed and that of the alternative."""
@@ -48,8 +53,7 @@ class Diagnosis:
     contradicts : bool
         Whether the sounds contradict the set-up as filed, explained or not.
     lead : float
-        Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the Bayesian
-        information criterion.
+        Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the criterion.
     undecided : tuple of Alternative
         Two or more that are the same fault of different arrays and explain the sounds equally well, best first: one of
         them is true.
@@ -106,7 +110,11 @@ def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s
 
 def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
     """Compare alternatives by the judge, or by their misfits alone."""
-    if trial.filed.misfit_s <= MIN_RATIO * trial.floor_s:
+    least, least_lead = KNOWN_MIN_GAIN, KNOWN_MIN_LEAD
+    if judge is not None:
+        least, least_lead = MIN_GAIN * (judge.arrays - 1), MIN_LEAD
+    is_small = trial.filed.misfit_s <= MIN_RATIO * trial.floor_s
+    if is_small and (judge is None or not judge.may_gain(least + COSTS["turned"])):
         return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
     tried = [
         *trial.orders(),
@@ -121,13 +129,15 @@ def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
         filed, tried = judge.filed, [judge.judged(one) for one in tried]
     rivals = sorted(tried, key=lambda one: one.criterion)
     best, gained = rivals[0], filed - rivals[0].criterion
-    contradicts = gained > MIN_GAIN
-    if judge is None:
+    contradicts = gained > least
+    if judge is not None:
+        contradicts &= best.is_large  # smaller errors are those of a careful set-up
+    else:
         contradicts &= trial.filed.misfit_s > MIN_RATIO * max(best.misfit_s, trial.floor_s)
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
-    named = contradicts and lead > MIN_LEAD and best.is_large
-    undecided = _undecided(rivals) if contradicts and not named else ()
+    named = contradicts and lead > least_lead and best.is_large
+    undecided = _undecided(rivals, least_lead) if contradicts and not named else ()
     return Diagnosis(
         trial.sounds,
         trial.filed.misfit_s,
@@ -139,10 +149,10 @@ def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
     )
 
 
-def _undecided(rivals: Sequence[Alternative]) -> tuple[Alternative, ...]:
+def _undecided(rivals: Sequence[Alternative], least_lead: float) -> tuple[Alternative, ...]:
     """Return the best alternatives if they are the same fault of different arrays, such as a shift of one of two."""
     best = rivals[0]
-    close = [one for one in rivals if one.criterion - best.criterion <= MIN_LEAD and one.array != best.array]
+    close = [one for one in rivals if one.criterion - best.criterion <= least_lead and one.array != best.array]
     if not close or any(one.fault != best.fault or not one.is_large for one in (best, *close)):
         return ()
     firsts = {one.array: one for one in reversed((best, *close))}

@@ -13,6 +13,11 @@ from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_
 from livessl.core.commission.places import Microphones, stacked
 from livessl.core.types import BoolArray, FloatArray, Observation
 
+OF_SET_UP: Final = frozenset(
+    {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
+)
+"""Codes of what the delays of all sounds show together."""
+
 LEAST_SHARPNESS: Final = 3.5
 """Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
 

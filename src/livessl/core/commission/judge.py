@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.alternative import Alternative
-from livessl.core.commission.places import Delays, Microphones, PlaceSearch, degrees_of_freedom
+from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.poses import moved
 from livessl.core.commission.tolerance import SPEED_STD_M_S, Explained, Freedom, careful, explained
 from livessl.core.types import FloatArray
@@ -20,16 +20,17 @@ FREE_MICROPHONE_M: Final = 0.1
 FREE_SPEED_M_S: Final = 20.0
 """Standard deviations of what an alternative leaves free, from what was found for it: metres, degrees, metres, m/s."""
 
-_UNKNOWNS: Final = {
-    "exchanged": 0.5,
-    "late_channel": 1.5,
-    "geometry": 3.5,
-    "turned": 3.0,
-    "moved": 4.0,
-    "height": 1.0,
-    "temperature": 1.0,
+COSTS: Final = {
+    "exchanged": 1.0,
+    "late_channel": 2.0,
+    "geometry": 6.0,
+    "turned": 6.0,
+    "moved": 8.0,
+    "height": 2.0,
+    "temperature": 2.0,
 }
-"""Unknowns of each alternative. Two microphones, or two arrays, that are exchanged count as one."""
+"""Deviance that an alternative must gain to be as good as the set-up as filed: two for each unknown (Akaike), one for
+each channel in another order, and two more for a shift, because people measure distances better than angles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +56,47 @@ class Judge:
 
     def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
         self._microphones, self._delays, self._search = microphones, delays, search
-        self._log_count = float(np.log(degrees_of_freedom(delays).sum()))
-        self.filed = self._explained(self._applied(None), None).deviance
+        self._filed = self._explained(self._applied(None), None)
+
+    @property
+    def arrays(self) -> int:
+        """Number of arrays."""
+        return len(self._microphones)
+
+    @property
+    def filed(self) -> float:
+        """Deviance of the set-up as filed."""
+        return self._filed.deviance
+
+    def may_gain(self, least: float) -> bool:
+        """Return whether a set-up that is nearly as filed may explain the sounds better by so much.
+
+        The poses, and then the microphones, of one array after the other are left free together.
+        """
+        for name, at_m in self._microphones.items():
+            careful_one = careful(self._microphones)[name]
+            for freed in (
+                replace(careful_one, position_m=FREE_M, orientation_deg=FREE_DEG),
+                replace(careful_one, microphones_m=np.full(len(at_m), FREE_MICROPHONE_M)),
+            ):
+                found = explained(
+                    self._microphones,
+                    self._delays,
+                    self._filed.places_m,
+                    self._search.bounds_m,
+                    self._search.c_m_s,
+                    careful(self._microphones) | {name: freed},
+                    FREE_SPEED_M_S,
+                )
+                if self.filed - found.deviance >= least:
+                    return True
+        return False
 
     def judged(self, alternative: Alternative) -> Alternative:
         """Return an alternative with its criterion, and with its size as the sounds say best."""
         found = self._explained(self._applied(alternative), alternative)
-        unknowns = _UNKNOWNS.get(alternative.fault)
-        if unknowns is None:  # an order of channels
-            unknowns = 0.5 * sum(channel != index for index, channel in enumerate(alternative.order, start=1))
-        return replace(_adjusted(alternative, found), criterion=found.deviance + unknowns * self._log_count)
+        others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
+        return replace(_adjusted(alternative, found), criterion=found.deviance + COSTS.get(alternative.fault, others))
 
     def _explained(self, applied: _Applied, alternative: Alternative | None) -> Explained:
         freedom, speed_std_m_s = careful(applied.microphones), SPEED_STD_M_S

@@ -2,12 +2,13 @@
 
 The unknowns are the turn and the shift of each array that may move, the speed of sound if it may differ, and the places
 of the sounds. Places that are known, and poses as far as they are known, enter as priors. The arrays need no common
-clock, for only delays within an array are used.
+clock; where some have one, the times between them may be used as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,11 +16,16 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from livessl.core.commission.arrivals import ARRIVAL_STD_S, Arrivals
 from livessl.core.commission.places import Delays, Microphones, contradictions_s, slopes_s_m
 from livessl.core.types import FloatArray
 
 DELAY_STD_S: Final = 20e-6
 """Standard deviation of a measured delay in a room, seconds."""
+
+MICROPHONE_STD_M: Final = 0.002
+"""Standard deviation of each microphone's place within its array, metres: arrays are built to some millimetres. It is
+the same in all sounds, and more of them do not average it out."""
 
 UNKNOWN_M: Final = 100.0
 UNKNOWN_DEG: Final = 360.0
@@ -120,6 +126,8 @@ def adjust(
     c_m_s: float,
     freedom: Freedom,
     place_std_m: float = UNKNOWN_M,
+    delay_std_s: float = DELAY_STD_S,
+    arrivals: Arrivals | None = None,
 ) -> Adjusted:
     """Find the poses, the speed of sound and the places that explain delays best.
 
@@ -136,8 +144,12 @@ def adjust(
     freedom : Freedom
     place_std_m : float
         Standard deviation of the given places along each axis, metres.
+    delay_std_s : float
+        Standard deviation of the delays, seconds.
+    arrivals : Arrivals or None
+        Times between arrays that share a clock.
     """
-    problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m)
+    problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m, delay_std_s, arrivals)
     solved = least_squares(
         problem.residuals,
         problem.start,
@@ -163,9 +175,12 @@ class _Problem:
         c_m_s: float,
         freedom: Freedom,
         place_std_m: float,
+        delay_std_s: float,
+        arrivals: Arrivals | None,
     ) -> None:
         self._microphones, self._delays, self._places_m = microphones, delays, places_m
         self._c_m_s, self._freedom, self._place_std_m = c_m_s, freedom, place_std_m
+        self._delay_std_s, self._arrivals = delay_std_s, arrivals
         self._free = [name for name in microphones if name in freedom.arrays]
         count = len(self._free) * _UNKNOWNS + (freedom.speed_std_m_s > 0.0)
         self.start = np.concatenate([np.zeros(count), places_m.ravel()])
@@ -178,12 +193,15 @@ class _Problem:
     def residuals(self, unknowns: FloatArray) -> FloatArray:
         """Delays and priors, in standard deviations."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
-        parts = [self._off(poses, speed_m_s, places_m).ravel() / DELAY_STD_S]
+        parts = [self._off(poses, speed_m_s, places_m).ravel() / self._delay_std_s]
         for name, (shift_m, turn) in poses.items():
             position_std_m, orientation_std_deg = self._freedom.arrays[name]
             parts += [shift_m / position_std_m, turn / np.radians(orientation_std_deg)]
         if self._freedom.speed_std_m_s > 0.0:
             parts.append(np.array([(speed_m_s - self._c_m_s) / self._freedom.speed_std_m_s]))
+        if self._arrivals is not None:
+            off_s = self._arrivals.contradictions_s(self._moved(poses), places_m, speed_m_s)
+            parts.append(off_s.ravel() / ARRIVAL_STD_S)
         parts.append(((places_m - self._places_m) / self._place_std_m).ravel())
         return np.concatenate(parts)
 
@@ -199,10 +217,15 @@ class _Problem:
             slopes[:, column] = (self.residuals(moved) - here) / step
         poses, speed_m_s, places_m = self._unpack(unknowns)
         sounds = np.arange(len(places_m))
-        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / DELAY_STD_S
+        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / self._delay_std_s
         rows = of_places.shape[1]
         blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
         blocks[sounds, :, sounds] = of_places
+        if self._arrivals is not None:
+            of_times = self._arrivals.slopes_s_m(self._moved(poses), places_m, speed_m_s) / ARRIVAL_STD_S
+            count = of_times.shape[0] * of_times.shape[1]
+            rows_of_times = slopes[-places_m.size - count : -places_m.size, few:]
+            rows_of_times.reshape(len(sounds), -1, len(sounds), 3)[sounds, :, sounds] = of_times
         slopes[-places_m.size :, few:] = np.eye(places_m.size) / self._place_std_m
         return slopes
 
@@ -210,6 +233,8 @@ class _Problem:
         """The unknowns as a result, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
+        bias = covariance @ jacobian.T @ self._slopes_by_microphones(unknowns)
+        covariance += MICROPHONE_STD_M**2 * bias @ bias.T
         off = self._off(poses, speed_m_s, places_m)
         count = sum(np.isfinite(one).sum(axis=1) - 1 for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
@@ -221,6 +246,19 @@ class _Problem:
         at = len(self._free) * _UNKNOWNS
         c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
         return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
+
+    def _slopes_by_microphones(self, unknowns: FloatArray) -> FloatArray:
+        """Slope of the residuals by the places of all microphones along each axis, per metre."""
+        here, columns = self.residuals(unknowns), []
+        filed = self._microphones
+        for name in self._delays:
+            for entry in range(filed[name].size):
+                off_m = np.zeros(filed[name].size)
+                off_m[entry] = _STEP
+                others = copy(self)
+                others._microphones = dict(filed) | {name: filed[name] + off_m.reshape(-1, 3)}
+                columns.append((others.residuals(unknowns) - here) / _STEP)
+        return np.stack(columns, axis=1)
 
     def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
         poses, at = {}, 0

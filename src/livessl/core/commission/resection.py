@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livessl.core.commission.places import KnownPlaces, centred
-from livessl.core.commission.poses import UNKNOWN_DEG, UNKNOWN_M, Freedom, Pose, adjust, moved
-from livessl.core.types import FloatArray
+from livessl.core.commission.places import Delays, KnownPlaces, Microphones, centred
+from livessl.core.commission.poses import UNKNOWN_DEG, UNKNOWN_M, Adjusted, Freedom, Pose, adjust, moved
+from livessl.core.types import BoolArray, FloatArray
 
 LEAST_PLACES: Final = 4
 """Fewest places from which a pose is measured: three leave nothing to check it with."""
@@ -23,6 +24,12 @@ STEPS_M: Final = (1.0, 0.25)
 
 NEAREST_M: Final = 0.1
 """Least distance of an array from a sound, metres."""
+
+CLAP_STD_S: Final = 12e-6
+"""Standard deviation of the delays of a clap, seconds: it is short and loud, and its delays are sharper than others."""
+
+SPEED_STD_M_S: Final = 3.0
+"""Standard deviation of the filed speed of sound, m/s: five degrees of temperature."""
 
 MOST_STD_M: Final = 0.10
 MOST_STD_DEG: Final = 3.0
@@ -45,6 +52,8 @@ class MeasuredPose:
         Largest standard deviations along any axis.
     misfit_before_s, misfit_s : float
         Misfit of the sounds with the filed pose and with the measured one, seconds.
+    covariance : (6, 6) float64
+        Of the position (m) and the turn (radians).
     """
 
     microphones_m: FloatArray
@@ -54,6 +63,7 @@ class MeasuredPose:
     orientation_std_deg: float
     misfit_before_s: float
     misfit_s: float
+    covariance: FloatArray
 
     @property
     def is_determined(self) -> bool:
@@ -87,7 +97,7 @@ def measure_pose(
     ValueError
         If there are fewer than `LEAST_PLACES`.
     """
-    heard = np.isfinite(delays_s).sum(axis=1) > 1
+    heard = received(delays_s)
     if heard.sum() < LEAST_PLACES:
         raise ValueError(f"expected {LEAST_PLACES} sounds or more at known places, got {heard.sum()}")
     delays_s, places_m = delays_s[heard], places_m[heard]
@@ -99,24 +109,118 @@ def measure_pose(
     for shift_m, rotvec in starts:
         rough_m = moved(microphones_m, shift_m, rotvec)
         freedom = Freedom({"array": (UNKNOWN_M, UNKNOWN_DEG)})
-        adjusted = adjust({"array": rough_m}, {"array": delays_s}, places_m, c_m_s, freedom, place_std_m)
-        misfit_s = float(np.sqrt(np.mean(adjusted.misfits_s**2)))
+        adjusted = adjust({"array": rough_m}, {"array": delays_s}, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
+        misfit_s = _misfit_s(adjusted)
         if best is None or misfit_s < best[0]:
             best = misfit_s, adjusted.poses["array"], adjusted.poses["array"].applied(rough_m)
     assert best is not None
     _, pose, measured_m = best
+    return _against_filed(microphones_m, measured_m, pose, delays_s, KnownPlaces(places_m, c_m_s))
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredSetUp:
+    """The poses of several arrays and the speed of sound as the same sounds say.
+
+    Parameters
+    ----------
+    poses : mapping of array to MeasuredPose
+    c_m_s, c_std_m_s : float
+        Speed of sound and its standard deviation, m/s.
+    places_m : (S, 3) float64
+        Where the sounds were, metres; NaN for those that were not used.
+    misfit_s : float
+        Misfit of all of them with the measured set-up, seconds.
+    """
+
+    poses: Mapping[str, MeasuredPose]
+    c_m_s: float
+    c_std_m_s: float
+    places_m: FloatArray
+    misfit_s: float
+
+    @property
+    def sounds(self) -> int:
+        """Number of sounds that were used."""
+        return int(np.isfinite(self.places_m).all(axis=1).sum())
+
+
+def measure_poses(
+    microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float, place_std_m: float
+) -> MeasuredSetUp:
+    """Measure the poses of all arrays that received enough of the sounds, and the speed of sound.
+
+    Each array is measured by itself first. Then all are adjusted together: they share the errors of the places, and the
+    speed of sound.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As filed, metres.
+    delays : mapping of array to (S, K) float64
+        Seconds.
+    places_m, c_m_s, place_std_m
+        As in `measure_pose`.
+
+    Raises
+    ------
+    ValueError
+        If no array received `LEAST_PLACES` of them.
+    """
+    enough = {name: measured for name, measured in delays.items() if received(measured).sum() >= LEAST_PLACES}
+    if not enough:
+        most = max((int(received(measured).sum()) for measured in delays.values()), default=0)
+        raise ValueError(f"expected {LEAST_PLACES} sounds or more at known places, got {most}")
+    rough = {
+        name: measure_pose(microphones[name], measured, places_m, c_m_s, place_std_m).microphones_m
+        for name, measured in enough.items()
+    }
+    freedom = Freedom(dict.fromkeys(rough, (UNKNOWN_M, UNKNOWN_DEG)), SPEED_STD_M_S)
+    adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
+    known = KnownPlaces(places_m, adjusted.c_m_s)
+    poses = {
+        name: _against_filed(
+            microphones[name], adjusted.poses[name].applied(rough[name]), adjusted.poses[name], measured, known
+        )
+        for name, measured in enough.items()
+    }
+    return MeasuredSetUp(poses, adjusted.c_m_s, adjusted.c_std_m_s, adjusted.places_m, _misfit_s(adjusted))
+
+
+def received(delays_s: FloatArray) -> BoolArray:
+    """Sounds (S,) that an array received with two channels or more, from delays (S, K)."""
+    return np.asarray(np.isfinite(delays_s).sum(axis=1) > 1)
+
+
+def described_pose(
+    filed_m: FloatArray, measured_m: FloatArray, pose: Pose, misfit_before_s: float, misfit_s: float
+) -> MeasuredPose:
+    """Describe a measured pose (K, 3) against the filed one, metres; misfits are in seconds."""
+    centre_m, filed_centre_m = measured_m.mean(axis=0), filed_m.mean(axis=0)
+    turn, _ = Rotation.align_vectors(measured_m - centre_m, filed_m - filed_centre_m)
     variance = np.diag(pose.covariance)
-    known = KnownPlaces(places_m, c_m_s)
-    turn, _ = Rotation.align_vectors(measured_m - measured_m.mean(axis=0), microphones_m - microphones_m.mean(axis=0))
     return MeasuredPose(
         measured_m,
-        measured_m.mean(axis=0) - microphones_m.mean(axis=0),
+        centre_m - filed_centre_m,
         turn,
         float(np.sqrt(variance[:3].max())),
         float(np.degrees(np.sqrt(variance[3:].max()))),
-        known.fit({"array": microphones_m}, {"array": delays_s}).misfit_s,
-        known.fit({"array": measured_m}, {"array": delays_s}).misfit_s,
+        misfit_before_s,
+        misfit_s,
+        pose.covariance,
     )
+
+
+def _against_filed(
+    filed_m: FloatArray, measured_m: FloatArray, pose: Pose, delays_s: FloatArray, known: KnownPlaces
+) -> MeasuredPose:
+    """Describe a measured pose with the misfits of sounds at known places."""
+    before_s, after_s = (known.fit({"array": at_m}, {"array": delays_s}).misfit_s for at_m in (filed_m, measured_m))
+    return described_pose(filed_m, measured_m, pose, before_s, after_s)
+
+
+def _misfit_s(adjusted: Adjusted) -> float:
+    return float(np.sqrt(np.mean(adjusted.misfits_s**2)))
 
 
 def from_known_places(

@@ -18,16 +18,16 @@ from livessl.core.commission.places import Delays, Microphones, contradictions_s
 from livessl.core.commission.poses import moved
 from livessl.core.types import FloatArray
 
-DELAY_STD_S: Final = 12e-6
+DELAY_STD_S: Final = 6e-6
 """Standard deviation of a delay in a room that is no outlier, seconds."""
 
 TAILS: Final = 3.0
 """Degrees of freedom of the t distribution of delays: 3 has heavy tails."""
 
-POSITION_STD_M: Final = 0.03
-ORIENTATION_STD_DEG: Final = 1.5
-MICROPHONE_STD_M: Final = 0.003
-SPEED_STD_M_S: Final = 2.0
+POSITION_STD_M: Final = 0.02
+ORIENTATION_STD_DEG: Final = 1.2
+MICROPHONE_STD_M: Final = 0.002
+SPEED_STD_M_S: Final = 1.5
 """Standard deviations of a careful set-up, along each axis: metres, degrees, metres and m/s."""
 
 _STEPS: Final = 5

@@ -13,8 +13,9 @@ import numpy as np
 import pyarrow as pa
 from scipy.signal import butter, sosfilt
 
-from livessl.lab.evaluate import localizer, sessions, unit
+from livessl.lab.evaluate import localizer, noise, sessions, unit
 from livessl.lab.evaluate.localizer import LocalizerSettings
+from livessl.lab.evaluate.noise import NoiseSettings
 from livessl.lab.evaluate.paper import Settings
 from livessl.lab.evaluate.sessions import SessionSettings
 from livessl.lab.evaluate.unit import Clips, Row
@@ -39,11 +40,11 @@ class Job:
 
     Parameters
     ----------
-    settings : Settings, LocalizerSettings or SessionSettings
+    settings : Settings, LocalizerSettings, SessionSettings or NoiseSettings
     clips : Clips
     """
 
-    settings: Settings | LocalizerSettings | SessionSettings
+    settings: Settings | LocalizerSettings | SessionSettings | NoiseSettings
     clips: Clips
 
     @property
@@ -56,6 +57,8 @@ class Job:
                 return localizer.SCHEMA
             case SessionSettings():
                 return sessions.SCHEMA
+            case NoiseSettings():
+                return noise.SCHEMA
 
     def unit(self) -> Unit:
         """Prepare what turns the number of a position into its rows."""
@@ -66,6 +69,8 @@ class Job:
                 return localizer.LocalizerPosition(settings, self.clips)
             case SessionSettings() as settings:
                 return sessions.SessionPosition(settings, self.clips)
+            case NoiseSettings() as settings:
+                return noise.NoisePosition(settings, self.clips)
 
     @property
     def digest(self) -> str:

@@ -156,7 +156,7 @@ class LocalizerPosition:
                         for method, estimator in estimators.items():
                             sounds = {spec.name: event.sound(estimator, spec, case.c_m_s, dead) for spec in specs}
                             row = head | {"case": case.name, "method": method}
-                            rows.append(row | _found(estimator, sounds, specs, source_m))
+                            rows.append(row | found_row(estimator, sounds, specs, source_m))
         return rows
 
     def _installed(self, case: Case, number: int) -> tuple[list[ArraySpec], dict[str, Estimator]]:
@@ -212,6 +212,31 @@ def sound_of(
     return Sound(segments, sample_rate_hz, onsets)
 
 
+def found_row(
+    estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray
+) -> Row:
+    """Locate a sound and compare the result with the truth: the columns that all scenarios share."""
+    found = estimator.locate(sounds)
+    outliers = found.outliers or {}
+    error = found.position_m - source_m
+    nearest_m = min((spec.centre_m for spec in specs), key=lambda centre_m: float(np.linalg.norm(centre_m - source_m)))
+    row: Row = {
+        "active_s": max(
+            sum(piece.shape[1] for piece in each.segments) / each.sample_rate_hz for each in sounds.values()
+        ),
+        "error_m": float(np.linalg.norm(error)),
+        "bearing_deg": angle_deg(found.position_m - nearest_m, source_m - nearest_m),
+        "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
+        "status": str(judged(found, [spec for spec in specs if spec.name not in {*outliers, *found.unneeded}])[0]),
+        "outvoted": "".join(sorted(outliers)),
+    }
+    row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
+    row |= {f"found_{axis}_m": value for axis, value in zip("xyz", found.position_m, strict=True)}
+    if found.features is not None:
+        row |= {"confidence": found.confidence, "margin": found.features.margin, "standing": found.features.peak_to_rms}
+    return row
+
+
 def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, float, float]:
     """Fit the confidence by logistic regression: return the intercept and the weights of margin and standing.
 
@@ -232,29 +257,6 @@ def development_fit(columns: Mapping[str, Any], near_m: float) -> tuple[float, f
         weights = weights + np.linalg.solve(hessian, gradient)
     intercept, of_margin, of_standing = (float(weight) for weight in weights)
     return intercept, of_margin, of_standing
-
-
-def _found(estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
-    """Locate an event and compare the result with the truth."""
-    found = estimator.locate(sounds)
-    outliers = found.outliers or {}
-    error = found.position_m - source_m
-    nearest_m = min((spec.centre_m for spec in specs), key=lambda centre_m: float(np.linalg.norm(centre_m - source_m)))
-    row: Row = {
-        "active_s": max(
-            sum(piece.shape[1] for piece in each.segments) / each.sample_rate_hz for each in sounds.values()
-        ),
-        "error_m": float(np.linalg.norm(error)),
-        "bearing_deg": angle_deg(found.position_m - nearest_m, source_m - nearest_m),
-        "mahalanobis2": float(error @ np.linalg.solve(found.covariance_m2, error)),
-        "status": str(judged(found, [spec for spec in specs if spec.name not in {*outliers, *found.unneeded}])[0]),
-        "outvoted": "".join(sorted(outliers)),
-    }
-    row |= {f"{axis}_m": value for axis, value in zip("xyz", source_m, strict=True)}
-    row |= {f"found_{axis}_m": value for axis, value in zip("xyz", found.position_m, strict=True)}
-    if found.features is not None:
-        row |= {"confidence": found.confidence, "margin": found.features.margin, "standing": found.features.peak_to_rms}
-    return row
 
 
 def _seed(seed: int, number: int, purpose: int, name: str) -> np.random.SeedSequence:

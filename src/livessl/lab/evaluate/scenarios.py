@@ -25,6 +25,9 @@ LOCALIZER: Final = "localizer"
 ROOMS: Final = "rooms"
 """The scenario that is run by default."""
 
+NOISE: Final = "noise"
+"""The scenario in other rooms than the paper's, with the noise that rooms have: `livessl.lab.evaluate.noise`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Case:

@@ -179,6 +179,17 @@ def with_interval(name: str, resampled: FloatArray) -> dict[str, float]:
     return {name: float(resampled[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share by Wilson (1927); 0 to 1 if the total is 0."""
+    if total == 0:
+        return 0.0, 1.0
+    z2 = 1.96**2
+    share = count / total
+    centre = (share + z2 / (2.0 * total)) / (1.0 + z2 / total)
+    half = np.sqrt(z2 * (share * (1.0 - share) / total + z2 / (4.0 * total**2))) / (1.0 + z2 / total)
+    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
+
+
 def area_under_roc(score: FloatArray, good: BoolArray) -> float:
     """Return the probability that a good event's score exceeds a bad one's; ties count half, NaN if one is missing."""
     good_scores, bad_scores = np.sort(score[good]), score[~good]

@@ -62,16 +62,17 @@ def draw(site: Site, path: Path) -> None:
 
 
 def _view(ax: Axes, site: Site, axes: tuple[int, int], title: str) -> None:
-    from matplotlib.patches import Rectangle
+    from matplotlib.patches import Polygon, Rectangle
 
     right, up = axes
     width, height = site.room.size_m[right], site.room.size_m[up]
     ax.add_patch(Rectangle((0, 0), width, height, fill=False, edgecolor=_INK, linewidth=1.5))
-    for name, zone in site.zones.items():
-        (x0, x1), (y0, y1) = zone.bounds_m[right], zone.bounds_m[up]
-        ax.add_patch(
-            Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=_ZONE, alpha=0.15, edgecolor=_ZONE, linestyle="--")
-        )
+    for name, zone in site.all_zones.items():
+        box_m = zone.box_m(site.room.size_m[2])
+        (x0, x1), (y0, y1) = box_m[right], box_m[up]
+        corners = list(zone.outline_m) if axes == (0, 1) else [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        hatch = "//" if zone.exclude else None
+        ax.add_patch(Polygon(corners, facecolor=_ZONE, alpha=0.15, edgecolor=_ZONE, linestyle="--", hatch=hatch))
         ax.annotate(name, ((x0 + x1) / 2, (y0 + y1) / 2), ha="center", va="center", fontsize=8, color=_ZONE)
     for spec in site.specs:
         ax.plot(spec.microphones_m[:, right], spec.microphones_m[:, up], "o", color=_ARRAY, markersize=3)

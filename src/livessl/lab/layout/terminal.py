@@ -44,14 +44,11 @@ def floor_plan(site: Site) -> list[str]:
         column, row = int(place_m[0] / x * columns), int(place_m[1] / y * rows)
         cells[min(max(row, 0), rows - 1)][min(max(column, 0), columns - 1)] = mark
 
-    for zone in site.zones.values():
-        (x0, x1), (y0, y1) = zone.bounds_m[:2]
-        corners = np.clip([[x0, y0], [x1, y1]], 0.0, [x, y])
-        steps = np.linspace(corners[0], corners[1], columns + rows)
-        for along in steps:
-            for edge in corners:
-                put(np.array([along[0], edge[1]]), "·")
-                put(np.array([edge[0], along[1]]), "·")
+    for zone in site.all_zones.values():
+        corners = np.clip(np.array(zone.outline_m), 0.0, [x, y])
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            for place_m in np.linspace(begin, end, columns + rows):
+                put(place_m, "·")
     for index, spec in enumerate(site.specs):
         put(spec.centre_m, mark_of(index))
     drawn = ["".join(row) for row in reversed(cells)]
@@ -80,8 +77,8 @@ def _tables(layout: Layout, rt60_s: float) -> Iterator[str]:
             f"{mark_of(index)} {spec.name:<{width}}  {len(spec.microphones_m):>11}  {centre:<20}  "
             f"{spec.aperture_m:>4.2f} m  {array.wall.distance_m:.2f} m to {array.wall.name}{near}"
         )
-    if layout.site.zones:
-        yield f"· zones: {', '.join(layout.site.zones)}"
+    if layout.site.all_zones:
+        yield f"· zones: {', '.join(layout.site.all_zones)}"
     if len(layout.arrays) > 2 and len(layout.distances_m) <= MOST_PAIRS:
         pairs = (f"{one} to {other} {apart:.2f} m" for (one, other), apart in layout.distances_m.items())
         yield f"distances: {', '.join(pairs)}"

@@ -81,7 +81,7 @@ class ActionSetting:
     rules : sequence of str
         Names of the rules that take it.
     other_rules : sequence of str
-        Names of rules that do not, or no longer, take it, those included that the site file no longer has.
+        Names of rules that no action of its type takes, those included that the site file no longer has.
     url : str
         Address of the server for people.
     """

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
 from livessl.clock import utc_ns
-from livessl.server.alerts.rules import SUPPRESSED, RuleState, Verdict, Zones, judge_event, match
+from livessl.server.alerts.rules import SUPPRESSED, RuleState, Verdict, judge_event, match
 from livessl.server.api.encode import JsonObject
 from livessl.server.store import Query, Store
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.alert_models import AlertRule
 
 PAGE: Final = 500
@@ -36,7 +39,7 @@ class DryRun:
     suppressed : dict of str to int
         Events that match and would not have alerted, by verdict.
     latest : list of JsonObject
-        Events of the latest alerts, newest first.
+        Events of the latest alerts, newest first: their `id` and `time_utc`.
     complete : bool
         Whether all events of that time were tried.
     """
@@ -49,20 +52,26 @@ class DryRun:
     complete: bool
 
 
-def past_events(store: Store, since_ns: int, before_ns: int) -> list[tuple[JsonObject, int]]:
-    """Return the stored events that began in a span of site time, oldest first, each with its start."""
-    found: list[tuple[JsonObject, int]] = []
-    query: Query | None = Query(since_ns=since_ns, until_ns=before_ns - 1, limit=PAGE)
+def past_pages(store: Store, since_ns: int, before_ns: int) -> Iterator[tuple[list[tuple[JsonObject, int]], int]]:
+    """Yield the stored events that began in a span of site time, page by page, oldest first.
+
+    Each page has its events with their starts, and the site time before which all events have then been yielded. There
+    is one page at least.
+    """
+    query: Query | None = Query(since_ns=since_ns, until_ns=before_ns - 1, limit=PAGE, oldest_first=True)
     while query is not None:
         page, query = _page(store, query)
-        found += page
-    return found[::-1]
+        # events of the same instant may follow on the next page
+        yield page, before_ns if query is None or query.before is None else query.before.time_ns
 
 
 def try_rule(
-    rule: AlertRule, store: Store, zones: Zones, timezone: str | None, since_ns: int, before_ns: int
+    rule: AlertRule, store: Store, zones: ZoneMap, timezone: str | None, since_ns: int, before_ns: int
 ) -> DryRun:
-    """Return what a rule on events would have done in a span of site time, armed all the time."""
+    """Return what a rule on events would have done in a span of site time, armed all the time.
+
+    Of each event that matches, only what the verdict needs is kept: the span may have many.
+    """
     condition = rule.events
     assert condition is not None
     tried, matches = 0, []
@@ -70,20 +79,23 @@ def try_rule(
     while query is not None and tried < MAX_TRIED:
         page, query = _page(store, query)
         tried += len(page)
-        matches += [(event, at) for event, at in page if match(condition, event, zones) is not None]
-    state, fired = RuleState(), []
+        matches += [(_gist(event), at) for event, at in page if match(condition, event, zones) is not None]
+    state, alerts, latest = RuleState(), 0, deque[JsonObject](maxlen=EXAMPLES)
     for event, time_ns in reversed(matches):
         verdict, state = judge_event(rule, state, event, time_ns, timezone)
         if verdict is Verdict.ALERT:
-            fired.append(event)
+            alerts += 1
+            latest.appendleft(event)
     suppressed = {str(verdict): state.suppressed.get(verdict, 0) for verdict in SUPPRESSED}
-    return DryRun(tried, len(matches), len(fired), suppressed, fired[: -EXAMPLES - 1 : -1], query is None)
+    return DryRun(tried, len(matches), alerts, suppressed, list(latest), query is None)
+
+
+def _gist(event: JsonObject) -> JsonObject:
+    return {name: event[name] for name in ("id", "replaces", "time_utc")}
 
 
 def _page(store: Store, query: Query) -> tuple[list[tuple[JsonObject, int]], Query | None]:
-    """Return a page of events, newest first, each with its start; and the query of the next page or None."""
+    """Return a page of events, each with its start, and the query of the next page or None."""
     events, cursor = store.find(query)
     dated = [(event, utc_ns(event["time_utc"])) for event in events if event["time_utc"] is not None]
-    if cursor is None:
-        return dated, None
-    return dated, Query(since_ns=query.since_ns, until_ns=query.until_ns, limit=query.limit, before=cursor)
+    return dated, None if cursor is None else replace(query, before=cursor)

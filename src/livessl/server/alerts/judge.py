@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from livessl.clock import Clock
@@ -11,8 +11,9 @@ from livessl.core.commission.finding import Finding
 from livessl.server.alerts.conditions import ConditionWatch, Observed, observe_arrays, observe_findings
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.outbox import Outbox, Raised
-from livessl.server.alerts.rules import RuleState, Verdict, Zones, judge_event, match
+from livessl.server.alerts.rules import RuleState, Verdict, judge, judge_event, match
 from livessl.server.api.encode import JsonObject
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
 
 
@@ -26,6 +27,8 @@ class Judge:
     outbox : Outbox
         Has the states of before, and takes the new ones with what is raised.
     messages : AlertMessages
+    zones : callable
+        Returns the zones that are in force.
 
     Raises
     ------
@@ -33,17 +36,21 @@ class Judge:
         If the states cannot be read or kept.
     """
 
-    def __init__(self, site: Site, clock: Clock, outbox: Outbox, messages: AlertMessages) -> None:
+    def __init__(
+        self, site: Site, clock: Clock, outbox: Outbox, messages: AlertMessages, zones: Callable[[], ZoneMap]
+    ) -> None:
         self._site = site.site
         self._rules = site.alerts.rules
         self._zone = site.alerts.timezone
         self._clock = clock
         self._outbox = outbox
         self._messages = messages
-        self._zones = Zones(site)
+        self._zones = zones
         self._lock = threading.Lock()
         self._watches = {
-            name: ConditionWatch(rule, self._zone) for name, rule in self._rules.items() if rule.kind != "events"
+            name: ConditionWatch(rule, self._zone)
+            for name, rule in self._rules.items()
+            if rule.kind in ("arrays", "findings")
         }
         stored = outbox.states()
         self._states = {name: _restored(stored.get(name), armed=rule.armed) for name, rule in self._rules.items()}
@@ -90,6 +97,7 @@ class Judge:
         OutboxError
             If nothing could be kept; then nothing has happened, and the events can be judged again.
         """
+        zones = self._zones()
         with self._lock:
             states: dict[str, RuleState] = {}
             raised: dict[str, Raised] = {}
@@ -97,7 +105,7 @@ class Judge:
                 for name, rule in self._rules.items():
                     if rule.events is None or (early and not rule.events.early):
                         continue
-                    found = match(rule.events, event, self._zones)
+                    found = match(rule.events, event, zones)
                     if found is None:
                         continue
                     key, *older = (self._messages.key(name, each) for each in (event["id"], *event["replaces"]))
@@ -110,6 +118,34 @@ class Judge:
                         alert = self._messages.of_event(name, event, found, rule.events.count, now_ns)
                         raised[key] = Raised(alert, time_ns, rule.actions)
             return self._commit(list(raised.values()), states, until_ns)
+
+    def judge_changes(self, changes: Sequence[tuple[JsonObject, int]]) -> list[JsonObject]:
+        """Judge what tracks do in zones, each with its site time in nanoseconds; return the new alerts.
+
+        Raises
+        ------
+        OutboxError
+            If nothing could be kept.
+        """
+        with self._lock:
+            states: dict[str, RuleState] = {}
+            raised: list[Raised] = []
+            for change, time_ns in changes:
+                for name, rule in self._rules.items():
+                    watched = rule.tracks
+                    if (
+                        watched is None
+                        or change["zone"] not in watched.zones
+                        or change["change"] not in watched.changes
+                    ):
+                        continue
+                    state = states.get(name, self._states[name])
+                    verdict = judge(rule, state, time_ns, self._zone)
+                    states[name] = state.noting(verdict, time_ns)
+                    if verdict is Verdict.ALERT:
+                        alert = self._messages.of_change(name, change, time_ns, self._clock.now_ns())
+                        raised.append(Raised(alert, time_ns, rule.actions))
+            return self._commit(raised, states)
 
     def judge_conditions(
         self, arrays: Sequence[JsonObject], findings: Sequence[Finding] | None, now_ns: int

@@ -55,6 +55,18 @@ class AlertMessages:
             "event": event,
             "array": None,
             "finding": None,
+            "change": None,
+        }
+
+    def of_change(self, rule: str, change: JsonObject, time_ns: int, raised_ns: int) -> JsonObject:
+        """Return the alert about a track that enters, leaves, or loiters in a zone."""
+        subject = f"track {change['track_id']} {change['change']} {change['zone']} {time_ns}"
+        inside = {"name": change["zone"], "probability": change["probability"]}
+        return {
+            **self._of_condition(rule, subject, time_ns, raised_ns, _change_text(change)),
+            "zones": change["zones"],
+            "membership": [inside],
+            "change": change,
         }
 
     def of_array(self, rule: str, array: JsonObject, since_ns: int, raised_ns: int) -> JsonObject:
@@ -86,6 +98,7 @@ class AlertMessages:
             "event": None,
             "array": seen.get("array"),
             "finding": seen.get("finding"),
+            "change": None,
         }
 
     def _head(self, rule: str, subject: str, raised_ns: int) -> JsonObject:
@@ -119,6 +132,14 @@ def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> st
     inside = "".join(f", in zone {name!r} with probability {value:.2f}" for name, value in zones.items())
     level = "" if event["level_dbfs"] is None else f", {event['level_dbfs']:.1f} dBFS"
     return f"{what}{where}{inside}, confidence {event['confidence']:.2f}{level}, {event['duration_s']:.2f} s long"
+
+
+def _change_text(change: JsonObject) -> str:
+    """Return what a track did, where and for how long, in one line."""
+    done = {"enter": "has entered", "leave": "has left", "loiter": "stays in"}[change["change"]]
+    stay = "" if change["change"] == "enter" else f" after {change['stay_s']:.1f} s"
+    x, y, z = change["position_m"]
+    return f"track {change['track_id']} {done} zone {change['zone']!r}{stay}, at ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
 def _total_std_m(covariance_m2: Any) -> float:

@@ -29,15 +29,22 @@ MAX_WAITING: Final = 1000
 BUSY_S: Final = 1.0
 """Longest wait, in seconds, for a file that another program has locked."""
 
+NO_ACTION: Final = "the site file no longer has this action"
+"""Why an alert was given up whose action was removed."""
+
 CURE: Final = "free space on its disk, or close the program that locks the file"
 
 
 class DeliveryState(StrEnum):
-    """Progress of one alert to one action: it waits for the next attempt, arrived, or was given up (a dead letter)."""
+    """Progress of one alert to one action.
+
+    It waits for the next attempt, arrived, was given up (a dead letter), or was dismissed by an operator after that.
+    """
 
     WAITING = "waiting"
     DELIVERED = "delivered"
     DEAD = "dead"
+    DISMISSED = "dismissed"
 
 
 class Raised(NamedTuple):
@@ -175,6 +182,11 @@ class Outbox:
         rows = self._rows("SELECT until_ns FROM judged WHERE site = ?", (site,))
         return int(rows[0][0]) if rows else None
 
+    def forget_judged(self, site: str) -> None:
+        """Forget how far the events of a site are judged: nobody judges them any more."""
+        with self._kept() as db:
+            db.execute("DELETE FROM judged WHERE site = ?", (site,))
+
     def due(self, action: str, now_ns: int, longest_wait_ns: int) -> Due | None:
         """Return the delivery that is due first, None if none is.
 
@@ -226,6 +238,31 @@ class Outbox:
                 (DeliveryState.WAITING, now_ns, number, DeliveryState.DEAD),
             ).rowcount
         return found > 0
+
+    def abandon(self, actions: Iterable[str]) -> int:
+        """Give up what waits for any action but these, which the site has; return how many alerts that are."""
+        known = list(actions)
+        marks = ", ".join("?" * len(known))
+        with self._kept() as db:
+            return db.execute(
+                f"UPDATE deliveries SET state = ?, error = ? WHERE state = ? AND action NOT IN ({marks})",  # noqa: S608 - question marks
+                (DeliveryState.DEAD, NO_ACTION, DeliveryState.WAITING, *known),
+            ).rowcount
+
+    def action_of_dead(self, number: int) -> str | None:
+        """Return the name of the action that has given up a dead letter; None if there is none of that number."""
+        sql = "SELECT action FROM deliveries WHERE number = ? AND state = ?"
+        rows = self._rows(sql, (number, DeliveryState.DEAD))
+        return str(rows[0][0]) if rows else None
+
+    def dismiss(self, number: int | None = None, action: str | None = None) -> int:
+        """Dismiss the dead letter of that number, those of an action, or all; return how many there were."""
+        with self._kept() as db:
+            return db.execute(
+                "UPDATE deliveries SET state = ? WHERE state = ? AND (? IS NULL OR number = ?) "
+                "AND (? IS NULL OR action = ?)",
+                (DeliveryState.DISMISSED, DeliveryState.DEAD, number, number, action, action),
+            ).rowcount
 
     def recent(self, limit: int, before: int | None = None, rule: str | None = None) -> list[tuple[int, JsonObject]]:
         """Return alerts, newest first, each with its number; those before a number, and of one rule, if given."""

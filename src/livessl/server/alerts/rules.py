@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Final, Self
 
-import numpy as np
-
-from livessl.core.types import FloatArray
-from livessl.server.alerts.membership import probability_in
 from livessl.server.alerts.schedule import is_open
 from livessl.server.api.encode import JsonObject
+from livessl.server.zones.shapes import ZoneMap
 from livessl.site.alert_models import AlertRule, EventCondition
-from livessl.site.build.grid import search_grid
-from livessl.site.models import Site
 
 NS_PER_S: Final = 1_000_000_000
 
@@ -23,12 +18,20 @@ MAX_ALERTED: Final = 16
 """Past alerts of a rule whose hold-off is remembered; a final result comes less than so many alerts after its early
 one."""
 
+MAX_NOTED: Final = 64
+"""Events of a rule whose verdict is remembered, so that one that is judged again is counted once. A final result comes
+less than so many matches after its early one."""
+
 
 class Verdict(StrEnum):
-    """Decision of a rule about an event or a condition; all but the first two are counted as suppressed."""
+    """Decision of a rule about an event or a condition; all but the first three are counted as suppressed.
+
+    `counted`: an earlier alert about several events has counted this one.
+    """
 
     ALERT = "alert"
     NO_MATCH = "no-match"
+    COUNTED = "counted"
     DISARMED = "disarmed"
     OFF_SCHEDULE = "off-schedule"
     COUNTING = "counting"
@@ -54,6 +57,10 @@ class RuleState:
         Site times of what alerted last, oldest first: several, because a sound may be judged out of turn.
     recent : tuple of (int, str)
         Site time and id of the events that count towards the next alert.
+    counted : tuple of str
+        Ids of events that counted towards the last alerts, and count no more when they are judged again.
+    noted : tuple of str
+        Ids of the last events that did not alert and are counted as suppressed.
     ongoing : tuple of str
         Conditions that have alerted and still last, such as an array that is lost.
     alerts : int
@@ -67,6 +74,8 @@ class RuleState:
     armed_since_ns: int = 0
     alerted_ns: tuple[int, ...] = ()
     recent: tuple[tuple[int, str], ...] = ()
+    counted: tuple[str, ...] = ()
+    noted: tuple[str, ...] = ()
     ongoing: tuple[str, ...] = ()
     alerts: int = 0
     suppressed: Mapping[str, int] = field(default_factory=dict)
@@ -79,6 +88,8 @@ class RuleState:
             "armed_since_ns": self.armed_since_ns,
             "alerted_ns": list(self.alerted_ns),
             "recent": [list(each) for each in self.recent],
+            "counted": list(self.counted),
+            "noted": list(self.noted),
             "ongoing": list(self.ongoing),
             "alerts": self.alerts,
             "suppressed": dict(self.suppressed),
@@ -88,8 +99,8 @@ class RuleState:
     def restored(cls, stored: Mapping[str, Any]) -> Self:
         """Return the state that `as_json` gave."""
         recent = tuple((int(time_ns), str(event_id)) for time_ns, event_id in stored["recent"])
-        tuples = {"alerted_ns": tuple(stored["alerted_ns"]), "recent": recent, "ongoing": tuple(stored["ongoing"])}
-        return cls(**{**stored, **tuples})
+        tuples = {name: tuple(stored.get(name, ())) for name in ("alerted_ns", "counted", "noted", "ongoing")}
+        return cls(**{**stored, **tuples, "recent": recent})
 
     @property
     def last_ns(self) -> int | None:
@@ -118,29 +129,8 @@ class Match:
         return max(self.zones.values(), default=None)
 
 
-class Zones:
-    """The zones of a site, and the volume that is searched.
-
-    Parameters
-    ----------
-    site : Site
-    """
-
-    def __init__(self, site: Site) -> None:
-        self._volume_m = np.array(search_grid(site).bounds_m, dtype=np.float64)
-        self._boxes_m: dict[str, FloatArray] = {
-            name: np.array(zone.bounds_m, dtype=np.float64) for name, zone in site.zones.items()
-        }
-
-    def probability(self, zone: str, event: JsonObject) -> float:
-        """Return the probability that an event with a position lies in a zone."""
-        position_m = np.array(event["position_m"], dtype=np.float64)
-        covariance_m2 = np.array(event["covariance_m2"], dtype=np.float64)
-        return probability_in(position_m, covariance_m2, self._boxes_m[zone], self._volume_m)
-
-
-def match(condition: EventCondition, event: JsonObject, zones: Zones) -> Match | None:
-    """Return how an event meets a condition, None if it does not; a refused event meets none."""
+def match(condition: EventCondition, event: JsonObject, zones: ZoneMap) -> Match | None:
+    """Return how an event meets a condition, None if it does not; a refused or an excluded event meets none."""
     if event["status"] not in condition.statuses or event["position_m"] is None:
         return None
     if event["confidence"] < condition.min_confidence or event["duration_s"] < condition.min_duration_s:
@@ -148,11 +138,23 @@ def match(condition: EventCondition, event: JsonObject, zones: Zones) -> Match |
     level = event["level_dbfs"]
     if condition.min_level_dbfs is not None and (level is None or level < condition.min_level_dbfs):
         return None
-    if not condition.zones:
-        return Match()
-    found = {zone: zones.probability(zone, event) for zone in condition.zones}
+    position_m, covariance_m2 = event["position_m"], event["covariance_m2"]
+    # a rule can be older than a zone: one that was deleted holds nothing
+    named = [zone for zone in condition.zones if zone in zones.zones]
+    found = {zone: zones.probability(zone, position_m, covariance_m2) for zone in named}
     inside = {zone: probability for zone, probability in found.items() if probability >= condition.probability}
-    return Match(inside) if inside else None
+    if (condition.zones and not inside) or _is_excluded(event, zones):
+        return None
+    return Match(inside)
+
+
+def _is_excluded(event: JsonObject, zones: ZoneMap) -> bool:
+    """Return whether an event was excluded when it was located, or is by the zones now, as for a dry run."""
+    if event.get("excluded", False):
+        return True
+    fans = [name for name, zone in zones.zones.items() if zone.exclude]
+    found = {name: zones.probability(name, event["position_m"], event["covariance_m2"]) for name in fans}
+    return bool(zones.excluding(zones.holding(event["position_m"]) if fans else [], found))
 
 
 def judge_event(
@@ -175,20 +177,43 @@ def judge_event(
     verdict = judge(rule, state, time_ns, zone)
     condition = rule.events
     assert condition is not None
-    if verdict in (Verdict.DISARMED, Verdict.OFF_SCHEDULE):
+    same = {event["id"], *event["replaces"]}
+    if not same.isdisjoint(state.counted):
+        kept = max(MAX_NOTED, 2 * condition.count)
+        return Verdict.COUNTED, replace(state, counted=_newest(state.counted, [event["id"]], kept))
+    if condition.within_s is not None and verdict not in (Verdict.DISARMED, Verdict.OFF_SCHEDULE):
+        verdict, state = _count(condition, condition.within_s, verdict, state, (time_ns, event["id"]), same)
+    if verdict not in SUPPRESSED:
         return verdict, state.noting(verdict, time_ns)
-    if condition.within_s is not None:
-        same = {event["id"], *event["replaces"]}
-        span_ns = round(condition.within_s * NS_PER_S)
-        recent = [(at, name) for at, name in state.recent if name not in same]
-        recent = sorted([*recent, (time_ns, event["id"])])
-        recent = [each for each in recent if each[0] > recent[-1][0] - span_ns]
-        if len(recent) < condition.count:
-            verdict = Verdict.COUNTING
-        elif verdict is Verdict.ALERT:
-            recent = []
-        state = replace(state, recent=tuple(recent[-condition.count :]))
-    return verdict, state.noting(verdict, time_ns)
+    noted = _newest(state.noted, [event["id"]], MAX_NOTED)
+    if same.isdisjoint(state.noted):
+        state = state.noting(verdict, time_ns)
+    return verdict, replace(state, noted=noted)
+
+
+def _count(
+    condition: EventCondition,
+    within_s: float,
+    verdict: Verdict,
+    state: RuleState,
+    new: tuple[int, str],
+    same: Collection[str],
+) -> tuple[Verdict, RuleState]:
+    """Count an event, its time and id, in place of the `same` ones; return the verdict that follows, and the state."""
+    recent = sorted([*(each for each in state.recent if each[1] not in same), new])
+    recent = [each for each in recent if each[0] > recent[-1][0] - round(within_s * NS_PER_S)]
+    if len(recent) < condition.count:
+        verdict = Verdict.COUNTING
+    elif verdict is Verdict.ALERT:
+        kept = max(MAX_NOTED, 2 * condition.count)
+        state = replace(state, counted=_newest(state.counted, [name for _, name in recent], kept))
+        recent = []
+    return verdict, replace(state, recent=tuple(recent[-condition.count :]))
+
+
+def _newest(known: Sequence[str], new: Sequence[str], most: int) -> tuple[str, ...]:
+    """Return known and new ids, each once, the oldest dropped beyond `most`."""
+    return tuple(dict.fromkeys((*known, *new)))[-most:]
 
 
 def judge(rule: AlertRule, state: RuleState, time_ns: int, zone: str | None) -> Verdict:

@@ -12,28 +12,31 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Final
 
 from livessl.clock import Clock
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import FRAME_NS
 from livessl.server.alerts.actions import ActionSetting, make_action
+from livessl.server.alerts.backlog import Backlog, Batch, final_until_ns
 from livessl.server.alerts.courier import NS_PER_S, REST_S, Courier
-from livessl.server.alerts.history import DryRun, past_events, try_rule
+from livessl.server.alerts.history import DryRun, past_pages, try_rule
 from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
-from livessl.server.alerts.rules import RuleState, Zones
+from livessl.server.alerts.rules import RuleState
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
+from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.alert_checks import outbox_file
 from livessl.site.models import Site
 
-MAX_QUEUE: Final = 1000
-"""Most batches of events that wait to be judged: hours of sounds, unless the outbox's disk is full."""
+MAX_CHANGES: Final = 1000
+"""Most changes of tracks that wait to be judged."""
 
 POLL_S: Final = 0.5
 """Interval, in seconds, at which arrays and findings are looked at."""
@@ -49,11 +52,8 @@ STOP_S: Final = 3.0
 _log = logging.getLogger(__name__)
 
 
-class _Batch(NamedTuple):
-    """Events with their starts; for final ones, the site time before which all events are final, otherwise None."""
-
-    events: Sequence[tuple[JsonObject, int]]
-    until_ns: int | None
+class DryRunBusyError(Exception):
+    """Another dry run is under way."""
 
 
 class Alerts:
@@ -75,6 +75,8 @@ class Alerts:
         Gets each alert for subscribers, on the thread of the alerts.
     url : str
         Address of the server, for links, unless the site file gives another one.
+    zones : callable or None
+        Returns the zones that are in force; None for those of the site.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class Alerts:
         site_time: SiteTime,
         publish: Callable[[JsonObject], None],
         url: str = "",
+        zones: Callable[[], ZoneMap] | None = None,
     ) -> None:
         self._site = site
         self._config = site.alerts
@@ -106,22 +109,24 @@ class Alerts:
         kinds = {rule.kind for rule in self._config.rules.values()}
         self._judges_events = "events" in kinds
         self._judges_early = any(rule.events and rule.events.early for rule in self._config.rules.values())
-        self._judges_conditions = bool(kinds - {"events"})
-        self.outbox = Outbox(outbox_file(site) if self._config.rules else None)
+        self._judges_tracks = "tracks" in kinds
+        self._judges_conditions = not kinds.isdisjoint(("arrays", "findings"))
+        self._zones = fixed_zones(site) if zones is None else zones
+        self.outbox = Outbox(_outbox_path(site))
         """Alerts, deliveries and the rules' states."""
         base = self._config.url or url + site.server.http.root_path
         try:
-            self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base))
+            self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base), self._zones)
             self.couriers = {name: self._courier(name, base) for name in self._config.actions}
             """The courier of each action, by name."""
+            self._leave_the_past()
         except BaseException:
             self.outbox.close()
             raise
-        self._queue: deque[_Batch] = deque()
-        self._missed: tuple[int, int] | None = None  # site time from and before which events did not fit into the queue
-        self._missing = threading.Lock()
-        self.unqueued = 0
-        """Events that did not fit into the queue; final ones are judged from the store instead."""
+        self._backlog = Backlog(site.site, store)
+        self._changes: deque[tuple[JsonObject, int]] = deque()
+        self.changes_lost = 0
+        """Changes of tracks that did not fit into the queue."""
         self._expired_ns = 0
         self._is_failing = False
         self._trying = threading.Lock()
@@ -134,35 +139,47 @@ class Alerts:
     def _courier(self, name: str, url: str) -> Courier:
         config = self._config.actions[name]
         rules = [rule for rule, each in self._config.rules.items() if name in each.actions]
-        others = sorted((self._config.rules.keys() | self.outbox.states().keys()) - set(rules))
+        alike = {other for other, each in self._config.actions.items() if each.kind == config.kind}
+        taken = {rule for rule, each in self._config.rules.items() if not alike.isdisjoint(each.actions)}
+        others = sorted((self._config.rules.keys() | self.outbox.states().keys()) - taken)
         action = make_action(ActionSetting(name, config, self._site, self._clock, rules, others, url))
         return Courier(name, config, action, self.outbox, self._clock)
 
+    def _leave_the_past(self) -> None:
+        """Close what a former site file began: rules on events that come back later must not judge the time between."""
+        if not self._judges_events:
+            self.outbox.forget_judged(self._site.site)
+        if gone := self.outbox.abandon(self.couriers):
+            _log.warning("%d alerts waited for actions that the site file no longer has; they are dead letters", gone)
+
     # --- for the fusion thread
+
+    @property
+    def unqueued(self) -> int:
+        """Events that did not fit into the queue; final ones are judged from the store instead."""
+        return self._backlog.unqueued
 
     def take_early(self, event: JsonObject, time_ns: int) -> None:
         """Take in an event that may still be replaced, and its start in site time."""
-        if not self._judges_early:
-            return
-        if len(self._queue) < MAX_QUEUE:
-            self._queue.append(_Batch([(event, time_ns)], None))
+        if self._judges_early:
+            self._backlog.add_early(event, time_ns)
             self._wake()
-        else:  # its final result is judged all the same
-            self.unqueued += 1
 
     def take_final(self, events: Sequence[tuple[JsonObject, int]], until: int) -> None:
         """Take in final events, each with its start, and the frame index before which all events are final."""
-        if not self._judges_events:
+        if self._judges_events:
+            self._backlog.add_final(events, until * FRAME_NS)
+            self._wake()
+
+    def take_change(self, change: JsonObject, time_ns: int) -> None:
+        """Take in what a track does in a zone, and its site time; what does not fit is given up, and counted."""
+        if not self._judges_tracks:
             return
-        until_ns = until * FRAME_NS
-        with self._missing:
-            if self._missed is None and len(self._queue) < MAX_QUEUE:
-                self._queue.append(_Batch(events, until_ns))
-            else:  # and so on until the missed ones are judged, so that all are judged in order
-                self.unqueued += len(events)
-                first_ns = min(time_ns for _, time_ns in events)
-                self._missed = (first_ns if self._missed is None else self._missed[0], until_ns)
-        self._wake()
+        if len(self._changes) < MAX_CHANGES:
+            self._changes.append((change, time_ns))
+            self._wake()
+        else:
+            self.changes_lost += 1
 
     # --- for the API
 
@@ -171,7 +188,7 @@ class Alerts:
         """Sentences for the reasons of `health`."""
         found = []
         if self._is_failing:
-            found.append(f"alerts.outbox: cannot be used, so that alerts wait: {len(self._queue)} batches of events")
+            found.append(f"alerts.outbox: cannot be used, so that alerts wait: {len(self._backlog)} batches of events")
         for (action, state), count in self.counts().items():
             if state == DeliveryState.DEAD:
                 what = "1 alert was" if count == 1 else f"{count} alerts were"
@@ -195,23 +212,46 @@ class Alerts:
         """Arm or disarm a rule: see `Judge.arm`."""
         self._judge.arm(rule, armed)
 
-    def resend(self, number: int) -> bool:
-        """Let a dead letter be delivered again; False if there is none of that number."""
-        found = self.outbox.resend(number, self._clock.now_ns())
+    def resend(self, number: int) -> None:
+        """Let a dead letter be delivered again.
+
+        Raises
+        ------
+        LookupError
+            If there is none of that number, or the site file no longer has its action.
+        """
+        action = self.outbox.action_of_dead(number)
+        if action is None:
+            raise LookupError(f"no dead letter {number}; GET alerts/dead-letters lists them")
+        if action not in self.couriers:
+            cure = "add it to alerts.actions, or dismiss the dead letter with DELETE"
+            raise LookupError(
+                f"dead letter {number} is for action {action!r}, which the site file does not have; {cure}"
+            )
+        self.outbox.resend(number, self._clock.now_ns())
         self._wake_couriers()
-        return found
 
     def dry_run(self, rule: str, since_ns: int, before_ns: int) -> DryRun:
-        """Return what a rule on events would have done in a span of site time; one call runs at a time."""
-        with self._trying:
-            zones, zone = Zones(self._site), self._config.timezone
-            return try_rule(self._config.rules[rule], self._store, zones, zone, since_ns, before_ns)
+        """Return what a rule on events would have done in a span of site time.
+
+        Raises
+        ------
+        DryRunBusyError
+            If another one is under way: each may read a hundred thousand events.
+        """
+        if not self._trying.acquire(blocking=False):
+            raise DryRunBusyError
+        try:
+            rules, zone = self._config.rules, self._config.timezone
+            return try_rule(rules[rule], self._store, self._zones(), zone, since_ns, before_ns)
+        finally:
+            self._trying.release()
 
     # --- the thread
 
     def start(self) -> None:
-        """Begin to judge and to deliver; a site without rules needs no thread."""
-        if not self._config.rules:
+        """Begin to judge and to deliver; a site that never had rules needs no thread."""
+        if not self._config.rules and _outbox_path(self._site) is None:
             return
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, args=(self._loop,), name="alerts", daemon=True)
@@ -273,25 +313,22 @@ class Alerts:
         """Judge the events that became final before a restart and were not judged; at first, skip all of the past."""
         if not self._judges_events:
             return
-        until = self._store.finalized(self._site.site).until
-        final_ns = 0 if until is None else until * FRAME_NS
+        final_ns = final_until_ns(self._store, self._site.site)
         judged_ns = self.outbox.judged_until_ns(self._site.site)
         if judged_ns is None:
             self._judge.skip(final_ns)
         elif final_ns > judged_ns:
-            self._announce(self._judge.judge_events(past_events(self._store, judged_ns, final_ns), final_ns))
+            for page, until_ns in past_pages(self._store, judged_ns, final_ns):
+                self._judge_batch(Batch(page, until_ns))
+
+    def _judge_batch(self, batch: Batch) -> None:
+        self._announce(self._judge.judge_events(batch.events, batch.until_ns, early=batch.until_ns is None))
 
     def _turn(self) -> None:
-        while self._queue:
-            batch = self._queue[0]
-            self._announce(self._judge.judge_events(batch.events, batch.until_ns, early=batch.until_ns is None))
-            self._queue.popleft()
-        while (missed := self._missed) is not None:
-            since_ns, before_ns = missed
-            self._announce(self._judge.judge_events(past_events(self._store, since_ns, before_ns), before_ns))
-            with self._missing:
-                newest = before_ns if self._missed is None else self._missed[1]
-                self._missed = None if newest == before_ns else (before_ns, newest)
+        self._backlog.work_off(self._judge_batch)
+        while self._changes:
+            self._announce(self._judge.judge_changes([self._changes[0]]))
+            self._changes.popleft()
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
             set_up = self._set_up_watch.state
@@ -324,3 +361,9 @@ class Alerts:
         if loop is not None:
             with suppress(RuntimeError):  # it has just been closed
                 loop.call_soon_threadsafe(work)
+
+
+def _outbox_path(site: Site) -> Path | None:
+    """Return the file of the outbox; None for memory. A site without rules uses the one that it had before."""
+    path = outbox_file(site)
+    return path if path is not None and (site.alerts.rules or path.exists()) else None

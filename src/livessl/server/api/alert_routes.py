@@ -13,6 +13,7 @@ from livessl.clock import utc_text
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
 from livessl.server.alerts.schedule import is_open
+from livessl.server.alerts.service import DryRunBusyError
 from livessl.server.api import alert_schema
 from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject
@@ -21,13 +22,18 @@ from livessl.server.parts import Parts
 
 DAY_NS: Final = 86_400_000_000_000
 
+DRY_RUN_RETRY_S: Final = 5
+"""Wait, in seconds, that is asked of a client whose dry run found another one under way."""
+
 _NO_RULE: Final = "There is no rule of that name."
+_NOT_ON_EVENTS: Final = "There is no rule of that name on events: only events are stored."
+_NO_LETTER: Final = "There is no dead letter of that number, or the site file does not have its action."
 _OUTBOX: Final = "The outbox cannot be read or written."
 _log = logging.getLogger(__name__)
 
 
 def alert_routes(parts: Parts) -> APIRouter:
-    """Rules, alerts and dead letters."""
+    """Rules and alerts."""
     alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
 
     @router.get(
@@ -52,36 +58,6 @@ def alert_routes(parts: Parts) -> APIRouter:
         next_before = rows[limit - 1][0] if len(rows) > limit else None
         return as_json({"v": API_VERSION, "alerts": found, "next_before": next_before})
 
-    @router.get(
-        "/dead-letters", response_model=alert_schema.DeadLetterPage, responses=errors(503, texts={503: _OUTBOX})
-    )
-    def get_dead_letters(
-        limit: Annotated[int, Query(ge=1, le=1000, description="most dead letters on a page")] = 50,
-        before: Annotated[
-            int | None, Query(ge=0, le=2**63 - 1, description="`next_before` of the previous page")
-        ] = None,
-    ) -> Response:
-        """Alerts that an action has given up, newest first."""
-        with _outbox_errors():
-            rows = alerts.outbox.dead(limit + 1, before)
-        found = [{**_delivery(delivery), "alert": alert} for delivery, alert in rows[:limit]]
-        next_before = rows[limit - 1][0].number if len(rows) > limit else None
-        return as_json({"v": API_VERSION, "dead_letters": found, "next_before": next_before})
-
-    @router.post(
-        "/dead-letters/{number}/resend",
-        response_model=alert_schema.Resent,
-        responses=errors(404, 411, 413, 503, texts={404: "There is no dead letter of that number.", 503: _OUTBOX}),
-    )
-    def post_resend(number: Annotated[int, Path(ge=1, le=2**63 - 1)], request: Request) -> Response:
-        """Deliver a dead letter again; for operators."""
-        with _outbox_errors():
-            found = alerts.resend(number)
-        if not found:
-            raise HTTPException(404, f"no dead letter {number}; GET alerts/dead-letters lists them")
-        _log.info("%r has sent dead letter %d again", request.scope["client_name"], number)
-        return as_json({"v": API_VERSION, "number": number})
-
     @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
@@ -104,7 +80,7 @@ def alert_routes(parts: Parts) -> APIRouter:
     @router.get(
         "/rules/{name}/dry-run",
         response_model=alert_schema.Tried,
-        responses=errors(404, texts={404: "There is no rule of that name on events: only events are stored."}),
+        responses=errors(404, 503, texts={404: _NOT_ON_EVENTS, 503: "Another dry run is under way."}),
     )
     def get_dry_run(
         name: str, days: Annotated[float, Query(gt=0, le=3660, description="length of the span that ends now")] = 7.0
@@ -115,7 +91,11 @@ def alert_routes(parts: Parts) -> APIRouter:
             raise HTTPException(404, f"rule {name!r} is not on events, and only events are stored")
         now_ns = parts.clock.now_ns()
         since_ns = now_ns - round(days * DAY_NS)
-        tried = alerts.dry_run(name, since_ns, now_ns)
+        try:
+            tried = alerts.dry_run(name, since_ns, now_ns)
+        except DryRunBusyError as error:
+            headers = {"Retry-After": str(DRY_RUN_RETRY_S)}
+            raise HTTPException(503, "another dry run is under way; try again when it has ended", headers) from error
         times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
         span = "day" if days == 1 else f"{days:g} days"
         found = {
@@ -132,6 +112,71 @@ def alert_routes(parts: Parts) -> APIRouter:
             "text": f"rule {name!r} would have alerted {times} in the last {span}",
         }
         return as_json(found)
+
+    return router
+
+
+def dead_letter_routes(parts: Parts) -> APIRouter:
+    """Alerts that an action has given up: they can be delivered again, or dismissed."""
+    alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
+
+    @router.get(
+        "/dead-letters", response_model=alert_schema.DeadLetterPage, responses=errors(503, texts={503: _OUTBOX})
+    )
+    def get_dead_letters(
+        limit: Annotated[int, Query(ge=1, le=1000, description="most dead letters on a page")] = 50,
+        before: Annotated[
+            int | None, Query(ge=0, le=2**63 - 1, description="`next_before` of the previous page")
+        ] = None,
+    ) -> Response:
+        """Alerts that an action has given up, newest first."""
+        with _outbox_errors():
+            rows = alerts.outbox.dead(limit + 1, before)
+        found = [{**_delivery(delivery), "alert": alert} for delivery, alert in rows[:limit]]
+        next_before = rows[limit - 1][0].number if len(rows) > limit else None
+        return as_json({"v": API_VERSION, "dead_letters": found, "next_before": next_before})
+
+    @router.post(
+        "/dead-letters/{number}/resend",
+        response_model=alert_schema.Resent,
+        responses=errors(404, 411, 413, 503, texts={404: _NO_LETTER, 503: _OUTBOX}),
+    )
+    def post_resend(number: Annotated[int, Path(ge=1, le=2**63 - 1)], request: Request) -> Response:
+        """Deliver a dead letter again; for operators."""
+        with _outbox_errors():
+            try:
+                alerts.resend(number)
+            except LookupError as error:
+                raise HTTPException(404, str(error)) from error
+        _log.info("%r has sent dead letter %d again", request.scope["client_name"], number)
+        return as_json({"v": API_VERSION, "number": number})
+
+    @router.delete(
+        "/dead-letters/{number}",
+        response_model=alert_schema.Dismissed,
+        responses=errors(404, 411, 413, 503, texts={404: "There is no dead letter of that number.", 503: _OUTBOX}),
+    )
+    def delete_dead_letter(number: Annotated[int, Path(ge=1, le=2**63 - 1)], request: Request) -> Response:
+        """Dismiss a dead letter: nobody delivers it any more; for operators."""
+        with _outbox_errors():
+            found = alerts.outbox.dismiss(number)
+        if not found:
+            raise HTTPException(404, f"no dead letter {number}; GET alerts/dead-letters lists them")
+        _log.info("%r has dismissed dead letter %d", request.scope["client_name"], number)
+        return as_json({"v": API_VERSION, "dismissed": found})
+
+    @router.delete(
+        "/dead-letters", response_model=alert_schema.Dismissed, responses=errors(411, 413, 503, texts={503: _OUTBOX})
+    )
+    def delete_dead_letters(
+        request: Request,
+        action: Annotated[str | None, Query(description="only those of this action; all if absent")] = None,
+    ) -> Response:
+        """Dismiss all dead letters, or those of an action, which the site need not have any more; for operators."""
+        with _outbox_errors():
+            found = alerts.outbox.dismiss(action=action)
+        _log.info("%r has dismissed %d dead letters", request.scope["client_name"], found)
+        return as_json({"v": API_VERSION, "dismissed": found})
 
     return router
 

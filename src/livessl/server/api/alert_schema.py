@@ -9,23 +9,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.server.alerts.outbox import DeliveryState
-from livessl.server.api.schema import ArrayCondition, Event, UtcTime, Version
+from livessl.server.api.schema import ArrayCondition, Event, Membership, UtcTime, Version
+from livessl.server.api.zone_schema import ZoneChange
 
 RuleName = Annotated[str, Field(description="Name of the rule in the site file.", examples=["door"])]
 ActionName = Annotated[str, Field(description="Name of the action in the site file.", examples=["guard"])]
 Count = Annotated[int, Field(ge=0)]
-
-
-class Membership(BaseModel):
-    """A zone of a rule, and the probability that the sound came from it."""
-
-    name: str = Field(description="Name of the zone.", examples=["door"])
-    probability: float = Field(
-        ge=0,
-        le=1,
-        description="Probability by the event's covariance, given that the sound came from the search volume.",
-        examples=[0.97],
-    )
 
 
 class AlertedArray(BaseModel):
@@ -51,7 +40,7 @@ class AlertedFinding(BaseModel):
 
 
 class Alert(BaseModel):
-    """An alert of a rule about an event, an array or a finding; the other two are null."""
+    """An alert of a rule about an event, a change of a track, an array or a finding; the others are null."""
 
     kind: Literal["alert"]
     key: str = Field(
@@ -75,6 +64,7 @@ class Alert(BaseModel):
     event: Event | None = Field(description="The event, the last one of several.")
     array: AlertedArray | None = Field(description="The array, if the alert is about one.")
     finding: AlertedFinding | None = Field(description="The finding, if the alert is about one.")
+    change: ZoneChange | None = Field(description="What a track did in a zone, if the alert is about that.")
 
 
 class Delivery(BaseModel):
@@ -126,6 +116,7 @@ class RuleKind(StrEnum):
     """Kinds of things that a rule can watch."""
 
     EVENTS = "events"
+    TRACKS = "tracks"
     ARRAYS = "arrays"
     FINDINGS = "findings"
 
@@ -180,6 +171,12 @@ class Resent(_Versioned):
     """Confirmation that a dead letter waits for delivery again."""
 
     number: int = Field(ge=1, description="Number of the delivery.", examples=[17])
+
+
+class Dismissed(_Versioned):
+    """Confirmation that dead letters were dismissed."""
+
+    dismissed: Count = Field(description="Number of dead letters that were dismissed.", examples=[1])
 
 
 class TriedAlert(BaseModel):

@@ -10,14 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.server.api.schema import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
+from livessl.server.api.zone_schema import BoundsM, IntervalM, ZoneShape
 
-IntervalM = Annotated[
-    list[float], Field(min_length=2, max_length=2, description="Lowest and highest coordinate in metres.")
-]
-BoundsM = Annotated[
-    list[IntervalM],
-    Field(min_length=3, max_length=3, description="Intervals in x, y and z.", examples=[[[0, 8], [0, 10], [0, 4]]]),
-]
 BandHz = Annotated[
     list[float],
     Field(
@@ -92,10 +86,12 @@ class ArrayGeometry(BaseModel):
     band_hz: BandHz
 
 
-class ZoneBounds(BaseModel):
-    """A named box of interest."""
+class FloorPlanPlace(BaseModel):
+    """Place of the floor plan's picture, which `GET floor-plan` returns."""
 
-    bounds_m: BoundsM
+    bounds_m: list[IntervalM] = Field(
+        min_length=2, max_length=2, description="Intervals in x and y.", examples=[[[0, 8], [0, 10]]]
+    )
 
 
 class Privacy(BaseModel):
@@ -122,7 +118,9 @@ class Site(_Versioned):
     activity: ActivitySettings
     arrays: dict[str, ArrayGeometry] = Field(description="Arrays by name; a joint array replaces those that it joins.")
     joint: dict[str, list[str]] = Field(description="Names of the arrays that each joint array joins.", examples=[{}])
-    zones: dict[str, ZoneBounds] = Field(description="Zones by name.")
+    zones: dict[str, ZoneShape] = Field(description="Zones by name.")
+    can_draw: bool = Field(description="Whether operators can draw zones.", examples=[True])
+    floor_plan: FloorPlanPlace | None = Field(description="The picture under the plan; null if there is none.")
     privacy: Privacy
 
 
@@ -353,6 +351,7 @@ _REASONS: Final = {
     401: "The token is missing or unknown.",
     403: "The token's role is too low.",
     404: "There is nothing of that name.",
+    409: "Something else owns it or needs it.",
     411: "The body's length is not declared.",
     413: "The body is too long.",
     422: "A parameter or the body is not valid, or a parameter is unknown.",

@@ -16,10 +16,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
 from livessl.server.api import documentation, routes
-from livessl.server.api.alert_routes import alert_routes
+from livessl.server.api.alert_routes import alert_routes, dead_letter_routes
 from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
+from livessl.server.api.clip_routes import clip_routes
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
@@ -27,6 +28,8 @@ from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.set_up_routes import set_up_routes
+from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
 from livessl.server.store import StoreError
 
@@ -40,8 +43,8 @@ def _content_security_policy(page: str) -> str:
     digests = (b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
     admitted = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
     return (
-        f"default-src 'self'; script-src {admitted}; img-src 'self' data:; connect-src 'self' ws: wss:; "
-        "frame-ancestors 'self'"
+        f"default-src 'self'; script-src {admitted}; img-src 'self' data:; "
+        "media-src 'self' blob:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
     )
 
 
@@ -82,6 +85,10 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         history_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
+        dead_letter_routes(parts),
+        zone_routes(parts),
+        set_up_routes(parts),
+        clip_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))

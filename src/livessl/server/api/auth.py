@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -37,6 +38,9 @@ RELOAD_S: Final = 1.0
 
 CLOSE_S: Final = 1.0
 """Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
+
+_SOUND: Final = re.compile(r"/api/v1/events/[^/]*/clips/.+")
+"""Addresses of recordings: sound is for operators, whoever may see where it was."""
 
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 
@@ -198,6 +202,8 @@ def needed_role(method: str, path: str) -> Role | None:
         return None
     if path == ACCESS:
         return Role.ADMIN
+    if _SOUND.fullmatch(path):
+        return Role.OPERATOR
     return Role.VIEWER if method in _READING else Role.OPERATOR
 
 

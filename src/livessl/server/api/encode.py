@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from livessl.clock import utc_text
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
+from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.models import Site
 
 API_VERSION: Final = 1
@@ -58,21 +59,26 @@ class Messages:
     Parameters
     ----------
     site : Site
-        The site, for its zones.
     origin_ns : int
         Site time at which `start_s` is 0: the beginning of the recording or of the live run, in nanoseconds.
     utc : bool
         Whether site time is UTC; it is not where a recording does not say when it was made. Then `time_utc` is null.
+    zones : callable or None
+        Returns the zones that are in force; None for those of the site.
     """
 
-    def __init__(self, site: Site, origin_ns: int, *, utc: bool) -> None:
-        self._site = site
+    def __init__(self, site: Site, origin_ns: int, *, utc: bool, zones: Callable[[], ZoneMap] | None = None) -> None:
+        self._zones = fixed_zones(site) if zones is None else zones
         self._origin_ns = origin_ns
         self._utc = utc
 
     def event(self, event: Event, stages: Stages | None = None, replaces: Sequence[str] = ()) -> JsonObject:
         """Encode an event, with the ids of the early ones that it replaces; the fields of the contract come first."""
         position, covariance, confidence, arrays = where(event.estimate)
+        zones = self._zones()
+        holding = zones.holding(position)
+        inside = {} if position is None else zones.memberships(position, covariance)
+        excluding = zones.excluding(holding, inside)
         return {
             "kind": "event",
             "id": event.id,
@@ -88,7 +94,10 @@ class Messages:
             "heard_by": list(event.heard_by),
             "level_dbfs": dbfs(event.power),
             "contributions": [_contribution(c) for c in event.contributions],
-            "zones": self._site.zones_of(position),
+            "zones": holding,
+            "membership": [{"name": name, "probability": round(value, 4)} for name, value in inside.items()],
+            "excluded": bool(excluding),
+            "excluded_by": excluding,
             "late_frames": event.late_frames,
             "latency_s": round(event.latency_s if stages is None else stages.total, 4),
             "latency_stages_s": _stages(stages),
@@ -114,7 +123,7 @@ class Messages:
             "contributions": [_contribution(c) for c in update.contributions],
             "others": [self._other(other) for other in update.others],
             "candidates": _candidates(update.estimate),
-            "zones": self._site.zones_of(position),
+            "zones": self._zones().holding(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
             "latency_stages_s": _stages(stages),
@@ -126,7 +135,7 @@ class Messages:
             "position_m": position,
             "covariance_m2": covariance,
             "confidence": confidence,
-            "zones": self._site.zones_of(position),
+            "zones": self._zones().holding(position),
         }
 
     def track(self, track: Track) -> JsonObject:
@@ -140,7 +149,7 @@ class Messages:
             "position_m": position,
             "velocity_m_s": _metres(track.velocity_m_s),
             "covariance_m2": [_square_metres(row) for row in track.covariance_m2],
-            "zones": self._site.zones_of(position),
+            "zones": self._zones().holding(position),
         }
 
     def _when(self, time_ns: int) -> JsonObject:

@@ -26,7 +26,6 @@ from livessl.server.history.heat_map import Cells
 from livessl.server.parts import Parts
 from livessl.server.store import Query as EventQuery
 from livessl.site.build.grid import search_grid
-from livessl.site.models import Site
 
 MAX_CELLS: Final = 250_000
 """Most cells of a heat map: those of a hall of 50 m x 50 m at 0.1 m."""
@@ -43,15 +42,16 @@ _UNCHANGED: Final[dict[int | str, dict[str, Any]]] = {
 def history_routes(parts: Parts) -> APIRouter:
     """Events, exports and heat map."""
     router = APIRouter()
-    searched = Depends(_filters(parts.site))
+    searched = Depends(_filters(parts))
     _add_events(router, parts, searched)
     _add_exports(router, parts, searched)
     _add_heat_map(router, parts, searched)
     return router
 
 
-def _filters(site: Site) -> Callable[..., EventQuery]:
+def _filters(parts: Parts) -> Callable[..., EventQuery]:
     """The query parameters that all searches share."""
+    site = parts.site
 
     def filters(
         since: Annotated[Time | None, Query(description="only events that began then or later; RFC 3339")] = None,
@@ -76,8 +76,9 @@ def _filters(site: Site) -> Callable[..., EventQuery]:
             ),
         ] = None,
     ) -> EventQuery:
-        if zone is not None and zone not in site.zones:
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+        zones = parts.zone_book.current.zones
+        if zone is not None and zone not in zones:
+            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
         known = [*dict.fromkeys([*array_names(site), *(spec.name for spec in site.specs)])]
         if array is not None and array not in known:
             raise HTTPException(404, f"no array {array!r}; there are {', '.join(known)}")

@@ -34,6 +34,7 @@ POLICY_VIOLATION: Final = 1008
 def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
     """The WebSocket of messages and the WebSocket of power maps."""
     site, fanout, router = parts.site, parts.fanout, APIRouter()
+    book = parts.zone_book
 
     @router.websocket(LIVE)
     async def live(
@@ -47,7 +48,7 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
         try:
             _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.LiveParameters)
-            wanted = queries.live_filter(site, kinds, min_confidence, zone)
+            wanted = queries.live_filter(book.current.zones, kinds, min_confidence, zone)
             since = queries.message_number("since_seq", since_seq)
         except ValueError as error:
             await _refuse(socket, error)

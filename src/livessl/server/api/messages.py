@@ -30,6 +30,7 @@ from livessl.server.api.schema import (
     Version,
     Zones,
 )
+from livessl.server.api.zone_schema import ZoneChange, ZoneShape
 
 Overloaded = Annotated[
     str | None,
@@ -102,6 +103,17 @@ class AlertMessage(_Numbered, Alert):
     """An alert of a rule; the rule's actions deliver it as well."""
 
 
+class ZoneMessage(_Numbered, ZoneChange):
+    """What a track does in a zone: it enters, leaves, or loiters."""
+
+
+class ZonesMessage(_Numbered):
+    """The zones in force, after an operator has drawn or deleted one."""
+
+    kind: Literal["zones"]
+    by_name: dict[str, ZoneShape] = Field(description="All zones by name.")
+
+
 class Gap(BaseModel):
     """Notice of messages that this client will not get; it has no number of its own."""
 
@@ -123,12 +135,22 @@ MESSAGES: Final[tuple[type[BaseModel], ...]] = (
     TrackMessage,
     ArraysMessage,
     AlertMessage,
+    ZoneMessage,
+    ZonesMessage,
     Gap,
 )
 """Every message of the live WebSocket."""
 
 Message = Annotated[
-    Hello | EventMessage | UpdateMessage | TrackMessage | ArraysMessage | AlertMessage | Gap,
+    Hello
+    | EventMessage
+    | UpdateMessage
+    | TrackMessage
+    | ArraysMessage
+    | AlertMessage
+    | ZoneMessage
+    | ZonesMessage
+    | Gap,
     Field(discriminator="kind"),
 ]
 """One message of the live WebSocket; `kind` selects its model."""

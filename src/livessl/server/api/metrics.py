@@ -11,6 +11,7 @@ from prometheus_client.registry import Collector
 
 from livessl.core.commission.finding import Severity
 from livessl.server.api.alert_metrics import alert_metrics
+from livessl.server.api.clip_metrics import clip_metrics
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.report_metrics import report_metrics
 from livessl.server.parts import Parts
@@ -48,6 +49,7 @@ class _Metrics(Collector):
         yield from server_metrics(self._parts)
         yield from event_metrics(self._parts)
         yield from alert_metrics(self._parts)
+        yield from clip_metrics(self._parts)
         arrays = self._parts.array_states.describe()
         yield from array_metrics(arrays)
         yield from report_metrics(arrays)

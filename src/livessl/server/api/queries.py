@@ -18,7 +18,7 @@ from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
 from livessl.site.models import Site
 
-KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert"})
+KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "zone", "zones"})
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
 
 
@@ -27,7 +27,8 @@ class LiveParameters(BaseModel):
 
     kinds: str | None = Field(
         default=None,
-        description="Message kinds, separated by commas: alert, arrays, event, track, update. All if absent.",
+        description="Message kinds, separated by commas: alert, arrays, event, track, update, zone, zones. All if "
+        "absent.",
         examples=["event,track"],
     )
     min_confidence: float = Field(
@@ -35,7 +36,7 @@ class LiveParameters(BaseModel):
     )
     zone: str | None = Field(
         default=None,
-        description="Only events, updates, tracks and alerts inside this zone are sent.",
+        description="Only events, updates, tracks, changes and alerts inside this zone are sent.",
         examples=["door"],
     )
     since_seq: int | None = Field(
@@ -136,8 +137,8 @@ def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
         raise unprocessable(name, f"{name}: {error}") from error
 
 
-def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
-    """Filter of a live subscriber.
+def live_filter(zones: Collection[str], kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
+    """Filter of a live subscriber, on a site with these zones.
 
     Raises
     ------
@@ -153,8 +154,8 @@ def live_filter(site: Site, kinds: str | None, min_confidence: str, zone: str | 
         least = float("nan")
     if not 0.0 <= least <= 1.0:
         raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
-    if zone is not None and zone not in site.zones:
-        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(site.zones) or 'none'}")
+    if zone is not None and zone not in zones:
+        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
     return Filter(chosen, least, zone)
 
 

@@ -51,14 +51,15 @@ def as_json(found: JsonObject, status: int = 200) -> Response:
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
-def describe_site(site: Site, mode: str) -> JsonObject:
+def describe_site(parts: Parts) -> JsonObject:
     """Geometry and settings, for clients that draw."""
+    site, picture = parts.site, parts.floor_plan
     grid = search_grid(site)
     return {
         "v": API_VERSION,
         "site": site.site,
         "version": __version__,
-        "mode": mode,
+        "mode": parts.site_time.mode,
         "room": {"size_m": list(site.room.size_m)},
         "grid": {"bounds_m": [list(b) for b in grid.bounds_m], "spacing_m": grid.spacing_m, "shape": list(grid.shape)},
         "speed_of_sound_m_s": site.c_m_s,
@@ -75,7 +76,9 @@ def describe_site(site: Site, mode: str) -> JsonObject:
             for spec in site.processed
         },
         "joint": {name: list(members) for name, members in site.joint.items()},
-        "zones": {name: {"bounds_m": [list(b) for b in zone.bounds_m]} for name, zone in site.zones.items()},
+        "zones": parts.zone_book.describe(),
+        "can_draw": site.zones_file is not None,
+        "floor_plan": None if picture is None else {"bounds_m": [list(b) for b in picture.bounds_m]},
         "privacy": _privacy(site),
     }
 
@@ -99,7 +102,7 @@ def state_routes(parts: Parts) -> APIRouter:
     @router.get("/api/v1/site", tags=["state"], response_model=answers.Site)
     def get_site() -> Response:
         """Room, grid, arrays and settings."""
-        return as_json(describe_site(site, parts.site_time.mode))
+        return as_json(describe_site(parts))
 
     @router.get("/api/v1/arrays", tags=["state"], response_model=answers.Arrays)
     def get_arrays() -> Response:
@@ -164,7 +167,7 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
         reasons.append(parts.store.problem)
     if (unkept or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
-    problems = parts.alerts.problems
+    problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if problems and status == "ok":
         status = "degraded"
     reasons += problems

@@ -175,6 +175,18 @@ Candidates = Annotated[
 ]
 
 
+class Membership(BaseModel):
+    """A zone, and the probability that the sound came from it."""
+
+    name: str = Field(description="Name of the zone.", examples=["door"])
+    probability: float = Field(
+        ge=0,
+        le=1,
+        description="Probability by the event's covariance, given that the sound came from the search volume.",
+        examples=[0.97],
+    )
+
+
 class Event(BaseModel):
     """A finished sound: the accurate answer."""
 
@@ -206,6 +218,13 @@ class Event(BaseModel):
     )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
+    membership: list[Membership] = Field(description="Zones from which it came with a probability of at least 0.05.")
+    excluded: bool = Field(
+        description="Whether its position lies in an excluded zone, or does with a probability of at least 0.5. It "
+        "alerts nobody.",
+        examples=[False],
+    )
+    excluded_by: list[str] = Field(description="Names of these zones.", examples=[[]])
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
     latency_s: LatencyS
     latency_stages_s: StagesOrNull

@@ -53,6 +53,8 @@ class Query:
         Cursor of an event: only older ones are found.
     after : Cursor or None
         Cursor of an event: only newer ones are found, those next to it first of all.
+    oldest_first : bool
+        Whether the order is the other one; `before` is then the cursor of an event that all found are newer than.
     status : str or None
         `located`, `direction-only` or `refused`.
     min_level_dbfs : float or None
@@ -70,6 +72,7 @@ class Query:
     limit: int = 50
     before: Cursor | None = None
     after: Cursor | None = None
+    oldest_first: bool = False
     status: str | None = None
     min_level_dbfs: float | None = None
     array: str | None = None

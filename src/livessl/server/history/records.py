@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import orjson
-from sqlalchemy import Connection, and_, bindparam, delete, exists, func, insert, not_, select, update
+from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
 
 from livessl.core.types import FRAME_NS
 from livessl.server.history.query import JsonObject
@@ -83,8 +83,17 @@ def put_early(connection: Connection, name: str) -> None:
 
 def end_early(connection: Connection, frame_index: int) -> None:
     """Let the early events before a frame index be final, and forget those that are gone."""
-    is_later = exists().where(and_(events.c.id == early.c.id, events.c.time_ns >= frame_index * FRAME_NS))
-    connection.execute(delete(early).where(not_(is_later)))
+    ids = early_ids(connection)
+    if not ids:
+        return
+    later = select(events.c.id).where(events.c.id.in_(ids), events.c.time_ns >= frame_index * FRAME_NS)
+    ended = set(ids) - set(connection.execute(later).scalars())
+    connection.execute(delete(early).where(early.c.id.in_(ended)))
+
+
+def early_ids(connection: Connection) -> list[str]:
+    """Return the ids of early events: few. A join would have PostgreSQL read all events, as it knows no better."""
+    return list(connection.execute(select(early.c.id)).scalars())
 
 
 def put_progress(connection: Connection, site: str, frame_index: int, clocks: JsonObject) -> None:

@@ -49,14 +49,18 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
 def page_statement(query: Query, most: int) -> Select[Any]:
     """Return the statement for a page of at most so many events: time, number and JSON.
 
-    They come newest first, or oldest first if the query names the event after which the page begins.
+    They come newest first, or oldest first if the query wants this or names the event after which the page begins.
     """
     statement, searched = matching(query, events.c.time_ns, events.c.number, events.c.body)
     place, time_ns = tuple_(searched.c.time_ns, searched.c.number), searched.c.time_ns
-    if query.before is not None:
-        statement = statement.where(time_ns <= query.before.time_ns, place < _place(query.before))
-    if query.after is not None:
-        statement = statement.where(time_ns >= query.after.time_ns, place > _place(query.after))
+    newer_than, older_than = query.after, query.before
+    if query.oldest_first:
+        newer_than, older_than = query.before, query.after
+    if older_than is not None:
+        statement = statement.where(time_ns <= older_than.time_ns, place < _place(older_than))
+    if newer_than is not None:
+        statement = statement.where(time_ns >= newer_than.time_ns, place > _place(newer_than))
+    if query.oldest_first or query.after is not None:
         return statement.order_by(time_ns, searched.c.number).limit(most)
     return statement.order_by(time_ns.desc(), searched.c.number.desc()).limit(most)
 

@@ -29,6 +29,13 @@ export const get = (url) => request(url, {});
 export const put = (url, value) =>
   request(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
 
+/** Delete a resource. */
+export const remove = (url) => request(url, { method: "DELETE" });
+
+/** Send `value` as JSON, for an answer. */
+export const post = (url, value) =>
+  request(url, { method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+
 /** Read a resource whose answer may take long. */
 export const getStream = (url) => request(url, { signal: null });
 

@@ -1,8 +1,9 @@
 // The page's start: connects the messages of the server to the model, and the model to the panels and plans.
 
-import { get, onTokenNeeded, put, useToken } from "./access.js";
+import { get, onTokenNeeded, post, put, useToken } from "./access.js";
 import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
+import { Clips } from "./clips.js";
 import { find, write } from "./dom.js";
 import { Readout } from "./estimate.js";
 import { EventList } from "./events.js";
@@ -12,6 +13,8 @@ import { Live } from "./live.js";
 import { MapPanel } from "./map-panel.js";
 import { Model, OLD_MS } from "./model.js";
 import { drawTogether, Plan } from "./plan.js";
+import { ZoneEditor } from "./plan-zones-editor.js";
+import { SetUp } from "./set-up.js";
 import { readColours } from "./theme.js";
 
 const API = new URL("api/v1/", document.baseURI);
@@ -43,9 +46,11 @@ const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name,
   const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
   put(address, { enabled }).catch((error) => console.warn(`livessl: array ${name}:`, error.message));
 });
+const clips = new Clips(API);
 const eventList = new EventList(find("events"), {
   empty: find("events-empty"),
   count: find("events-count"),
+  onOpen: (event, details) => clips.show(event, details),
   onMark: (event) => {
     model.setHighlight(event, event && when(event, model.serverNow()));
     redraw();
@@ -60,6 +65,7 @@ const alertsPanel = new AlertsPanel(find("alerts-panel"), {
     put(address, { armed }).catch((error) => console.warn(`livessl: rule ${name}:`, error.message)).finally(loadAlerts);
   },
 });
+const zoneEditor = new ZoneEditor(API, plans[0], redraw);
 const mapPanel = new MapPanel(API, plans, redraw);
 const light = matchMedia("(prefers-color-scheme: light)");
 
@@ -82,6 +88,9 @@ const HANDLERS = {
     header.showSite(message.site, message.mode);
     arraysPanel.mayChange = message.role !== "viewer";
     alertsPanel.mayChange = message.role !== "viewer";
+    zoneEditor.mayChange = message.role !== "viewer";
+    setUp.mayChange = message.role !== "viewer";
+    clips.mayListen = message.role !== "viewer";
     HANDLERS.arrays(message);
     loadSite();
     loadEvents();
@@ -94,6 +103,7 @@ const HANDLERS = {
     header.showOverload(message.overload);
     arraysPanel.show(model.arrays, Date.now(), "live");
     mapPanel.offer(model.arrays.map(({ array }) => array.name));
+    setUp.showArrays(model.arrays, "live");
   },
   update(message) {
     model.takeUpdate(message);
@@ -112,6 +122,11 @@ const HANDLERS = {
   alert() {
     loadAlerts();
   },
+  zones({ by_name: zones }) {
+    if (model.site === null) return; // it is loaded with the zones
+    model.site.zones = zones;
+    zoneEditor.show(zones, model.site.can_draw);
+  },
   gap(message) {
     header.showGap(message);
     loadAlerts();
@@ -129,7 +144,7 @@ const live = new Live(liveUrl(), {
 });
 
 function liveUrl() {
-  const url = new URL("live?kinds=update,event,track,arrays,alert", API);
+  const url = new URL("live?kinds=update,event,track,arrays,alert,zones", API);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   return url;
 }
@@ -165,6 +180,12 @@ async function getJson(path) {
   return response.json();
 }
 
+async function postJson(path, value) {
+  const response = await post(new URL(path, API), value);
+  if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
+  return response.json();
+}
+
 /** Run `load`; if it fails, try again a few times. */
 async function retrying(load, attempts = ATTEMPTS) {
   try {
@@ -182,10 +203,27 @@ function loadSite() {
     model.site = site;
     header.showSite(site.site, model.mode);
     header.showPrivacy(site.privacy);
+    zoneEditor.show(site.zones, site.can_draw);
+    if (site.floor_plan !== null) loadFloorPlan(site.floor_plan);
     const [x, y, z] = site.room.size_m;
     find("floor-frame").style.setProperty("--aspect", String(x / y));
     find("side-frame").style.setProperty("--aspect", String(y / z));
     find("floor-empty").hidden = true;
+  });
+}
+
+/** Load the picture under the floor plan; as data in its address, for an element's request would have no token. */
+function loadFloorPlan({ bounds_m: bounds }) {
+  retrying(async () => {
+    const response = await get(new URL("floor-plan", API));
+    if (!response.ok) throw new Error(`floor-plan: the server answered ${response.status}`);
+    const reader = new FileReader();
+    reader.readAsDataURL(await response.blob());
+    await new Promise((resolve, reject) => Object.assign(reader, { onload: resolve, onerror: reject }));
+    const image = new Image();
+    image.src = reader.result;
+    await image.decode();
+    model.floorPlan = { image, bounds };
   });
 }
 
@@ -294,7 +332,8 @@ function redraw() {
 function draw(now) {
   if (model.site === null) return;
   dirty = false;
-  drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images), colours);
+  drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images, zoneEditor.draft), colours);
+  setUp.place();
 }
 
 function applyTheme() {
@@ -305,6 +344,7 @@ function applyTheme() {
 
 // --- start ----------------------------------------------------------------------------------------------------
 
+const setUp = new SetUp({ load: getJson, send: postJson, plan: plans[0], redraw });
 applyTheme();
 light.addEventListener("change", applyTheme);
 const sizes = new ResizeObserver(redraw);

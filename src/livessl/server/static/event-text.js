@@ -30,7 +30,7 @@ export function summary(event, nowMs) {
       el("span", { className: "meter", "aria-hidden": "true" }, meter),
       el("span", { className: "percent", text: percent(event.confidence) })),
     el("span", { className: "facts" }, ...facts.filter(Boolean).map((fact) => el("span", { text: fact }))),
-    event.zones?.length ? el("span", { className: "zones", text: event.zones.join(", ") }) : null,
+    zonesText(event) ? el("span", { className: "zones", text: zonesText(event) }) : null,
     text ? el("span", { className: "verdict", text }) : null,
   ].filter(Boolean);
 }
@@ -66,7 +66,7 @@ export function details(event) {
     entry("error (1 σ)", sigmas && `${sigmas} m`, "wide"),
     entry("detected by", event.heard_by?.join(", ")),
     entry("used", event.arrays?.map((name) => withRequest(name, event)).join(", ")),
-    entry("zones", event.zones?.join(", ")),
+    entry("zones", zonesText(event)),
     entry("start", event.time_utc ?? `${number(event.start_s, 3)} s into the recording`, "wide"),
     entry("duration", `${number(event.duration_s, 2)} s`),
     entry("latency", latency(event), "wide"),
@@ -108,4 +108,10 @@ function contributionTable(event) {
     el("caption", { text: "Contribution of each array" }),
     el("thead", {}, el("tr", {}, ...heads.map((text) => el("th", { text, scope: "col" })))),
     el("tbody", {}, ...rows));
+}
+
+/** The zones that hold an event; it is excluded by some, which need not hold it, if they probably do. */
+function zonesText({ zones = [], excluded_by: excludedBy = [] }) {
+  const others = zones.filter((name) => !excludedBy.includes(name));
+  return [...others, ...excludedBy.map((name) => `${name} (excluded)`)].join(", ");
 }

@@ -7,12 +7,16 @@ import { details, summary } from "./event-text.js";
 const MOST_ROWS = 200;
 
 export class EventList {
-  /** `onMark(event | null)` is called when an event is pointed at, focused or selected, and with null when none is. */
-  constructor(list, { empty, count, onMark }) {
+  /**
+   * `onMark(event | null)` is called when an event is pointed at, focused or selected, and with null when none is;
+   * `onOpen(event, details)` when its details are opened first.
+   */
+  constructor(list, { empty, count, onMark, onOpen }) {
     this.list = list;
     this.empty = empty;
     this.count = count;
     this.onMark = onMark;
+    this.onOpen = onOpen;
     this.rows = new Map();
     this.selected = null;
     list.addEventListener("keydown", (event) => this.#walk(event));
@@ -120,7 +124,10 @@ export class EventList {
   #open({ event, root, button, opened }, open) {
     button.setAttribute("aria-expanded", String(open));
     root.classList.toggle("selected", open);
-    if (open && !opened.hasChildNodes()) opened.append(...details(event));
+    if (open && !opened.hasChildNodes()) {
+      opened.append(...details(event));
+      this.onOpen(event, opened);
+    }
     opened.hidden = !open;
   }
 

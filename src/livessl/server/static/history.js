@@ -116,6 +116,10 @@ function showEvents({ events, next_cursor: older, previous_cursor: newer }, plac
   const rows = new EventList(list, {
     empty: find("events-empty"),
     count: el("p"),
+    onOpen: ({ id }, details) => {
+      const href = `./#event=${encodeURIComponent(id)}`;
+      details.append(el("a", { className: "elsewhere", href, text: "Open on the live page, with its recordings" }));
+    },
     onMark: (event) => {
       model.setHighlight(event, event && when(event, Date.now()));
       draw();

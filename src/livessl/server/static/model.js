@@ -1,6 +1,7 @@
 // What the page knows, collected from the server's messages; the panels and plans show it. It touches no element.
 
 import { utc } from "./format.js";
+import { zonesOf } from "./plan-zones.js";
 import { ServerClock } from "./server-clock.js";
 
 /** Age, in milliseconds, beyond which an estimate is drawn as old. */
@@ -20,6 +21,8 @@ export class Model {
   constructor() {
     /** The answer of GET site, or null before it. */
     this.site = null;
+    /** The picture under the floor plan, as { image, bounds }, or null. */
+    this.floorPlan = null;
     /** "live" or "replay", or null before the first message. */
     this.mode = null;
     /** State of the connection: "live", "stale" or "down". */
@@ -131,8 +134,8 @@ export class Model {
     for (const [id, { updatedMs }] of this.tracks) if (now - updatedMs > OLD_MS) this.tracks.delete(id);
   }
 
-  /** Everything that the plans draw, at the browser's time `now`; `images` are the coloured power maps, or null. */
-  scene(now, images) {
+  /** Everything that the plans draw, at the browser's time `now`; `images` are the coloured power maps, or null; `draft` is a zone. */
+  scene(now, images, draft = null) {
     const { site } = this;
     const reported = new Map(this.arrays.map(({ array }) => [array.name, array]));
     const newest = this.newest?.marker;
@@ -142,9 +145,9 @@ export class Model {
       now,
       images,
       cellM: site.grid.spacing_m,
-      zones: Object.entries(site.zones ?? {}).map(([name, { bounds_m: bounds }]) => ({
-        name, low: bounds.map(([from]) => from), high: bounds.map(([, to]) => to),
-      })),
+      zones: zonesOf(site.zones),
+      floorPlan: this.floorPlan,
+      draft,
       arrays: Object.entries(site.arrays).map(([name, { position_m: position, microphones_m: microphones }]) => ({
         name,
         position,

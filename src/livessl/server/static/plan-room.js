@@ -1,4 +1,4 @@
-// Layers of a plan that show the room: floor, power map, grid, zones, walls and axes.
+// Layers of a plan that show the room: floor, power map, grid, walls and axes.
 
 import { number } from "./format.js";
 import { opacity } from "./colour-map.js";
@@ -61,28 +61,6 @@ export function drawGrid(plan) {
     g.lineTo(plan.right, y);
   }
   g.stroke();
-}
-
-export function drawZones(plan, zones) {
-  const { g } = plan;
-  const colour = plan.colours.zone;
-  g.font = SMALL;
-  g.textAlign = "left";
-  g.textBaseline = "top";
-  for (const { name, low, high } of zones) {
-    const [x, y, width, height] = plan.box(low, high);
-    g.fillStyle = colour;
-    g.globalAlpha = 0.07;
-    g.fillRect(x, y, width, height);
-    g.globalAlpha = 0.75;
-    g.strokeStyle = colour;
-    g.lineWidth = 1;
-    g.setLineDash([5, 4]);
-    g.strokeRect(x + 0.5, y + 0.5, width - 1, height - 1);
-    g.setLineDash([]);
-    g.globalAlpha = 1;
-    plan.text(name, x + 6, y + 6, colour);
-  }
 }
 
 export function drawWalls(plan) {

@@ -5,7 +5,8 @@ import { number } from "./format.js";
 import { OLD_MS } from "./model.js";
 import { drawArray } from "./plan-arrays.js";
 import { drawEstimate, drawTracks, drawTrail } from "./plan-estimates.js";
-import { drawAxes, drawFloor, drawGrid, drawMap, drawWalls, drawZones } from "./plan-room.js";
+import { drawAxes, drawFloor, drawGrid, drawMap, drawWalls } from "./plan-room.js";
+import { drawDraft, drawFloorPicture, drawZones } from "./plan-zones.js";
 
 /** Space around the room for axes and labels, in pixels. */
 const MARGIN = { left: 44, right: 18, top: 26, bottom: 40 };
@@ -26,7 +27,7 @@ export class Plan {
     this.axisNames = VIEWS[view].names;
     this.size = null;
     canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
-      const metres = this.#under(offsetX, offsetY);
+      const metres = this.under(offsetX, offsetY);
       const words = metres?.map((value, index) => `${this.axisNames[index]} ${number(value)}`);
       write(pointer, words?.join("  ") ?? "");
     });
@@ -72,6 +73,7 @@ export class Plan {
     g.lineJoin = "round";
     drawFloor(this);
     this.clip(() => {
+      drawFloorPicture(this, scene.floorPlan);
       drawMap(this, scene);
       drawGrid(this);
       drawZones(this, scene.zones);
@@ -81,6 +83,7 @@ export class Plan {
     this.clip(() => {
       drawTracks(this, scene);
       drawTrail(this, scene);
+      drawDraft(this, scene.draft);
     });
     for (const array of scene.arrays) drawArray(this, array);
     const { highlight } = scene;
@@ -96,9 +99,14 @@ export class Plan {
   }
 
   /** Metres under a pixel, or null outside the room. */
-  #under(px, py) {
+  under(px, py) {
     if (this.size === null || px < this.left || px > this.right || py < this.top || py > this.bottom) return null;
     return [(px - this.left) / this.scale, (this.bottom - py) / this.scale];
+  }
+
+  /** Metres at a pixel of the canvas, or null outside the room. */
+  metresAt(px, py) {
+    return this.#under(px, py);
   }
 
   // What the layers draw with.

@@ -44,7 +44,12 @@ def build_site(file: SiteFile, directory: Path) -> tuple[Site, list[Finding]]:
     specs, faults = _array_specs(file, directory)
     processed, joint_faults = _processed_specs(file, specs)
     site = Site.model_construct(
-        **dict(iter(file)), directory=directory, c_m_s=_speed_of_sound_m_s(file), specs=specs, processed=processed
+        **dict(iter(file)),
+        directory=directory,
+        c_m_s=_speed_of_sound_m_s(file),
+        specs=specs,
+        processed=processed,
+        drawn_zones={},
     )
     return site, [*faults, *joint_faults]
 

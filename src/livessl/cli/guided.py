@@ -1,0 +1,107 @@
+"""Calibration with a running server: it asks for a clap at each place, and prints how far off each was located."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from livessl.calibration import Clap, HeardSound, measured_poses
+from livessl.cli.calibration_words import progress_line
+from livessl.core.commission.findings import LEAST_SHARPNESS
+from livessl.core.commission.next_place import AIM_DEG, AIM_M, proposed_place
+from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp
+from livessl.core.types import FloatArray
+from livessl.site.build.grid import search_grid
+
+if TYPE_CHECKING:
+    from livessl.cli.server_sounds import ServerSounds
+    from livessl.site.models import Site
+
+LEAST_GUIDED: Final = 6
+"""Fewest claps after which the poses may be good enough: with four or five, one bad clap is not noticed."""
+
+MOST_GUIDED: Final = 12
+"""Most claps that are asked for where no place is given."""
+
+
+def ask_for(text: str) -> None:
+    """Print what the user is asked to do: to stderr, so that stdout has results only."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def is_clear(sound: HeardSound) -> bool:
+    """Return whether an array received a sound clearly."""
+    return any(one.sharpness >= LEAST_SHARPNESS for one in sound.observations)
+
+
+def clap_at(sounds: ServerSounds, place_m: Sequence[float], what: str) -> Clap:
+    """Ask for a clap at a place, and wait for it."""
+    where = ", ".join(f"{x:.1f}" if round(x, 1) == round(x, 3) else f"{x:.2f}" for x in place_m)
+
+    def accepts(sound: HeardSound) -> bool:
+        if not is_clear(sound):
+            ask_for("  a sound that no array received clearly; clap louder")
+        return is_clear(sound)
+
+    sound = sounds.next_sound(lambda: ask_for(f"clap at {where} ({what})"), f"a clap at {where}", accepts)
+    return Clap(np.array(place_m, dtype=np.float64), sound)
+
+
+def claps_at(sounds: ServerSounds, places_m: Sequence[Sequence[float]], show: Callable[[Clap], None]) -> list[Clap]:
+    """Ask for a clap at each of some places; `show` gets each as it comes in."""
+    claps = []
+    for number, place_m in enumerate(places_m, 1):
+        claps.append(clap_at(sounds, place_m, f"{number} of {len(places_m)}"))
+        show(claps[-1])
+    return claps
+
+
+def claps_for_poses(
+    sounds: ServerSounds,
+    site: Site,
+    places_m: Sequence[Sequence[float]],
+    place_std_m: float,
+    show: Callable[[Clap], None],
+) -> list[Clap]:
+    """Ask for claps until the poses are good enough: at the given places, or at proposed ones if there are none."""
+    claps: list[Clap] = []
+    for place_m, what in _places(site, places_m, place_std_m, claps):
+        claps.append(clap_at(sounds, place_m, what))
+        show(claps[-1])
+        if len(claps) < LEAST_PLACES:
+            continue
+        measured = measured_poses(site, claps, place_std_m)
+        ask_for(f"  {progress_line(measured)}")
+        if len(claps) >= LEAST_GUIDED and is_good(site, measured):
+            ask_for("good enough")
+            break
+    return claps
+
+
+def is_good(site: Site, measured: MeasuredSetUp) -> bool:
+    """Return whether the poses of all arrays are known to `AIM_M` and `AIM_DEG`."""
+    return len(measured.poses) == len(site.processed) and all(
+        pose.position_std_m <= AIM_M and pose.orientation_std_deg <= AIM_DEG for pose in measured.poses.values()
+    )
+
+
+def next_place(site: Site, places_m: FloatArray, place_std_m: float) -> FloatArray | None:
+    """Return the place at which another clap would improve the poses most, metres; None if no place is free."""
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    return proposed_place(microphones, places_m, np.array(search_grid(site).bounds_m), site.c_m_s, place_std_m)
+
+
+def _places(
+    site: Site, places_m: Sequence[Sequence[float]], place_std_m: float, claps: Sequence[Clap]
+) -> Iterator[tuple[Sequence[float], str]]:
+    for number, place_m in enumerate(places_m, 1):
+        yield place_m, f"{number} of {len(places_m)}"
+    while not places_m and len(claps) < MOST_GUIDED:
+        so_far_m = np.array([clap.place_m for clap in claps]).reshape(-1, 3)
+        proposed_m = next_place(site, so_far_m, place_std_m)
+        if proposed_m is None:
+            return
+        yield proposed_m.tolist(), f"{len(claps) + 1}, proposed; to another place, give --at X,Y,Z for each"

@@ -1,0 +1,125 @@
+"""Proposes places for claps that determine poses best, and predicts how well some claps determine them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from livessl.core.commission.places import Microphones
+from livessl.core.commission.poses import MICROPHONE_STD_M
+from livessl.core.commission.resection import CLAP_STD_S
+from livessl.core.types import FloatArray
+
+AIM_M: Final = 0.03
+AIM_DEG: Final = 1.0
+"""Standard deviations of a pose, in metres and degrees, at which a calibration is good enough: the errors that remain
+then move positions by no more than the sounds themselves scatter."""
+
+STEP_M: Final = 0.5
+"""Spacing of the places that are proposed, metres: such places are easy to find with a tape."""
+
+HEIGHTS_M: Final = (0.5, 1.0, 1.5, 2.0)
+"""Heights of the places that are proposed, metres: a hand reaches them."""
+
+MARGIN_M: Final = 0.5
+"""Least distance of a proposed place from the walls, metres."""
+
+NEAREST_M: Final = 1.0
+"""Least distance of a proposed place from an array, metres: closer ones must be measured more exactly."""
+
+APART_M: Final = 0.75
+"""Least distance between two proposed places, metres."""
+
+_ROUGH_M: Final = 1.0
+_ROUGH_DEG: Final = 60.0
+"""Standard deviations of a pose before any clap."""
+
+
+def proposed_place(
+    microphones: Microphones, places_m: FloatArray, bounds_m: FloatArray, c_m_s: float, place_std_m: float
+) -> FloatArray | None:
+    """Find the place at which the next clap improves the worst-known pose most.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As far as they are known, metres.
+    places_m : (S, 3) float64
+        Places of the claps so far, metres; S may be 0.
+    bounds_m : (3, 2) float64
+        Search volume, metres.
+    c_m_s : float
+        Speed of sound, m/s.
+    place_std_m : float
+        How exactly places are known along each axis, metres.
+
+    Returns
+    -------
+    (3,) float64 or None
+        Metres; None if no place is free.
+    """
+    candidates_m = _candidates(microphones, places_m, bounds_m)
+    if len(candidates_m) == 0:
+        return None
+    known = {name: _information(at_m, places_m, c_m_s, place_std_m).sum(axis=0) for name, at_m in microphones.items()}
+    off = np.zeros(len(candidates_m))
+    for name, at_m in microphones.items():
+        added = _information(at_m, candidates_m, c_m_s, place_std_m)
+        position_m, orientation_deg = _stds(known[name] + _rough() + added)
+        off = np.maximum(off, np.maximum(position_m / AIM_M, orientation_deg / AIM_DEG))
+    return np.asarray(candidates_m[np.argmin(off)])
+
+
+def expected_stds(
+    microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float
+) -> tuple[float, float]:
+    """Predict the largest standard deviations, in metres and degrees, of a pose that is measured by claps (S, 3)."""
+    information = _information(microphones_m, places_m, c_m_s, place_std_m).sum(axis=0)
+    position_m, orientation_deg = _stds((information + _rough())[None])
+    return float(position_m[0]), float(orientation_deg[0])
+
+
+def _rough() -> FloatArray:
+    """Information (6, 6) on a pose before any clap."""
+    return np.diag([_ROUGH_M**-2.0] * 3 + [np.radians(_ROUGH_DEG) ** -2.0] * 3)
+
+
+def _candidates(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArray) -> FloatArray:
+    """Places (G, 3) on a grid, away from walls, arrays and the claps so far, metres."""
+    axes = [
+        np.arange(np.ceil((low + MARGIN_M) / STEP_M) * STEP_M, high - MARGIN_M + 1e-9, STEP_M) for low, high in bounds_m
+    ]
+    low, high = bounds_m[2]
+    axes[2] = np.array([height for height in HEIGHTS_M if low <= height <= high] or [0.5 * (low + high)])
+    grid_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    free = np.ones(len(grid_m), dtype=bool)
+    for at_m in microphones.values():
+        free &= np.linalg.norm(grid_m - at_m.mean(axis=0), axis=1) >= NEAREST_M
+    for place_m in places_m:
+        free &= np.linalg.norm(grid_m - place_m, axis=1) >= APART_M
+    return np.asarray(grid_m[free])
+
+
+def _information(microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float) -> FloatArray:
+    """Fisher information (S, 6, 6) of one clap at each place on the shift (m) and turn (radians) of an array.
+
+    The place of the clap is a nuisance with its own standard deviation: it adds to the covariance of the delays.
+    """
+    towards = places_m[:, None] - microphones_m
+    unit = towards / np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
+    arms_m = microphones_m - microphones_m.mean(axis=0)
+    slopes = np.concatenate([-unit, -np.cross(arms_m[None], unit)], axis=2) / c_m_s
+    slopes -= slopes.mean(axis=1, keepdims=True)
+    of_place = unit / c_m_s
+    of_place = of_place - of_place.mean(axis=1, keepdims=True)
+    covariance = (CLAP_STD_S**2 + (MICROPHONE_STD_M / c_m_s) ** 2) * np.eye(
+        len(microphones_m)
+    ) + place_std_m**2 * of_place @ of_place.swapaxes(1, 2)
+    return np.asarray(slopes.swapaxes(1, 2) @ np.linalg.solve(covariance, slopes))
+
+
+def _stds(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Largest standard deviations (G,) of positions in metres and of orientations in degrees."""
+    variance = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
+    return np.sqrt(variance[:, :3].max(axis=1)), np.degrees(np.sqrt(variance[:, 3:].max(axis=1)))

@@ -1,0 +1,29 @@
+"""Prometheus metrics of the clips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from livessl.server.parts import Parts
+
+
+def clip_metrics(parts: Parts) -> Iterator[Metric]:
+    """Gauges and counters of the clips; none for a site that keeps none."""
+    clips = parts.clips
+    if clips is None:
+        return
+    yield GaugeMetricFamily("livessl_clips_stored", "Events with recordings.", clips.folder.count)
+    yield GaugeMetricFamily("livessl_clips_bytes", "Size of all recordings.", clips.folder.nbytes)
+    yield GaugeMetricFamily("livessl_clips_waiting", "Events whose recordings are being made.", clips.waiting)
+    results = CounterMetricFamily(
+        "livessl_clips", "What has become of events that should have recordings.", labels=["result"]
+    )
+    for result, count in asdict(clips.counts).items():
+        results.add_metric([result], count)
+    yield results
+    yield CounterMetricFamily(
+        "livessl_clips_frames_dropped", "Frames that no recording can have, for want of memory.", clips.frames_dropped
+    )

@@ -1,0 +1,137 @@
+"""REST routes of the clips of events: what there is, the sound itself, keeping and deleting it."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import soundfile
+from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi.responses import FileResponse
+
+from livessl.server.api import clip_schema
+from livessl.server.api.answers import errors
+from livessl.server.api.encode import API_VERSION
+from livessl.server.api.routes import as_json
+from livessl.server.clips.service import state_of
+from livessl.server.parts import Parts
+
+MEDIA_TYPES: Final = {".flac": "audio/flac", ".wav": "audio/wav"}
+
+_BINARY: Final[dict[str, Any]] = {"schema": {"type": "string", "format": "binary"}}
+_TEXT: Final[dict[str, Any]] = {"text/plain; charset=utf-8": {"schema": {"type": "string"}}}
+_NO_CLIP: Final = "The event has no recordings."
+_NO_FILE: Final = "The event has no recording of that name."
+_DISK: Final = "The folder of the clips cannot be written."
+_log = logging.getLogger(__name__)
+
+
+def clip_routes(parts: Parts) -> APIRouter:
+    """Figures, lists, recordings, and what operators may do with them."""
+    clips, router = parts.clips, APIRouter(prefix="/api/v1", tags=["clips"])
+
+    @router.get("/clips", response_model=clip_schema.ClipsState)
+    def get_clips() -> Response:
+        """How many events have recordings, how large they are, and what was left out since the start."""
+        config = parts.site.server.clips
+        limits = {
+            "max_bytes": None if config is None else config.max_bytes,
+            "max_age_days": None if config is None else config.max_age_days,
+        }
+        return as_json({"v": API_VERSION, **state_of(clips), **limits})
+
+    @router.get("/events/{event_id}/clips", response_model=clip_schema.EventClips)
+    def get_event_clips(event_id: str) -> Response:
+        """Recordings of an event."""
+        about = None if clips is None else clips.folder.about(event_id)
+        waits = clips is not None and clips.is_waiting(event_id)
+        found = {
+            "v": API_VERSION,
+            "event_id": event_id,
+            "state": "stored" if about is not None else "waiting" if waits else "none",
+            "keep": about is not None and about["keep"],
+            "position_m": None if about is None else about["position_m"],
+            "files": [] if about is None else about["files"],
+        }
+        return as_json(found)
+
+    @router.get(
+        "/events/{event_id}/clips/{name}",
+        response_class=Response,
+        responses={
+            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
+            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
+            400: {"description": "`Range` is malformed.", "content": _TEXT},
+            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
+            **errors(404, texts={404: _NO_FILE}),
+        },
+    )
+    def get_clip(
+        event_id: str,
+        name: str,
+        format: Annotated[  # noqa: A002 - the API's word
+            Literal["stored", "wav"], Query(description="as it is stored, or decoded to 24-bit WAV, always whole")
+        ] = "stored",
+    ) -> Response:
+        """A recording, for operators. `Range` gives parts of it as it is stored."""
+        path = None if clips is None else clips.folder.file(event_id, name)
+        if path is None:
+            raise HTTPException(404, f"event {event_id!r} has no recording {name!r}; GET events/ID/clips lists them")
+        if format == "wav" and path.suffix != ".wav":
+            return Response(_as_wav(path), media_type=MEDIA_TYPES[".wav"])
+        headers = {"Cache-Control": "private, no-cache"}
+        return FileResponse(path, media_type=MEDIA_TYPES[path.suffix], headers=headers)
+
+    @router.put(
+        "/events/{event_id}/clips/keep",
+        response_model=clip_schema.Kept,
+        responses=errors(400, 404, 411, 413, 503, texts={404: _NO_CLIP, 503: _DISK}),
+    )
+    def put_keep(event_id: str, switch: clip_schema.KeepSwitch, request: Request) -> Response:
+        """Keep an event's recordings for ever, or no longer; for operators."""
+        with _disk_errors():
+            if clips is None or not clips.folder.keep(event_id, switch.keep):
+                raise _no_clip(event_id)
+        what = "keeps" if switch.keep else "no longer keeps"
+        _log.info("%r %s the clips of %r", request.scope["client_name"], what, event_id)
+        return as_json({"v": API_VERSION, "event_id": event_id, "keep": switch.keep})
+
+    @router.delete(
+        "/events/{event_id}/clips",
+        response_model=clip_schema.ClipsDeleted,
+        responses=errors(404, 411, 413, 503, texts={404: _NO_CLIP, 503: _DISK}),
+    )
+    def delete_clips(event_id: str, request: Request) -> Response:
+        """Delete an event's recordings, also those that are kept for ever; the event stays. For operators."""
+        with _disk_errors():
+            if clips is None or not clips.folder.delete(event_id):
+                raise _no_clip(event_id)
+        _log.info("%r has deleted the clips of %r", request.scope["client_name"], event_id)
+        return as_json({"v": API_VERSION, "event_id": event_id})
+
+    return router
+
+
+def _no_clip(event_id: str) -> HTTPException:
+    return HTTPException(404, f"event {event_id!r} has no recordings")
+
+
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Answer 503 where the disk does not do what it should."""
+    try:
+        yield
+    except OSError as error:
+        raise HTTPException(503, f"server.clips.folder: {error.strerror or error}; correct that") from error
+
+
+def _as_wav(path: Path) -> bytes:
+    """Return a recording as a WAV file of 24 bits."""
+    samples, rate_hz = soundfile.read(path, dtype="int32", always_2d=True)
+    made = io.BytesIO()
+    soundfile.write(made, samples, rate_hz, format="WAV", subtype="PCM_24")
+    return made.getvalue()

@@ -1,0 +1,106 @@
+"""REST routes for setting up: the last sounds with their delays, and the verification by sounds at known places."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import asdict
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, HTTPException, Query, Response
+
+from livessl.clock import utc_text
+from livessl.core.commission.verification import set_up_verdict
+from livessl.core.types import FloatArray, Observation
+from livessl.server.api import set_up_schema
+from livessl.server.api.answers import errors
+from livessl.server.api.encode import API_VERSION, JsonObject, where
+from livessl.server.api.routes import as_json
+from livessl.server.heard_sounds import HeardSound
+from livessl.server.parts import Parts
+
+_GONE = "One of the sounds is not kept: the last 64 are."
+
+
+def set_up_routes(parts: Parts) -> APIRouter:
+    """Sounds with their delays, and the verification of the set-up."""
+    heard, router, one_at_a_time = parts.set_up_watch.heard, APIRouter(tags=["state"]), threading.Lock()
+
+    @router.get("/api/v1/sounds", response_model=set_up_schema.HeardSounds)
+    def get_sounds(
+        after: Annotated[int, Query(ge=0, le=2**53, description="only sounds of a higher number")] = 0,
+    ) -> Response:
+        """The last 64 sounds with the delays that each array observed, the oldest first: what calibration uses."""
+        sounds = heard.after(after)
+        now_utc = utc_text(parts.site_time.now_ns())
+        found = [_sound(sound) for sound in sounds]
+        return as_json({"v": API_VERSION, "now_utc": now_utc, "last": heard.last, "sounds": found})
+
+    @router.post(
+        "/api/v1/set-up/verify",
+        response_model=set_up_schema.Verified,
+        responses=errors(400, 404, 411, 413, texts={404: _GONE}),
+    )
+    def post_verify(request: set_up_schema.VerifyRequest) -> Response:
+        """Compare sounds with the places where they were made, and explain the errors; changes nothing. For operators.
+
+        One sound shows that something is wrong; four usually show what.
+        """
+        from livessl.site.build.set_up import verify_set_up  # scipy's optimizer takes memory, and no event needs it
+
+        try:
+            sounds = heard.numbered([clap.number for clap in request.claps])
+        except LookupError as error:
+            raise HTTPException(404, f"sound {error} is not kept any more; make it again") from error
+        places_m = np.array([clap.place_m for clap in request.claps], dtype=np.float64)
+        with one_at_a_time:  # it takes up to seconds of one core
+            findings = verify_set_up(parts.site, [sound.observations for sound in sounds], places_m)
+        claps = [_clap(sound, place_m) for sound, place_m in zip(sounds, places_m, strict=True)]
+        return as_json(
+            {
+                "v": API_VERSION,
+                "verdict": str(set_up_verdict(findings, [clap["error_m"] for clap in claps])),
+                "claps": claps,
+                "findings": [{"kind": "finding", **asdict(finding)} for finding in findings],
+            }
+        )
+
+    return router
+
+
+def _sound(sound: HeardSound) -> JsonObject:
+    event = sound.event
+    return {
+        "number": sound.number,
+        "id": event.id,
+        "time_utc": utc_text(event.start_ns),
+        "position_m": where(event.estimate)[0],
+        "status": str(event.status),
+        "reason": event.reason,
+        "observations": [_observed(observation) for observation in sound.observations],
+    }
+
+
+def _observed(one: Observation) -> JsonObject:
+    return {
+        "array": one.array,
+        "delays_us": [None if np.isnan(delay_s) else round(1e6 * delay_s, 3) for delay_s in one.delays_s.tolist()],
+        "inverted": one.inverted.tolist(),
+        "coherence": one.coherence.round(4).tolist(),
+        "powers": one.powers.tolist(),
+        "sharpness": round(one.sharpness, 3),
+        "closure_us": round(1e6 * one.closure_s, 3),
+    }
+
+
+def _clap(sound: HeardSound, place_m: FloatArray) -> JsonObject:
+    estimate = sound.event.estimate
+    error_m = None if estimate is None else round(float(np.linalg.norm(estimate.position_m - place_m)), 4)
+    return {
+        "number": sound.number,
+        "place_m": place_m.tolist(),
+        "position_m": where(estimate)[0],
+        "error_m": error_m,
+        "status": str(sound.event.status),
+        "reason": sound.event.reason,
+    }

@@ -1,0 +1,245 @@
+"""The folder of clips: for each event a folder with its recordings and one JSON file about them; nobody else writes.
+
+A clip is written into a folder of another name first, so that a killed server leaves no half of one.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import orjson
+
+from livessl.errors import RunError
+
+ABOUT: Final = "clip.json"
+"""File about a clip's recordings."""
+
+PARTIAL: Final = ".partial-"
+"""Beginning of the name of a folder that is being written or deleted."""
+
+_SAFE: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,199}")
+_ZEROS: Final = bytes(1 << 16)
+_log = logging.getLogger(__name__)
+
+About = dict[str, Any]
+
+
+class ClipsError(RunError):
+    """The folder of clips cannot be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What retention needs to know of a clip."""
+
+    start_ns: int
+    nbytes: int
+    keep: bool
+
+
+class ClipFolder:
+    """All clips of a site. Every thread may call it.
+
+    Parameters
+    ----------
+    path : Path
+        Is made if it does not exist; only its owner may look into it.
+
+    Raises
+    ------
+    ClipsError
+        If it cannot be made or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.RLock()
+        self._entries: dict[str, _Entry] = {}
+        try:
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            probe = path / f"{PARTIAL}probe"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise ClipsError(
+                f"server.clips.folder: cannot write {path}: {reason}; name a folder in which the server may write"
+            ) from error
+
+    def load(self) -> None:
+        """Read what is there, and delete what a killed server has left unfinished."""
+        for folder in sorted(self._path.iterdir()):
+            if folder.name.startswith(PARTIAL):
+                _erase(folder)
+            elif folder.is_dir():
+                about = self.about(folder.name)
+                if about is None:
+                    _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
+                else:
+                    self._note(folder.name, about)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all recordings."""
+        with self._lock:
+            return sum(entry.nbytes for entry in self._entries.values())
+
+    @property
+    def count(self) -> int:
+        """Number of events with a clip."""
+        return len(self._entries)
+
+    @property
+    def kept(self) -> int:
+        """Number of clips that are kept for ever."""
+        with self._lock:
+            return sum(entry.keep for entry in self._entries.values())
+
+    def about(self, event_id: str) -> About | None:
+        """Return what is known of an event's clip; None if it has none."""
+        if not _SAFE.fullmatch(event_id):
+            return None
+        try:
+            about = orjson.loads((self._path / event_id / ABOUT).read_bytes())
+        except (OSError, orjson.JSONDecodeError):
+            return None
+        return about if isinstance(about, dict) else None
+
+    def file(self, event_id: str, name: str) -> Path | None:
+        """Return the path of one of a clip's recordings; None if there is none of that name."""
+        about = self.about(event_id)
+        if about is None or name not in {each["name"] for each in about["files"]}:
+            return None
+        path = self._path / event_id / name
+        return path if path.is_file() else None
+
+    def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> About:
+        """Store a clip in place of an earlier one of the same event, which stays kept for ever if it was.
+
+        Parameters
+        ----------
+        event_id : str
+        write : callable
+            Writes the recordings into a folder and returns what to say of them: `start_ns` and `files` with `name` and
+            `bytes` at least.
+
+        Raises
+        ------
+        OSError
+            If the disk does not take it; nothing is left of it then.
+        ValueError
+            If the id cannot be the name of a folder.
+        """
+        if not _SAFE.fullmatch(event_id):
+            raise ValueError(f"clip: expected an event id of letters, digits, '.', '_' or '-', got {event_id!r}")
+        partial = self._path / f"{PARTIAL}{event_id}"
+        _erase(partial)
+        try:
+            partial.mkdir(mode=0o700)
+            about = {**write(partial), "keep": False}
+            with self._lock:
+                earlier = self.about(event_id)
+                about["keep"] = earlier is not None and earlier["keep"]
+                (partial / ABOUT).write_bytes(orjson.dumps(about))
+                going = self._set_aside(event_id)
+                partial.rename(self._path / event_id)
+                self._note(event_id, about)
+        except BaseException:
+            with suppress(OSError):
+                _erase(partial)
+            raise
+        if going is not None:
+            _erase(going)
+        return about
+
+    def keep(self, event_id: str, keep: bool) -> bool:
+        """Keep a clip for ever, or no longer; return False if there is none.
+
+        Raises
+        ------
+        OSError
+            If the disk does not take it.
+        """
+        with self._lock:
+            about = self.about(event_id)
+            if about is None:
+                return False
+            path = self._path / event_id / ABOUT
+            fresh = path.with_name(f"{PARTIAL}{ABOUT}")
+            fresh.write_bytes(orjson.dumps({**about, "keep": keep}))
+            fresh.replace(path)
+            self._note(event_id, {**about, "keep": keep})
+            return True
+
+    def delete(self, event_id: str) -> bool:
+        """Overwrite and delete an event's clip; return False if there is none.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be deleted.
+        """
+        going = self._set_aside(event_id)
+        if going is not None:
+            _erase(going)
+        return going is not None
+
+    def expire(self, before_ns: int | None, most_bytes: int) -> int:
+        """Delete clips of events that began before a time, and the oldest ones beyond a number of bytes.
+
+        Clips that are kept for ever stay. Return the number of clips that were deleted.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be deleted.
+        """
+        with self._lock:
+            excess = self.nbytes - most_bytes
+            oldest_first = sorted(self._entries.items(), key=lambda item: item[1].start_ns)
+        gone = 0
+        for event_id, entry in oldest_first:
+            is_old = before_ns is not None and entry.start_ns < before_ns
+            if not entry.keep and (is_old or excess > 0):
+                excess -= entry.nbytes
+                gone += self.delete(event_id)
+        return gone
+
+    def _set_aside(self, event_id: str) -> Path | None:
+        """Make a clip disappear at once by renaming its folder; return the folder, which is yet to be erased."""
+        with self._lock:
+            if self.about(event_id) is None:
+                return None
+            going = self._path / f"{PARTIAL}going-{event_id}"
+            _erase(going)
+            (self._path / event_id).rename(going)
+            self._entries.pop(event_id, None)
+            return going
+
+    def _note(self, event_id: str, about: Mapping[str, Any]) -> None:
+        nbytes = sum(int(each["bytes"]) for each in about["files"])
+        with self._lock:
+            self._entries[event_id] = _Entry(int(about["start_ns"]), nbytes, bool(about["keep"]))
+
+
+def _erase(folder: Path) -> None:
+    """Overwrite a folder's files with zeros and delete it; on some disks and file systems copies remain."""
+    if not folder.exists():
+        return
+    for path in (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()):
+        left = path.stat().st_size
+        with path.open("r+b") as file:
+            while left > 0:
+                left -= file.write(_ZEROS[:left])
+            file.flush()
+            os.fsync(file.fileno())
+    shutil.rmtree(folder) if folder.is_dir() else folder.unlink()

@@ -1,0 +1,149 @@
+"""Writes one event's clip: a file of each array, and the signal that is beamed at the event's place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from livessl.clock import utc_text
+from livessl.core.enhance.enhance import Enhancement, plan
+from livessl.core.types import Event, Float32Array, FloatArray
+from livessl.recordings.recorder import FLAC_MAX_CHANNELS
+from livessl.recordings.sound_file import Format, SoundWriter
+from livessl.server.clips.cut import Cut
+
+ENHANCED: Final = "enhanced.flac"
+"""Name of the enhanced signal."""
+
+PEAK: Final = 10.0 ** (-3.0 / 20.0)
+"""Largest sample of the enhanced signal, -3 dB full scale: most sounds of a room are too quiet to be listened to."""
+
+MOST_GAIN: Final = 1000.0
+"""Largest gain, 60 dB, by which the enhanced signal is made louder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What is to be written of an event.
+
+    Parameters
+    ----------
+    event : Event
+    cuts : tuple of Cut
+        What the arrays recorded around it.
+    enhanced : bool
+        Whether the signal beamed at the place is written, too.
+    c_m_s : float
+        Speed of sound, m/s.
+    """
+
+    event: Event
+    cuts: tuple[Cut, ...]
+    enhanced: bool
+    c_m_s: float
+
+
+def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
+    """Write the recordings of a clip into a folder, and return what to say of them.
+
+    Raises
+    ------
+    OSError
+        If the disk does not take them.
+    """
+    event = recipe.event
+    files = [_write_array(event, cut, folder) for cut in recipe.cuts]
+    if recipe.enhanced:
+        made = _write_enhanced(recipe, folder)
+        files = files if made is None else [made, *files]
+    estimate = event.estimate
+    return {
+        "event_id": event.id,
+        "start_ns": event.start_ns,
+        "time_utc": utc_text(event.start_ns),
+        "duration_s": round(event.duration_s, 6),
+        "position_m": None if estimate is None else [round(float(x), 4) for x in estimate.position_m],
+        "files": files,
+    }
+
+
+def _write_array(event: Event, cut: Cut, folder: Path) -> dict[str, Any]:
+    kind: Format = "flac" if len(cut.samples) <= FLAC_MAX_CHANNELS else "wav"
+    name = f"array-{cut.spec.name}.{kind}"
+    pre_roll_s = (event.start_ns - cut.time_ns) / 1e9
+    return {
+        "name": name,
+        "kind": "array",
+        "array": cut.spec.name,
+        **_write(folder / name, cut.samples, cut.sample_rate_hz, kind),
+        "time_utc": utc_text(cut.time_ns),
+        "pre_roll_s": round(pre_roll_s, 4),
+        "post_roll_s": round(cut.duration_s - pre_roll_s - event.duration_s, 4),
+        "gaps_s": [[round(begin, 4), round(end, 4)] for begin, end in cut.gaps_s],
+        "gain_db": 0.0,
+        "beams": [],
+    }
+
+
+def _write_enhanced(recipe: Recipe, folder: Path) -> dict[str, Any] | None:
+    """Write the enhanced signal from the arrays of which the estimate was made; None if none of them has sound."""
+    event, estimate = recipe.event, recipe.event.estimate
+    if estimate is None:
+        return None
+    used = [cut for cut in recipe.cuts if cut.spec.name in estimate.arrays]
+    sounds = [cut.sound(event.start_ns, event.end_ns) for cut in used]
+    sounds = [sound for sound in sounds if sound.sound.any()]
+    if not sounds:
+        return None
+    made = plan(sounds, estimate.position_m, recipe.c_m_s)
+    signal = made.apply({sound.spec.name: sound.samples for sound in sounds})
+    gain = _gain(signal)
+    samples = np.asarray(gain * signal[None], dtype=np.float32)
+    pre_roll_s = (event.start_ns - made.time_ns) / 1e9
+    return {
+        "name": ENHANCED,
+        "kind": "enhanced",
+        "array": None,
+        **_write(folder / ENHANCED, samples, made.sample_rate_hz, "flac"),
+        "time_utc": utc_text(made.time_ns),
+        "pre_roll_s": round(pre_roll_s, 4),
+        "post_roll_s": round(len(signal) / made.sample_rate_hz - pre_roll_s - event.duration_s, 4),
+        "gaps_s": [],
+        "gain_db": round(20.0 * float(np.log10(gain)), 1),
+        "beams": _beams(made),
+    }
+
+
+def _beams(made: Enhancement) -> Sequence[Mapping[str, Any]]:
+    return [
+        {
+            "array": part.array,
+            "share": round(part.share, 3),
+            "lag_s": round(part.lag_s, 5),
+            "snr_db": None if part.snr_db is None else round(part.snr_db, 1),
+        }
+        for part in made.parts
+    ]
+
+
+def _write(path: Path, samples: Float32Array, rate_hz: float, kind: Format) -> dict[str, Any]:
+    writer = SoundWriter(path, round(rate_hz), len(samples), kind)
+    try:
+        writer.write(samples)
+    finally:
+        writer.close()
+    return {
+        "channels": len(samples),
+        "sample_rate_hz": round(rate_hz),
+        "duration_s": round(samples.shape[1] / rate_hz, 4),
+        "bytes": path.stat().st_size,
+    }
+
+
+def _gain(signal: FloatArray) -> float:
+    peak = float(np.abs(signal).max(initial=0.0))
+    return 1.0 if peak == 0.0 else min(PEAK / peak, MOST_GAIN)

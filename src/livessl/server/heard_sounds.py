@@ -1,0 +1,100 @@
+"""The last sounds with the delays that each array observed: what commands and pages calibrate with."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Final
+
+from livessl.core.commission.observe import observe
+from livessl.core.types import Event, Observation
+
+KEPT: Final = 64
+"""Number of sounds that are kept: more than a calibration needs, by claps (12) or by unknown sounds (20)."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeardSound:
+    """One sound, and what the arrays observed of it.
+
+    Parameters
+    ----------
+    number : int
+        Number of the sound, from 1; later sounds have higher ones while the server runs.
+    event : Event
+        Its final event, without what it was located from.
+    observations : tuple of Observation
+    """
+
+    number: int
+    event: Event
+    observations: tuple[Observation, ...]
+
+
+class HeardSounds:
+    """Keeps the last sounds. The fusion thread calls `take` and `forget`; every thread may read.
+
+    Delays are measured when they are read, so that the fusion thread spends no time on it.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._observing = threading.Lock()
+        self._new: deque[tuple[int, Event]] = deque(maxlen=KEPT)
+        self._sounds: deque[HeardSound] = deque(maxlen=KEPT)
+        self._last = 0
+        self._run = 0  # number of times that all sounds were forgotten
+
+    @property
+    def last(self) -> int:
+        """Number of the last sound; 0 before the first."""
+        return self._last
+
+    def take(self, event: Event) -> None:
+        """Take in a final event with what the arrays received."""
+        with self._lock:
+            self._last += 1
+            self._new.append((self._last, event))
+
+    def forget(self) -> None:
+        """Forget all sounds; numbers continue."""
+        with self._lock:
+            self._new.clear()
+            self._sounds.clear()
+            self._run += 1
+
+    def after(self, number: int) -> list[HeardSound]:
+        """Return the sounds with a higher number, the oldest first."""
+        self._observe()
+        with self._lock:
+            return [sound for sound in self._sounds if sound.number > number]
+
+    def numbered(self, numbers: list[int]) -> list[HeardSound]:
+        """Return the sounds of these numbers in this order.
+
+        Raises
+        ------
+        LookupError
+            With the first number that is not kept.
+        """
+        known = {sound.number: sound for sound in self.after(0)}
+        missing = next((number for number in numbers if number not in known), None)
+        if missing is not None:
+            raise LookupError(missing)
+        return [known[number] for number in numbers]
+
+    def _observe(self) -> None:
+        """Measure the delays of the sounds that are new."""
+        with self._observing:
+            with self._lock:
+                new, run = list(self._new), self._run
+                self._new.clear()
+            if not new:
+                return
+            observed = [
+                HeardSound(number, replace(event, received=()), observe(event.received)) for number, event in new
+            ]
+            with self._lock:
+                if run == self._run:
+                    self._sounds.extend(observed)

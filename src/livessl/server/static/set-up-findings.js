@@ -1,0 +1,11 @@
+// A finding of the doctor as an item of a list.
+
+import { el } from "./dom.js";
+
+/** A finding as an item of a list: what is wrong, at which input, and what cures it. */
+export function findingItem({ fault, severity, message, cure, input, confidence }) {
+  const where = input === null ? "" : ` (input ${input})`;
+  return el("li", { className: "finding", "data-severity": severity, "data-fault": fault },
+    el("p", { className: "finding-what" }, el("b", { text: severity }), ` ${message}${where}`),
+    el("p", { className: "finding-cure", text: `${cure}. ${Math.round(100 * confidence)} % sure.` }));
+}

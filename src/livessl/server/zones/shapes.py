@@ -1,0 +1,82 @@
+"""The zones of a site at one moment, and which of them hold a position. Values in, values out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from livessl.server.zones.membership import Prism, probability_in
+from livessl.site.build.grid import search_grid
+from livessl.site.models import Site
+from livessl.site.zone_models import Zone
+
+NAMED: Final = 0.05
+"""Least probability of a zone that events name; it is above the error of the published covariance's digits."""
+
+EXCLUDED: Final = 0.5
+"""Probability of an excluded zone from which on what lies there is excluded."""
+
+
+class ZoneMap:
+    """Zones by name, with the volume that is searched. It never changes.
+
+    Parameters
+    ----------
+    site : Site
+    drawn : mapping of str to Zone or None
+        Zones that operators have drawn; None for those that the site was loaded with.
+    """
+
+    def __init__(self, site: Site, drawn: Mapping[str, Zone] | None = None) -> None:
+        self.drawn: Mapping[str, Zone] = dict(site.drawn_zones if drawn is None else drawn)
+        """The zones that operators have drawn."""
+        self.zones: Mapping[str, Zone] = {**site.zones, **self.drawn}
+        """All zones."""
+        self.height_m = site.room.size_m[2]
+        """Height of the room, up to which zones reach that give none."""
+        self._volume_m = np.array(search_grid(site).bounds_m, dtype=np.float64)
+        self._prisms = {name: _prism(zone) for name, zone in self.zones.items()}
+
+    def holding(self, position_m: Sequence[float] | None) -> list[str]:
+        """Return the names of the zones in which a position lies."""
+        return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
+
+    def probability(self, zone: str, position_m: Any, covariance_m2: Any) -> float:
+        """Return the probability that a source is in a zone.
+
+        Parameters
+        ----------
+        zone : str
+        position_m : (3,) array_like
+            In metres.
+        covariance_m2 : (3, 3) array_like
+            Its covariance, in square metres.
+        """
+        mean_m = np.asarray(position_m, dtype=np.float64)
+        return probability_in(mean_m, np.asarray(covariance_m2, dtype=np.float64), self._prisms[zone], self._volume_m)
+
+    def memberships(self, position_m: Any, covariance_m2: Any) -> dict[str, float]:
+        """Return the zones in which a source may be, each with its probability of at least `NAMED`."""
+        found = {name: self.probability(name, position_m, covariance_m2) for name in self.zones}
+        return {name: probability for name, probability in found.items() if probability >= NAMED}
+
+    def excluding(self, holding: Sequence[str], memberships: Mapping[str, float]) -> list[str]:
+        """Return the excluded zones in which something lies, or is with a probability of at least `EXCLUDED`."""
+        return [
+            name
+            for name, zone in self.zones.items()
+            if zone.exclude and (name in holding or memberships.get(name, 0.0) >= EXCLUDED)
+        ]
+
+
+def fixed_zones(site: Site) -> Callable[[], ZoneMap]:
+    """Return what always returns the zones that a site was loaded with."""
+    zones = ZoneMap(site)
+    return lambda: zones
+
+
+def _prism(zone: Zone) -> Prism:
+    low, high = zone.heights_m or (-np.inf, np.inf)
+    return Prism(np.array(zone.outline_m, dtype=np.float64), low, high)

@@ -1,0 +1,111 @@
+"""The recordings in an event's details, in a browser that plays them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Dialog, Page, expect
+from scene_server import capture_scene
+
+from browser import faultless_page, running_browser, visit
+from livessl.server.app import Server
+from livessl.site.tokens import add_token
+from small_site import HANG_S, Changes, running_server, site_of, wait_until
+
+pytestmark = [pytest.mark.browser]
+
+CLIPS: Changes = {"server.clips": {"folder": "clips"}, "server.http.tokens": "tokens.yaml"}
+CLIPPED = """
+() => [...document.querySelectorAll(".clips *")]
+  .filter((e) => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1).map((e) => e.outerHTML)
+"""
+"""Script that finds elements of the recordings whose text is wider than they are."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with running_browser() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def tokens(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    directory = tmp_path_factory.mktemp("site")
+    return directory, {role: add_token(directory / "tokens.yaml", role, role) for role in ("viewer", "operator")}
+
+
+@pytest.fixture(scope="module")
+def server(tokens: tuple[Path, dict[str, str]]) -> Iterator[Server]:
+    with running_server(site_of(CLIPS, tokens[0])) as server:
+        capture_scene(server)
+        clips = server.parts.clips
+        assert clips is not None
+        wait_until(lambda: clips.counts.written == 2, "both clips")
+        yield server
+
+
+def sign_in(page: Page, server: Server, token: str) -> None:
+    visit(page, server.url)
+    page.get_by_label("Access token").fill(token)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
+    page.get_by_test_id("event").first.locator(".summary").click()
+    expect(page.get_by_test_id("clips").first).to_have_attribute("data-state", "stored", timeout=1000 * HANG_S)
+
+
+def test_operator_listens_keeps_and_deletes(
+    browser: Browser, server: Server, tokens: tuple[Path, dict[str, str]]
+) -> None:
+    with faultless_page(browser) as page:
+        sign_in(page, server, tokens[1]["operator"])
+        enhanced = page.get_by_test_id("clip-enhanced.flac")
+        expect(enhanced).to_contain_text("Enhanced, at the place found")
+        enhanced.get_by_role("button", name="Listen").click()
+        audio = enhanced.get_by_test_id("clip-audio")
+        expect(audio).to_be_visible(timeout=1000 * HANG_S)
+        page.wait_for_function(
+            "e => e.readyState >= 3 && e.duration > 0.5 && e.error === null",
+            arg=audio.element_handle(),
+            timeout=1000 * HANG_S,
+        )
+        with page.expect_download(timeout=1000 * HANG_S) as saved:
+            page.get_by_test_id("clip-array-north.flac").get_by_role("button", name="Save").click()
+        assert saved.value.suggested_filename.endswith("-array-north.flac")
+        assert saved.value.path().read_bytes()[:4] == b"fLaC"
+        for width in (1440, 1280, 820, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate(CLIPPED) == [], width
+        page.get_by_role("button", name="Keep for ever").click()
+        kept = page.get_by_role("button", name="Keep no longer")
+        expect(kept).to_have_attribute("aria-pressed", "true", timeout=1000 * HANG_S)
+        asked: list[str] = []
+
+        def refuse(dialog: Dialog) -> None:
+            asked.append(dialog.message)
+            dialog.dismiss()
+
+        page.once("dialog", refuse)
+        page.get_by_role("button", name="Delete the recordings").click()
+        assert asked == ["Delete the recordings of this event? The event itself stays."]
+        expect(kept).to_be_visible()
+        page.once("dialog", lambda dialog: dialog.accept())
+        page.get_by_role("button", name="Delete the recordings").click()
+        expect(page.get_by_test_id("clips").first).to_have_attribute("data-state", "none", timeout=1000 * HANG_S)
+        assert server.parts.clips is not None
+        assert server.parts.clips.folder.count == 1
+
+
+def test_viewer_sees_what_there_is_and_gets_no_button(
+    browser: Browser, server: Server, tokens: tuple[Path, dict[str, str]]
+) -> None:
+    with faultless_page(browser) as page:
+        visit(page, server.url)
+        page.get_by_label("Access token").fill(tokens[1]["viewer"])
+        page.get_by_role("button", name="Sign in").click()
+        expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
+        page.get_by_test_id("event").last.locator(".summary").click()
+        clips = page.get_by_test_id("clips").last
+        expect(clips).to_contain_text("Sign in as an operator to listen.", timeout=1000 * HANG_S)
+        expect(clips.get_by_role("button")).to_have_count(0)

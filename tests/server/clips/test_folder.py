@@ -1,0 +1,141 @@
+"""The folder of clips: complete or not there, limited, and deleted for good."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from livessl.server.clips.folder import PARTIAL, ClipFolder, ClipsError
+
+SOUND = b"what somebody said"
+
+
+def write(start_ns: int, content: bytes = SOUND) -> Any:
+    def into(folder: Path) -> dict[str, Any]:
+        (folder / "a.flac").write_bytes(content)
+        return {"start_ns": start_ns, "files": [{"name": "a.flac", "bytes": len(content)}]}
+
+    return into
+
+
+def on_disk(path: Path) -> set[str]:
+    return {str(each.relative_to(path)) for each in path.rglob("*") if each.is_file()}
+
+
+def test_clip_is_stored_read_kept_and_deleted(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path / "clips")
+    folder.put("lab-1", write(5))
+    about = folder.about("lab-1")
+    assert about is not None
+    assert (about["start_ns"], about["keep"]) == (5, False)
+    assert (tmp_path / "clips").stat().st_mode & 0o077 == 0
+    path = folder.file("lab-1", "a.flac")
+    assert path is not None
+    assert path.read_bytes() == SOUND
+    assert folder.keep("lab-1", True)
+    assert (folder.count, folder.kept, folder.nbytes) == (1, 1, len(SOUND))
+    assert folder.delete("lab-1")
+    assert (folder.count, folder.kept, folder.nbytes) == (0, 0, 0)
+    assert on_disk(tmp_path) == set()
+    assert not folder.delete("lab-1")
+    assert not folder.keep("lab-1", True)
+
+
+def test_deleted_sound_is_overwritten_before_it_is_unlinked(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    os.link(tmp_path / "lab-1" / "a.flac", tmp_path / "other-name")  # shows what was on the disk's blocks
+    folder.delete("lab-1")
+    assert (tmp_path / "other-name").read_bytes() == bytes(len(SOUND))
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret", "..", ".", "", "a/b", "a\0b", f"{PARTIAL}x", "x" * 300, "clip.json", "b.flac"]
+)
+def test_names_that_are_no_recording_lead_nowhere(tmp_path: Path, name: str) -> None:
+    (tmp_path / "secret").write_text("secret", encoding="utf-8")
+    folder = ClipFolder(tmp_path / "clips")
+    folder.put("lab-1", write(5))
+    assert folder.file("lab-1", name) is None
+    assert folder.about(name) is None
+    assert folder.file(name, "a.flac") is None
+    assert not folder.delete(name)
+    with pytest.raises(ValueError, match="expected an event id"):
+        folder.put("../x", write(5))
+
+
+def test_error_while_writing_leaves_nothing_and_keeps_the_earlier_clip(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+
+    def full(partial: Path) -> dict[str, Any]:
+        (partial / "a.flac").write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    for name in ("lab-1", "lab-2"):
+        with pytest.raises(OSError, match="No space"):
+            folder.put(name, full)
+    assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json"}
+    assert folder.about("lab-2") is None
+
+
+def test_clip_that_is_written_again_stays_kept(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    folder.keep("lab-1", True)
+    folder.put("lab-1", write(5, b"longer than before"))
+    about = folder.about("lab-1")
+    assert about is not None
+    assert about["keep"]
+    assert folder.nbytes == len(b"longer than before")
+
+
+def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    folder.put("lab-2", write(6))
+    folder.keep("lab-2", True)
+    (tmp_path / f"{PARTIAL}lab-3").mkdir()
+    (tmp_path / f"{PARTIAL}lab-3" / "a.flac").write_bytes(SOUND)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    again = ClipFolder(tmp_path)
+    again.load()
+    assert (again.count, again.kept, again.nbytes) == (2, 1, 2 * len(SOUND))
+    assert (tmp_path / "foreign").is_dir()
+    assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
+
+
+@given(
+    clips=st.dictionaries(st.integers(0, 30), st.tuples(st.integers(1, 50), st.booleans()), max_size=12),
+    before=st.none() | st.integers(0, 30),
+    most=st.integers(0, 300),
+)
+def test_expiry_deletes_old_ones_then_the_oldest_and_never_kept_ones(
+    tmp_path_factory: pytest.TempPathFactory,
+    clips: dict[int, tuple[int, bool]],
+    before: int | None,
+    most: int,
+) -> None:
+    folder = ClipFolder(tmp_path_factory.mktemp("clips"))
+    for start, (size, keep) in clips.items():
+        folder.put(f"lab-{start}", write(start, b"x" * size))
+        folder.keep(f"lab-{start}", keep)
+    left = {start for start, (_, keep) in clips.items() if keep or before is None or start >= before}
+    for start in sorted(clips):
+        if sum(clips[each][0] for each in left) > most and start in left and not clips[start][1]:
+            left.discard(start)
+    gone = folder.expire(before, most)
+    assert {start for start in clips if folder.about(f"lab-{start}")} == left
+    assert (gone, folder.count) == (len(clips) - len(left), len(left))
+
+
+def test_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(ClipsError, match=r"server\.clips\.folder: cannot write .*; name a folder in which"):
+        ClipFolder(tmp_path / "file" / "clips")

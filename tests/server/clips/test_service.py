@@ -1,0 +1,264 @@
+"""What becomes of an event's sound: which events have clips, what is missing in them, and what is given up."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from alert_desk import START, refused, sound
+from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.types import FRAME_NS, Event, Frame, Status
+from livessl.server.clips import service
+from livessl.server.clips.service import SETTLE_NS, Clips
+from small_site import RATE_HZ, Changes, frame, site_of
+
+DAY_NS = 86_400_000_000_000
+CLIPS: dict[str, Any] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5}
+
+
+class HandClock:
+    """A clock that a test sets; it begins when the sounds do."""
+
+    def __init__(self) -> None:
+        self.ns = START * FRAME_NS
+
+    def now_ns(self) -> int:
+        return self.ns
+
+    monotonic_ns = now_ns
+
+    def sleep_until_ns(self, time_ns: int) -> bool:
+        self.ns = max(self.ns, time_ns)
+        return True
+
+
+class Switches:
+    """Stands in for site time and overload."""
+
+    is_replay = False
+    message: str | None = None
+
+
+class Desk:
+    """Clips without a server: a test hands in frames and events, and moves the clock."""
+
+    def __init__(self, directory: Path, changes: Changes | None = None, **clips: Any) -> None:
+        site = site_of({"server.clips": CLIPS | clips, **(changes or {})}, directory)
+        assert site.server.clips is not None
+        self.clock, self.switches = HandClock(), Switches()
+        switches = cast(Any, self.switches)
+        self.clips = Clips(site, site.server.clips, self.clock, switches, switches)
+        self.offsets = ClockOffsets({"north": "a", "south": "b"}, site.c_m_s)
+
+    def finish(self, *events: Event) -> None:
+        for event in events:
+            self.clips.take_final(event, self.offsets)
+
+    def work(self) -> None:
+        """Let the time come at which everything that waits is due, and do it."""
+        self.clock.ns += 10_000_000_000
+        while self.clips.work():
+            pass
+
+    def files(self, event: Event) -> dict[str, dict[str, Any]]:
+        about = self.clips.folder.about(event.id)
+        return {} if about is None else {file["name"]: file for file in about["files"]}
+
+
+def heard(indices: Sequence[int], array: str = "north", ahead_ns: int = 0) -> list[Frame]:
+    """Frames of an array around the sound that begins at `START`; its own clock is ahead."""
+    found = []
+    for n in indices:
+        first = frame(n + 1000, START + n, array, active=0 <= n < 10, seed=n + 100)
+        level = np.float32(1.0 if first.active else 0.01)
+        found.append(
+            Frame(
+                array,
+                n + 1000,
+                first.frame_index,
+                first.time_ns + ahead_ns,
+                RATE_HZ,
+                level * first.samples,
+                0.01,
+                first.active,
+            )
+        )
+    return found
+
+
+def event(number: int = 0, **more: Any) -> Event:
+    made = sound(number, **more)
+    return Event(**{name: getattr(made, name) for name in made.__slots__} | {"heard_by": ("north", "south")})
+
+
+def test_clip_has_the_whole_span_that_was_sent_and_says_how_much_that_is(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take([*heard(range(-60, 30)), *heard(range(-8, 16), "south")], None)
+    desk.finish(event())
+    assert desk.clips.is_waiting("small-0")
+    desk.work()
+    files = desk.files(event())
+    north, south = files["array-north.flac"], files["array-south.flac"]
+    assert (north["pre_roll_s"], north["post_roll_s"]) == (1.0, 0.5)  # what the site asks for
+    assert (south["pre_roll_s"], south["post_roll_s"]) == (0.4, 0.3)  # what there was
+    assert north["gaps_s"] == south["gaps_s"] == []
+    assert (desk.clips.counts.written, desk.clips.counts.incomplete) == (1, 0)
+    assert not desk.clips.is_waiting("small-0")
+
+
+def test_frames_that_are_missing_are_listed_and_counted(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take([*heard([*range(-8, 3), *range(6, 16)]), *heard(range(-8, 16), "south")], None)
+    desk.finish(event())
+    desk.work()
+    assert desk.files(event())["array-north.flac"]["gaps_s"] == [[0.55, 0.7]]
+    assert (desk.clips.counts.written, desk.clips.counts.incomplete) == (1, 1)
+
+
+def test_gap_before_the_event_makes_no_clip_incomplete(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take([*heard([*range(-18, -12), *range(-8, 16)]), *heard(range(-8, 16), "south")], None)
+    desk.finish(event())
+    desk.work()
+    assert len(desk.files(event())["array-north.flac"]["gaps_s"]) == 1
+    assert desk.clips.counts.incomplete == 0
+
+
+def test_array_whose_clock_is_known_to_be_ahead_is_cut_at_the_time_of_the_sound(tmp_path: Path) -> None:
+    desk, ahead_ns = Desk(tmp_path, pre_s=0.2, post_s=0.0), 110_000_000
+    for n in range(4):
+        desk.offsets.learn(START * FRAME_NS + n, {"north": 0.0, "south": ahead_ns / 1e9})
+    rest_s = desk.offsets.rest_s("south") + 0.05 * desk.offsets.frames_ahead("south")
+    rest_s -= desk.offsets.rest_s("north") + 0.05 * desk.offsets.frames_ahead("north")
+    assert rest_s == pytest.approx(0.11, abs=1e-3)
+    desk.clips.take([*heard(range(-20, 30)), *heard(range(-20, 30), "south", ahead_ns)], None)
+    desk.finish(event())
+    desk.work()
+    north, south = (desk.files(event())[f"array-{name}.flac"] for name in ("north", "south"))
+    assert abs(north["pre_roll_s"] - south["pre_roll_s"]) < 0.051  # a frame more or less
+    assert 0.15 < south["pre_roll_s"] <= 0.2
+
+
+@pytest.mark.parametrize(
+    "other", [refused(0), sound(0, status=Status.DIRECTION_ONLY)], ids=["refused", "direction only"]
+)
+def test_event_without_a_position_gets_no_clip(tmp_path: Path, other: Event) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.finish(other)
+    assert desk.clips.waiting == 0
+
+
+def test_replay_gives_neither_frames_nor_events(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.switches.is_replay = True
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.finish(event())
+    assert desk.clips.waiting == 0
+    desk.switches.is_replay = False
+    desk.finish(event())
+    desk.work()
+    assert desk.clips.counts.without_sound == 1
+
+
+def test_overloaded_server_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.switches.message = "overloaded"
+    desk.finish(event())
+    desk.work()
+    assert (desk.clips.counts.shed, desk.clips.counts.written, desk.clips.waiting) == (1, 0, 0)
+
+
+def test_clip_is_not_cut_before_its_last_frames_can_have_come(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take(heard(range(-8, 12)), None)
+    desk.clock.ns = event().end_ns
+    desk.finish(event())
+    desk.clock.ns += SETTLE_NS + 490_000_000
+    assert not desk.clips.work()
+    desk.clips.take(heard(range(12, 16)), None)
+    desk.clock.ns += 10_000_000
+    assert desk.clips.work()
+    assert desk.files(event())["array-north.flac"]["post_roll_s"] == 0.3
+
+
+def test_frames_are_released_once_their_results_are_final(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.clips.take(heard(range(20)), None)
+    desk.clips.take([], START + 100)
+    desk.finish(event())
+    desk.clips.take(heard([3000]), START + 3000)  # long after the clip should have been cut
+    desk.work()
+    assert desk.clips.counts.without_sound == 1
+
+
+def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk, reached, release = Desk(tmp_path), threading.Event(), threading.Event()
+    writes = vars(service)["write_clip"]
+
+    def slow(*arguments: Any) -> Any:
+        reached.set()
+        assert release.wait(60)
+        return writes(*arguments)
+
+    monkeypatch.setattr(service, "write_clip", slow)
+    monkeypatch.setattr(service, "MAX_WAITING", 3)
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.finish(event())
+    worker = threading.Thread(target=desk.work)
+    worker.start()
+    assert reached.wait(60)
+    desk.finish(*(event(number) for number in range(1, 6)))  # returns at once: the disk still hangs
+    assert (desk.clips.waiting, desk.clips.counts.shed) == (3, 3)
+    release.set()
+    worker.join(60)
+    assert not worker.is_alive()
+    assert desk.clips.counts.written == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "clips", "days"),
+    [({}, {"max_age_days": 2}, 2), ({"store": {"retention_days": 1}}, {"max_age_days": None}, 1)],
+)
+def test_clips_are_deleted_at_their_age_or_with_their_event(
+    tmp_path: Path, changes: Changes, clips: dict[str, Any], days: int
+) -> None:
+    desk = Desk(tmp_path, changes, **clips)
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.finish(event())
+    desk.work()
+    desk.clock.ns += days * DAY_NS - 3_600_000_000_000
+    desk.work()
+    assert desk.clips.folder.count == 1
+    desk.clock.ns += 3_600_000_000_000
+    desk.work()
+    assert (desk.clips.folder.count, desk.clips.counts.deleted) == (0, 1)
+
+
+def test_enhanced_signal_can_be_left_out(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, enhanced=False)
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.finish(event())
+    desk.work()
+    assert set(desk.files(event())) == {"array-north.flac"}
+
+
+def test_array_of_more_than_eight_microphones_is_stored_as_wav(tmp_path: Path) -> None:
+    circle = {"geometry": {"circle": {"radius_m": 0.2, "count": 9}}, "position_m": [1.9, 1.3, 1.4]}
+    desk = Desk(tmp_path, {"arrays.north": circle, "nodes": {}})
+    wide = [
+        Frame("north", 1, f.frame_index, f.time_ns, RATE_HZ, np.tile(f.samples, (3, 1))[:9], 0.01, f.active)
+        for f in heard(range(-8, 16))
+    ]
+    desk.clips.take(wide, None)
+    desk.finish(event())
+    desk.work()
+    assert desk.files(event())["array-north.wav"]["channels"] == 9

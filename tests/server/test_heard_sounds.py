@@ -1,0 +1,40 @@
+"""The server keeps the last sounds with their delays."""
+
+from __future__ import annotations
+
+import pytest
+
+from known_sounds import events
+from livessl.server.heard_sounds import KEPT, HeardSounds
+
+
+@pytest.fixture
+def heard() -> HeardSounds:
+    return HeardSounds()
+
+
+def test_sounds_have_numbers_and_delays_and_are_read_from_any_number_on(heard: HeardSounds) -> None:
+    for event in events()[:3]:
+        heard.take(event)
+    assert [sound.number for sound in heard.after(0)] == [1, 2, 3]
+    assert [sound.number for sound in heard.after(2)] == [3]
+    (third,) = heard.numbered([3])
+    assert {one.array for one in third.observations} == {"north", "south"}
+    assert third.event == events()[2]
+    assert third.event.received == ()
+
+
+def test_numbers_continue_when_the_sounds_are_forgotten(heard: HeardSounds) -> None:
+    heard.take(events()[0])
+    heard.forget()
+    assert (heard.after(0), heard.last) == ([], 1)
+    heard.take(events()[1])
+    assert [sound.number for sound in heard.after(0)] == [2]
+
+
+def test_the_oldest_sounds_go(heard: HeardSounds) -> None:
+    for _ in range(KEPT + 2):
+        heard.take(events()[0])
+    assert [sound.number for sound in heard.after(0)] == list(range(3, KEPT + 3))
+    with pytest.raises(LookupError, match="2"):
+        heard.numbered([3, 2])
