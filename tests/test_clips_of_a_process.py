@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,12 @@ from livessl.lab.processes import free_port, wait_until_ready
 from small_site import HANG_S, scene_recordings, site_of, started, wait_until, write_site
 
 CLOCK = SystemClock()
+
+
+def made(figures: dict[str, Any]) -> int:
+    """The number of events whose clips are no longer waited for."""
+    return sum(int(figures[name]) for name in ("written", "shed", "failed", "without_sound"))
+
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
@@ -42,10 +49,14 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
 
     with started(*command) as process:
         wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
-        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
-        recordings = scene_recordings(start_ns)
-        capture_recordings(site_of(changes), "lab-pc", recordings, CLOCK, "run", lambda: False)
-        wait_until(lambda: get("clips")["written"] == 2, "both clips")
+        for attempt in count(1):  # a busy machine can shed a clip
+            start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
+            recordings = scene_recordings(start_ns)
+            capture_recordings(site_of(changes), "lab-pc", recordings, CLOCK, f"run-{attempt}", lambda: False)
+            wait_until(lambda n=2 * attempt: made(get("clips")) >= n, "what becomes of both events")  # type: ignore[misc]
+            if get("clips")["written"] >= 2:
+                break
+        written = get("clips")["written"]
         process.kill()
         process.wait()
     unfinished = tmp_path / "clips" / ".partial-small-1"
@@ -53,12 +64,13 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
     (unfinished / "array-north.flac").write_bytes(b"half")
     with started(*command) as process:
         wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
-        wait_until(lambda: get("clips")["clips"] == 2, "the clips of before")
+        wait_until(lambda: get("clips")["clips"] == written, "the clips of before")
         wait_until(lambda: not unfinished.exists(), "the end of what was not finished")
-        for event in get("events")["events"]:
-            files = get(f"events/{event['id']}/clips")["files"]
+        events = [event["id"] for event in get("events")["events"]]
+        for event in (each for each in events if get(f"events/{each}/clips")["state"] == "stored"):
+            files = get(f"events/{event}/clips")["files"]
             assert [file["kind"] for file in files] == ["enhanced", "array", "array"]
-            sound = httpx.get(f"{url}/api/v1/events/{event['id']}/clips/enhanced.flac", timeout=HANG_S)
+            sound = httpx.get(f"{url}/api/v1/events/{event}/clips/enhanced.flac", timeout=HANG_S)
             assert sound.content[:4] == b"fLaC"
-            assert httpx.delete(f"{url}/api/v1/events/{event['id']}/clips", timeout=HANG_S).status_code == 200
+            assert httpx.delete(f"{url}/api/v1/events/{event}/clips", timeout=HANG_S).status_code == 200
         assert list((tmp_path / "clips").iterdir()) == []

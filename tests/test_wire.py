@@ -75,6 +75,7 @@ HOSTS = st.builds(
     error_s=st.none() | st.floats(0.0, 1e9),
     lost_blocks=st.integers(0, 2**64 - 1),
     load=st.none() | st.floats(0.0, 1e9),
+    sound_server=st.booleans(),
     machine=WORDS,
 )
 MARKS = st.builds(
@@ -90,6 +91,7 @@ MARKS = st.builds(
     drift_ppm=st.floats(allow_nan=False, allow_infinity=False),
     clock=st.sampled_from(ClockState),
     levels=st.lists(LEVELS, max_size=16).map(tuple),
+    drift_error_ppm=st.none() | st.floats(0.0, 1e12),
     host=st.none() | HOSTS,
 )
 HELLOS = st.builds(
@@ -123,8 +125,10 @@ BYES = st.builds(Bye, node=NAMES, run_id=NAMES)
 WELCOMES = st.builds(Welcome, run_id=NAMES, reads=st.lists(NAMES, max_size=8).map(tuple))
 
 QUIET = ChannelLevel(-40.5, -52.25, 3, 0.001, 50.0, -61.0, -70.5, 2.5)
-HOST = HostState(True, "chrony", "ntp.example", 0.0021, 4, 0.75, "a1b2")
-REPORT = replace(mark(), levels=(QUIET, replace(QUIET, hum_hz=None, hum_dbfs=None, mean=None)), host=HOST)
+HOST = HostState(True, "chrony", "ntp.example", 0.0021, 4, 0.75, True, "a1b2")
+REPORT = replace(
+    mark(), levels=(QUIET, replace(QUIET, hum_hz=None, hum_dbfs=None, mean=None)), drift_error_ppm=3.5, host=HOST
+)
 
 EXAMPLES: list[WireMessage] = [
     frame(),
@@ -168,7 +172,8 @@ def test_every_truncation_is_refused(message: WireMessage) -> None:
     data = encode(message)
     whole = []
     if isinstance(message, Mark):  # sections are optional, so a mark without the last ones is whole
-        whole = [len(encode(replace(message, levels=(), host=None))), len(encode(replace(message, host=None)))]
+        without = replace(message, host=None), replace(message, drift_error_ppm=None, host=None)
+        whole = [len(encode(mark)) for mark in (*without, replace(without[1], levels=()))]
     for length in [*range(min(len(data), 200)), len(data) - 1]:
         if length not in whole:
             refusal(data[:length])
@@ -426,7 +431,7 @@ def test_mark_without_sections_is_as_older_servers_read_it() -> None:
     assert len(encode(replace(mark(), levels=(QUIET,)))) > len(encode(mark()))
 
 
-@given(st.integers(3, 255), st.binary(max_size=300), st.booleans())
+@given(st.integers(4, 255), st.binary(max_size=300), st.booleans())
 def test_unknown_section_is_skipped(tag: int, body: bytes, is_last: bool) -> None:
     """A newer node may add sections, before or after those that this server knows."""
     plain, whole = encode(mark()), encode(REPORT)
@@ -445,10 +450,18 @@ def test_unknown_section_is_skipped(tag: int, body: bytes, is_last: bool) -> Non
         (struct.pack("<BHQ7d", 1, 64, 0, 0, 0, math.inf, 0, 0, 0, 0), "a mean up to 1e+07, got inf"),
         (struct.pack("<BHQ7d", 1, 64, 0, 0, 0, 0, 0, 1e4, 0, 0), "a level up to 1000, got 10000"),
         (struct.pack("<BH", 1, 64) + bytes(63), "a section of 64 bytes, got 63"),
-        (struct.pack("<BH", 2, 5) + bytes(5), "a machine's state of at least 28 bytes, got 5"),
-        (struct.pack("<BHBdQdBBB", 2, 28, 3, 0, 0, 0, 0, 0, 0), "a known clock, got 0 bytes and 3"),
-        (struct.pack("<BHBdQdBBB", 2, 28, 0, 0, 0, 0, 1, 0, 0), "1 bytes of names and a known clock, got 0 bytes"),
-        (struct.pack("<BHBdQdBBB", 2, 28, 0, math.inf, 0, 0, 0, 0, 0), "an error in seconds up to 1e+09, got inf"),
+        (struct.pack("<BH", 2, 5) + bytes(5), "a machine's state of at least 29 bytes, got 5"),
+        (struct.pack("<BHf", 3, 4, 1.0), "an error of the drift of 8 bytes, got 4"),
+        (struct.pack("<BHd", 3, 8, -1.0), "an error of the drift from 0 to 1e+12 ppm, got -1.0"),
+        (struct.pack("<BHBdQd?BBB", 2, 29, 3, 0, 0, 0, False, 0, 0, 0), "a known clock, got 0 bytes and 3"),
+        (
+            struct.pack("<BHBdQd?BBB", 2, 29, 0, 0, 0, 0, False, 1, 0, 0),
+            "1 bytes of names and a known clock, got 0 bytes",
+        ),
+        (
+            struct.pack("<BHBdQd?BBB", 2, 29, 0, math.inf, 0, 0, False, 0, 0, 0),
+            "an error in seconds up to 1e+09, got inf",
+        ),
     ],
 )
 def test_section_of_a_wrong_value_is_refused(tail: bytes, expected: str) -> None:

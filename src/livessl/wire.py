@@ -3,9 +3,9 @@
 A message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, time of sending), then the body of its
 kind. Samples travel as float32, so that a frame arrives bit for bit as it was cut.
 
-A mark may end with sections: levels, and the state of the node's machine. A node sends them only to a server that has
-said in a `Welcome` that it reads sections, because older servers would refuse the mark. A server skips sections that it
-does not know, so that later ones need no other agreement.
+A mark may end with sections: levels, the error of the drift, and the state of the node's machine. A node sends them
+only to a server that has said in a `Welcome` that it reads sections, because older servers would refuse the mark. A
+server skips sections that it does not know, so that later ones need no other agreement.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from livessl.core.types import FRAME_NS, MAX_MICROPHONES, MAX_SAMPLE, MIN_MICROPHONES, ClockState, Frame, Mark
-from livessl.wire_sections import SectionError, decode_sections, encode_sections
+from livessl.wire_sections import SectionError, Sections, decode_sections, encode_sections
 
 VERSION: Final = 2
 
@@ -284,8 +284,9 @@ def _encode_mark(mark: Mark) -> bytes:
         _CLOCK_STATES.index(mark.clock),
         len(mark.channel_power),
     )
+    sections = Sections(mark.levels, mark.drift_error_ppm, mark.host)
     powers = np.asarray(mark.channel_power, dtype="<f8").tobytes()
-    return b"".join([_head(_MARK_KIND), fixed, name, powers, encode_sections(mark.levels, mark.host)])
+    return b"".join([_head(_MARK_KIND), fixed, name, powers, encode_sections(sections)])
 
 
 def _decode_mark(body: memoryview) -> Mark:
@@ -304,23 +305,23 @@ def _decode_mark(body: memoryview) -> Mark:
     if not math.isfinite(drift):
         raise WireError(f"mark of array {name!r}: expected a finite drift, got {drift}")
     try:
-        levels, host = decode_sections(body[end:])
+        found = decode_sections(body[end:])
     except SectionError as error:
         raise WireError(f"mark of array {name!r}: {error}") from error
-    state = _CLOCK_STATES[clock]
     return Mark(
-        name,
-        sequence,
-        frame_index,
-        power,
-        noise,
-        channel_power,
-        overflows,
-        lost,
-        drift,
-        state,
-        levels=levels,
-        host=host,
+        array=name,
+        sequence=sequence,
+        frame_index=frame_index,
+        power=power,
+        noise_power=noise,
+        channel_power=channel_power,
+        overflows=overflows,
+        lost_frames=lost,
+        drift_ppm=drift,
+        clock=_CLOCK_STATES[clock],
+        levels=found.levels,
+        drift_error_ppm=found.drift_error_ppm,
+        host=found.host,
     )
 
 

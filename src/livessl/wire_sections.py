@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Final
 
@@ -24,16 +24,22 @@ MAX_HUM_HZ: Final = 1e6
 MAX_ERROR_S: Final = 1e9
 """Largest error of a clock, in seconds, and largest load: beyond any that a system reports."""
 
+MAX_PPM: Final = 1e12
+"""Largest error of a drift, parts per million: above any that a fit of stamps gives."""
+
 MAX_TEXT_BYTES: Final = 255
 """Longest name of a service, a reference clock or a machine, in bytes; longer ones are cut."""
 
 _LEVELS: Final = 1
 _HOST: Final = 2
+_DRIFT: Final = 3
 _HEAD: Final = struct.Struct("<BH")
 # clipped samples; peak, RMS, mean, frequency and level of hum, noise, noise over the neighbours
 _LEVEL: Final = struct.Struct("<Q7d")
-# synchronized (0, 1 or 2 for unknown), error, lost blocks, load, lengths of the names of service, reference and machine
-_STATE: Final = struct.Struct("<BdQdBBB")
+# synchronized (0, 1 or 2 for unknown), error, lost blocks, load, whether there is a sound server, lengths of the names
+# of service, reference and machine
+_STATE: Final = struct.Struct("<BdQd?BBB")
+_ERROR: Final = struct.Struct("<d")
 _SYNCHRONIZED: Final = (False, True, None)
 
 
@@ -41,17 +47,35 @@ class SectionError(ValueError):
     """Bytes that are not valid sections: what was expected, and what was got."""
 
 
-def encode_sections(levels: Sequence[ChannelLevel], host: HostState | None) -> bytes:
-    """Return the sections as bytes; none for what is not given."""
+@dataclass(frozen=True, slots=True)
+class Sections:
+    """The sections of a mark.
+
+    Parameters
+    ----------
+    levels, drift_error_ppm, host
+        As in `Mark`.
+    """
+
+    levels: tuple[ChannelLevel, ...] = ()
+    drift_error_ppm: float | None = None
+    host: HostState | None = None
+
+
+def encode_sections(sections: Sections) -> bytes:
+    """Return sections as bytes; none for what is not given."""
+    levels, host = sections.levels, sections.host
     parts = []
     if levels:
         parts.append(_section(_LEVELS, b"".join(map(_encode_level, levels))))
+    if sections.drift_error_ppm is not None:
+        parts.append(_section(_DRIFT, _ERROR.pack(sections.drift_error_ppm)))
     if host is not None:
         parts.append(_section(_HOST, _encode_host(host)))
     return b"".join(parts)
 
 
-def decode_sections(data: memoryview) -> tuple[tuple[ChannelLevel, ...], HostState | None]:
+def decode_sections(data: memoryview) -> Sections:
     """Return what sections hold; unknown ones are skipped.
 
     Raises
@@ -60,6 +84,7 @@ def decode_sections(data: memoryview) -> tuple[tuple[ChannelLevel, ...], HostSta
         If a section is cut, or holds a value that no node sends.
     """
     levels: tuple[ChannelLevel, ...] = ()
+    drift_error_ppm: float | None = None
     host: HostState | None = None
     start = 0
     while start < len(data):
@@ -73,9 +98,11 @@ def decode_sections(data: memoryview) -> tuple[tuple[ChannelLevel, ...], HostSta
         start += length
         if tag == _LEVELS:
             levels = _decode_levels(body)
+        elif tag == _DRIFT:
+            drift_error_ppm = _decode_error(body)
         elif tag == _HOST:
             host = _decode_host(body)
-    return levels, host
+    return Sections(levels, drift_error_ppm, host)
 
 
 def _section(tag: int, body: bytes) -> bytes:
@@ -119,6 +146,15 @@ def _decode_level(
     )
 
 
+def _decode_error(body: memoryview) -> float:
+    if len(body) != _ERROR.size:
+        raise SectionError(f"expected an error of the drift of {_ERROR.size} bytes, got {len(body)}")
+    (error_ppm,) = _ERROR.unpack(body)
+    if not 0.0 <= error_ppm <= MAX_PPM:
+        raise SectionError(f"expected an error of the drift from 0 to {MAX_PPM:g} ppm, got {error_ppm}")
+    return float(error_ppm)
+
+
 def _encode_host(host: HostState) -> bytes:
     names = [text.encode("utf-8", "replace")[:MAX_TEXT_BYTES] for text in (host.service, host.reference, host.machine)]
     fixed = _STATE.pack(
@@ -126,6 +162,7 @@ def _encode_host(host: HostState) -> bytes:
         _or_nan(host.error_s),
         host.lost_blocks,
         _or_nan(host.load),
+        host.sound_server,
         *map(len, names),
     )
     return b"".join([fixed, *names])
@@ -134,7 +171,7 @@ def _encode_host(host: HostState) -> bytes:
 def _decode_host(body: memoryview) -> HostState:
     if len(body) < _STATE.size:
         raise SectionError(f"expected a machine's state of at least {_STATE.size} bytes, got {len(body)}")
-    synchronized, error_s, lost_blocks, load, *lengths = _STATE.unpack_from(body)
+    synchronized, error_s, lost_blocks, load, sound_server, *lengths = _STATE.unpack_from(body)
     names = bytes(body[_STATE.size :])
     if synchronized >= len(_SYNCHRONIZED) or len(names) != sum(lengths):
         raise SectionError(
@@ -152,6 +189,7 @@ def _decode_host(body: memoryview) -> HostState:
         error_s=_or_none("an error in seconds", error_s, MAX_ERROR_S),
         lost_blocks=lost_blocks,
         load=_or_none("a load", load, MAX_ERROR_S),
+        sound_server=sound_server,
         machine=machine,
     )
 

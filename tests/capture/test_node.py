@@ -267,6 +267,7 @@ class Scripted:
         self._ready = ready
         self.problem: str | None = None
         self.lost_blocks = 0
+        self.through_sound_server = False
         self.entered = self.left = False
 
     def __enter__(self) -> Self:

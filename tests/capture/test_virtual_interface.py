@@ -87,6 +87,8 @@ def test_interface_that_is_unplugged_is_opened_again(interfaces: Interfaces) -> 
         interfaces.plug(umc)
         after = blocks_until(device, lambda blocks: len(blocks) == 3)
         assert device.problem is None
+        assert device.interruptions == 1
+        assert not device.through_sound_server
     assert [block.overflow for block in after] == [True, False, False]
     assert before[-1].first_index < after[0].first_index
     assert sum(losses([before[-1], *after])[1:]) == 0
@@ -109,6 +111,8 @@ def test_overrun_of_the_driver_is_flagged_where_samples_are_missing(interfaces: 
         blocks_until(device, lambda blocks: len(blocks) == 5)
         umc.overrun()
         blocks = blocks_until(device, lambda blocks: len(blocks) > 2 and blocks[-2].overflow)
+        assert device.lost_blocks >= 1
+        assert device.interruptions == 0
     assert losses(blocks)[-2:][0] > 0
     assert losses(blocks)[-1] == 0
 

@@ -12,6 +12,7 @@ import yaml
 
 from cli.command_runs import Recorded, Run
 from livessl.cli.main import main
+from livessl.core.types import Uncertainty as SiteUncertainty
 from livessl.site.load import load_site
 from small_site import RATE_HZ, write_site, write_wav
 
@@ -129,6 +130,11 @@ def test_the_site_file_says_where_its_calibration_is_written_and_put_back(
     again = run("calibrate", "poses", *session, "--write")
     assert (again.code, "name it in the site file" in again.err) == (0, False)
     second = yaml.safe_load(written.read_text())
+    known = load_site(site).array("south").uncertainty
+    assert known.position_m == second["arrays"]["south"]["position_std_m"] != SiteUncertainty().position_m
+    assert known.orientation_deg == second["arrays"]["south"]["orientation_std_deg"]
+    assert known.temperature_c == SiteUncertainty().temperature_c
+    assert "from calibration/small.yaml, and the site's" in run("config", "show", site).out
     assert set(second["arrays"]) == {"north", "south"}
     assert np.shape(second["arrays"]["south"]["covariance"]) == (6, 6)
     assert run("calibrate", "poses", "--site", site, "--undo").code == 0

@@ -68,10 +68,14 @@ class Desk:
         marks = [mark(0, START + self.pace - 1, array) for array in arrays]
         self.fusion.step(marks, self.clock.now_ns())
 
-    def report(self, array: str, level: ChannelLevel, host: HostState | None = None) -> None:
+    def report(
+        self, array: str, level: ChannelLevel, host: HostState | None = None, drift_error_ppm: float | None = None
+    ) -> None:
         """The node sends a mark with the level of its array's channels, once a second."""
         self.clock.time_ns += 1_000_000_000
-        report = replace(mark(0, START + self.pace, array), levels=(QUIET, level, QUIET, QUIET), host=host)
+        levels = (QUIET, level, QUIET, QUIET)
+        quiet = mark(0, START + self.pace, array)
+        report = replace(quiet, levels=levels, drift_error_ppm=drift_error_ppm, host=host)
         self.ingest.receive(b"p1", wire.encode(report), self.clock.monotonic_ns())
         self.states.watch()
 
@@ -171,7 +175,7 @@ def test_levels_and_machine_that_a_node_reports_are_described() -> None:
     desk.greet()
     north = desk.array("north")
     assert (north["channels"], north["channels_age_s"], north["host"]) == ([], None, None)
-    host = HostState(True, "chrony", "ntp.example", 0.0021049999, 2, 0.456, "m1")
+    host = HostState(True, "chrony", "ntp.example", 0.0021049999, 2, 0.456, machine="m1")
     desk.report("north", ChannelLevel(-200.0, -200.0, 17, None, 50.0, -60.04, None), host)
     desk.clock.time_ns += 700_000_000
     north = desk.array("north")
@@ -200,6 +204,22 @@ def test_levels_and_machine_that_a_node_reports_are_described() -> None:
     assert desk.array("south")["channels"] == []
     desk.states.follow(desk.fusion)
     assert desk.array("north")["channels"] == []  # another run is about another set-up
+
+
+def test_drift_is_settling_until_its_error_is_below_5_ppm_and_never_known_through_a_sound_server() -> None:
+    desk = Desk()
+    desk.greet()
+    assert desk.array("north")["drift"] is None
+    direct, server = HostState(True), HostState(True, sound_server=True)
+    for error_ppm, host, expected in (
+        (None, direct, "settling"),
+        (5.1, direct, "settling"),
+        (4.9, direct, "known"),
+        (4.9, None, "known"),
+        (0.1, server, "unmeasurable"),
+    ):
+        desk.report("north", QUIET, host, error_ppm)
+        assert desk.array("north")["drift"] == expected
 
 
 def test_lasting_fault_of_a_channel_becomes_a_finding_and_shows_at_the_channel(

@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Sequence
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any, cast
 
 import pytest
 from world import HandClock
 
-from livessl.core.commission import observe
+from alert_desk import sound
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.commission.steady import MOST_CONFIRMING
+from livessl.server import heard_sounds
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import KEPT_SOUNDS, SetUpWatch
 from livessl.site.build import set_up
@@ -22,7 +23,7 @@ from small_site import site_of
 TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turned", "turn it back")
 CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
 WEAK = Finding("level", "north", 2, Severity.WARNING, 0.9, "channel 2 of 'north' is weaker", "set the gains alike")
-SOUND = cast(Any, SimpleNamespace(source=1, received=("north", "south")))
+SOUND = replace(sound(), received=cast(Any, ("north", "south")))  # what was received is not looked at
 
 
 class Desk:
@@ -31,7 +32,7 @@ class Desk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.found: Sequence[Finding] = ()
         self.examined: list[int] = []
-        monkeypatch.setattr(observe, "observe", lambda received: received)
+        monkeypatch.setattr(heard_sounds, "observe", lambda received: received)
         monkeypatch.setattr(set_up, "find_set_up_faults", self._find)
         self.watch = SetUpWatch(site_of(), Overload(HandClock()))
 
@@ -126,11 +127,13 @@ def test_reader_never_sees_the_findings_of_one_state_with_the_sounds_of_another(
             if any(one.message != f"{state.sounds}" for one in state.findings):
                 torn.append(state)
 
-    reader = threading.Thread(target=read)
+    reader = threading.Thread(target=read, daemon=True)
     reader.start()
-    for _ in range(60):
-        desk.hear([], KEPT_SOUNDS)
-        desk.watch.forget()
-    done.set()
+    try:
+        for _ in range(20):
+            desk.hear([], KEPT_SOUNDS)
+            desk.watch.forget()
+    finally:
+        done.set()
     reader.join()
     assert torn == []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
@@ -162,6 +164,15 @@ def test_rules_name_zones_that_can_alert(tmp_path: Path) -> None:
     assert "alerts.rules.d.tracks.zones: expected one of the zones fan, desk, got 'dusk'" in found
     [fault] = faults_of({"alerts": {"rules": {"a": {"tracks": {}}}}})
     assert "alerts.rules.a.tracks.zones: missing; add it" in fault
+
+
+def test_example_of_the_page_about_zones_is_valid(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "zones.md").read_text(encoding="utf-8")
+    [example] = re.findall(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "plan.svg").write_text('<svg width="200" height="250"/>', encoding="utf-8")
+    site = site_of(yaml.safe_load(example) | {"alerts.outbox": "alerts.sqlite", "server.events_db": "e"}, tmp_path)
+    assert [rule.kind for rule in site.alerts.rules.values()] == ["tracks", "tracks"]
+    assert site.zones_of([2.0, 2.0, 1.0]) == ["desk"]
 
 
 def png(width: int, height: int) -> bytes:

@@ -26,6 +26,11 @@ class Device(Protocol):
         """Blocks that were lost since the start because this machine did not keep up."""
         ...
 
+    @property
+    def through_sound_server(self) -> bool:
+        """Whether samples come through a sound server or plug-in, whose times do not show the device's clock."""
+        ...
+
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /

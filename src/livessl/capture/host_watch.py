@@ -45,19 +45,28 @@ class HostWatch:
     ) -> None:
         self._stop.set()  # the thread may wait for a program, and ends with the process
 
-    def state(self, lost_blocks: int = 0) -> HostState | None:
+    def state(self, lost_blocks: int = 0, *, sound_server: bool = False) -> HostState | None:
         """Return the state of the machine; None before the first reading.
 
         Parameters
         ----------
         lost_blocks : int
             Blocks of the device that were lost because the machine did not keep up.
+        sound_server : bool
+            Whether the device is read through a sound server.
         """
         clock = self._clock
         if clock is None:
             return None
         return HostState(
-            clock.synchronized, clock.service, clock.reference, clock.error_s, lost_blocks, load(), self._machine
+            clock.synchronized,
+            clock.service,
+            clock.reference,
+            clock.error_s,
+            lost_blocks,
+            load(),
+            sound_server,
+            self._machine,
         )
 
     def _work(self) -> None:

@@ -71,7 +71,9 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
                     link.report(problem)
-                link.send(with_host(pipeline.push(block), host, device.lost_blocks))
+                link.send(
+                    with_host(pipeline.push(block), host, device.lost_blocks, sound_server=device.through_sound_server)
+                )
     finally:
         link.close(bye=True)
 
@@ -103,7 +105,9 @@ def capture_recordings(
     _finish(link, clock, stop)
 
 
-def with_host(messages: Iterable[Message], host: HostWatch, lost_blocks: int = 0) -> list[Message]:
+def with_host(
+    messages: Iterable[Message], host: HostWatch, lost_blocks: int = 0, *, sound_server: bool = False
+) -> list[Message]:
     """Return messages with the state of this machine in those marks that carry levels.
 
     Parameters
@@ -112,9 +116,13 @@ def with_host(messages: Iterable[Message], host: HostWatch, lost_blocks: int = 0
     host : HostWatch
     lost_blocks : int
         Blocks of the device that were lost because the machine did not keep up.
+    sound_server : bool
+        Whether the device is read through a sound server.
     """
     return [
-        replace(message, host=host.state(lost_blocks)) if isinstance(message, Mark) and message.levels else message
+        replace(message, host=host.state(lost_blocks, sound_server=sound_server))
+        if isinstance(message, Mark) and message.levels
+        else message
         for message in messages
     ]
 

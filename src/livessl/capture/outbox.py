@@ -174,7 +174,9 @@ class Outbox:
         """Return True if the message was handed over, or cannot be read any more."""
         if isinstance(message, Mark):
             mark = replace(message, lost_frames=message.lost_frames + self.dropped)
-            return send(wire.encode(mark if self._with_sections else replace(mark, levels=(), host=None)))
+            return send(
+                wire.encode(mark if self._with_sections else replace(mark, levels=(), drift_error_ppm=None, host=None))
+            )
         try:
             data = self._spool.read(message)
         except SpoolError as error:

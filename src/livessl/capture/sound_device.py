@@ -92,6 +92,8 @@ class SoundDevice:
     lost_blocks : int
         Blocks that were lost because this machine did not keep up: those that its driver flagged, those that this
         process did not read in time, and one for each gap without a flag.
+    through_sound_server : bool
+        Whether its samples come through a sound server or plug-in, as far as it is known.
     interruptions : int
         Number of times that the device had delivered and was then opened again: it was unplugged, stopped or failed.
     """
@@ -112,6 +114,7 @@ class SoundDevice:
         self.unflagged_gaps = 0
         self.lost_blocks = 0
         self.interruptions = 0
+        self.through_sound_server = False
         self._block_s = config.block_s
         self._wanted = wanted_device(config, channels)
         self._clock = clock
@@ -234,6 +237,7 @@ class SoundDevice:
                 raise DeviceError(report.message)
             self._reported = True
             if report.state is DeviceState.OPEN:
+                self.through_sound_server = not report.hardware
                 rule = HARDWARE if report.hardware else SOUND_SERVER
                 self._gaps = GapWatch(self.sample_rate_hz, self._block_s, rule)
                 self._log_realtime(report.not_realtime)

@@ -17,6 +17,7 @@ from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.listeners import Listeners
 from livessl.server.clips.service import Clips
 from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
@@ -112,14 +113,15 @@ def assemble(
 
         presence = Presence(zones, publish_change)
         tracks = Tracks(presence)
-        kept = site.server.clips
+        kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
+        sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, clips
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
         )
         floor_plan = read_floor_plan(site)
         undo.pop_all()
@@ -134,6 +136,7 @@ def assemble(
         event_log=event_log,
         alerts=alerts,
         clips=clips,
+        listeners=listeners,
         tracks=tracks,
         maps=maps,
         latency=latency,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final, Protocol
 
 from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
-from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -32,6 +31,14 @@ BATCH: Final = 200
 _log = logging.getLogger(__name__)
 
 
+class SoundTaker(Protocol):
+    """Takes in the sound of the arrays, on the fusion thread, which it must not hold up."""
+
+    def take(self, messages: Iterable[Message], settled: int | None) -> None:
+        """Take in messages, and the frame index before which all results are final."""
+        ...
+
+
 class Engine:
     """Everything between the receiver and the publisher, in one thread.
 
@@ -48,8 +55,8 @@ class Engine:
     overload : Overload
     zones : callable
         Returns the zones that are in force.
-    clips : Clips or None
-        Gets every frame, for what is kept of events.
+    sound_takers : sequence of SoundTaker
+        Get every frame: for those who listen, and for what is kept of events.
     """
 
     def __init__(
@@ -64,7 +71,7 @@ class Engine:
         publisher: Publisher,
         overload: Overload,
         zones: Callable[[], ZoneMap],
-        clips: Clips | None = None,
+        sound_takers: Sequence[SoundTaker] = (),
     ) -> None:
         self._site = site
         self._clock = clock
@@ -76,7 +83,7 @@ class Engine:
         self._publisher = publisher
         self._overload = overload
         self._zones = zones
-        self._clips = clips
+        self._sound_takers = sound_takers
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
@@ -211,8 +218,8 @@ class Engine:
             run.begin(origin_ns, self._zones)
         self._site_time.advance(batch)
         run.fusion.exclude(self._array_states.disabled)
-        if self._clips is not None:
-            self._clips.take(batch, run.fusion.settled)
+        for taker in self._sound_takers:
+            taker.take(batch, run.fusion.settled)
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

@@ -19,6 +19,8 @@ class NodeFigures:
     ----------
     levels : tuple of ChannelLevel
         Level of each channel.
+    drift_error_ppm : float or None
+        Error that the drift may have, parts per million; None if it is not known.
     host : HostState or None
         State of the node's machine; None if it does not report it.
     received_ns : int
@@ -26,6 +28,7 @@ class NodeFigures:
     """
 
     levels: tuple[ChannelLevel, ...]
+    drift_error_ppm: float | None
     host: HostState | None
     received_ns: int
 
@@ -43,7 +46,7 @@ class NodeReports:
         if not mark.levels:
             return
         with self._lock:
-            self._last[mark.array] = NodeFigures(mark.levels, mark.host, now_ns)
+            self._last[mark.array] = NodeFigures(mark.levels, mark.drift_error_ppm, mark.host, now_ns)
             self._watch.take(mark.array, mark.levels, mark.host, now_ns / 1e9)
 
     def of(self, array: str) -> NodeFigures | None:

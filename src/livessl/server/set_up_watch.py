@@ -127,13 +127,12 @@ class SetUpWatch:
         # imported late: scipy's optimizer takes memory, and no event needs it
         from livessl.site.build.set_up import find_set_up_faults
 
-        self._examined = new[-1].number
         sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
         findings = find_set_up_faults(self._site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
             if run != self._run:
                 return
-            self._sounds = sounds
+            self._sounds, self._examined = sounds, new[-1].number
             self._unjudged += len(new)
             if findings is None:
                 self._note(())

@@ -68,6 +68,11 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
     yield from alert_faults(site)
+    if site.privacy == "positions-only" and site.server.listen:
+        yield (
+            ("server", "listen"),
+            "with privacy: positions-only nobody may listen; remove it, or set privacy: recording",
+        )
     if site.privacy == "positions-only" and site.server.clips is not None:
         yield (
             ("server", "clips"),

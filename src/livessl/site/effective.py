@@ -75,7 +75,8 @@ def effective_settings(path: Path) -> list[Setting]:
         if place[0] == "arrays" and place[1] in measured and set(place) & _POSE:
             source += f", replaced by {site.calibration}"
         settings.append(Setting(place, value, source, line))
-    return [_inherited(setting, settings) for setting in settings if not _is_unused(setting)]
+    in_effect = [setting for setting in settings if not _is_unused(setting)]
+    return [_calibrated(setting, site, measured) or _inherited(setting, settings) for setting in in_effect]
 
 
 def _measured(site: Site) -> set[str]:
@@ -83,6 +84,19 @@ def _measured(site: Site) -> set[str]:
     if site.calibration is None:
         return set()
     return set(read_yaml(site.file(site.calibration).read_text(encoding="utf-8"))["arrays"])
+
+
+def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | None:
+    """Return the uncertainty of an array that the calibration file gives; None for any other setting."""
+    section, array, group, key = (*setting.place, "", "", "", "")[:4]
+    if section != "arrays" or array not in measured or group != "uncertainty" or setting.line is not None:
+        return None
+    if key not in ("", "position_m", "orientation_deg"):
+        return None
+    value = getattr(site.array(array).uncertainty, key) if key else None
+    return Setting(
+        setting.place, value, f"from {site.calibration}" if key else f"from {site.calibration}, and the site's", None
+    )
 
 
 def _inherited(setting: Setting, settings: list[Setting]) -> Setting:

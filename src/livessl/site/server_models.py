@@ -80,6 +80,7 @@ class ServerConfig(Model):
     events_db: Annotated[str | None, AfterValidator(check_history_place)] = None
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
+    listen: bool = False
 
     @field_validator("bind")
     @classmethod

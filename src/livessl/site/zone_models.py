@@ -14,11 +14,15 @@ from livessl.site.fields import Bounds, Coordinate, FileName, Interval, Model, P
 class Zone(Model):
     """A part of the room with a name: a box, or a polygon on the floor plan with a range of heights."""
 
-    bounds_m: Bounds | None = None
-    polygon_m: tuple[tuple[Coordinate, Coordinate], ...] | None = None
-    z_m: Interval | None = None
-    exclude: bool = False
-    loiter_s: Positive | None = None
+    bounds_m: Bounds | None = Field(default=None, description="A box: lowest and highest x, y and z in metres.")
+    polygon_m: tuple[tuple[Coordinate, Coordinate], ...] | None = Field(
+        default=None, description="Instead of a box, corners [x, y] on the floor plan in metres, in order."
+    )
+    z_m: Interval | None = Field(default=None, description="Lowest and highest z of a polygon in metres; null for all.")
+    exclude: bool = Field(default=False, description="Whether events there are flagged and never alert.")
+    loiter_s: Positive | None = Field(
+        default=None, description="Stay in seconds after which a track loiters; null if none does."
+    )
 
     @field_validator("bounds_m")
     @classmethod

@@ -300,3 +300,41 @@ def test_empty_blocks_change_nothing() -> None:
         assert framer.push(Block(0, numbered(0, 0), 0, overflow=True)) == []
     assert framer.overflows == framer.lost_frames == 0
     assert_contiguous(cuts)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    ppm=st.floats(-250.0, 250.0),
+    jitter_ms=st.floats(0.01, 0.5),
+    block_s=st.sampled_from([0.02, 0.05]),
+    seed=st.integers(0, 1000),
+)
+def test_drift_is_within_the_error_that_is_told_and_settles(
+    ppm: float, jitter_ms: float, block_s: float, seed: int
+) -> None:
+    """Also while the fit still holds back most of it; a stamp is late by what the machine was busy, never early."""
+    block, rng = round(block_s * RATE_HZ), np.random.default_rng(seed)
+    late_ns = rng.exponential(1e6 * jitter_ms, round(120.0 / block_s)).round().astype(int)
+    timeline = Timeline(RATE_HZ)
+    assert timeline.drift_error_ppm is None
+    settled_s = None
+    for number, late in enumerate(late_ns.tolist()):
+        timeline.update(number * block, ideal_ns(number * block, ppm=ppm) + late)
+        error_ppm = timeline.drift_error_ppm
+        assert (error_ppm is None) == (number * block / RATE_HZ < LOCKED_S)
+        if error_ppm is not None:
+            # the jitter that the first stamps show is not quite that of all
+            assert abs(timeline.drift_ppm - ppm) <= 1.2 * error_ppm + 0.01
+            settled_s = settled_s or (number * block_s if error_ppm <= 5.0 else None)
+    assert settled_s is not None
+    assert settled_s <= 100.0  # the prior fades as fast for any drift
+
+
+def test_drift_error_begins_anew_after_a_step_of_the_clock() -> None:
+    timeline = Timeline(RATE_HZ)
+    for number in range(3000):
+        timeline.update(number * 320, ideal_ns(number * 320, ppm=40.0))
+    assert (timeline.drift_error_ppm or 99.0) < 5.0
+    for number in range(3000, 3000 + STEP_BLOCKS):
+        timeline.update(number * 320, ideal_ns(number * 320, ppm=40.0) + 2 * STEP_NS)
+    assert timeline.drift_error_ppm is None

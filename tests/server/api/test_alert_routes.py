@@ -173,7 +173,7 @@ def test_operator_dismisses_dead_letters(tmp_path: Path) -> None:
 def test_second_dry_run_at_a_time_is_sent_away(tmp_path: Path) -> None:
     with alerting(tmp_path) as server:
         url = f"{server.url}/api/v1/alerts/rules/door/dry-run"
-        with server.parts.alerts._trying:
+        with server.parts.alerts.dry_runs._trying:
             busy = httpx.get(url, timeout=HANG_S)
         assert (busy.status_code, busy.headers["Retry-After"]) == (503, "5")
         assert httpx.get(url, timeout=HANG_S).status_code == 200

@@ -38,7 +38,7 @@ def test_first_message_is_hello(server: Server) -> None:
         assert [array["name"] for array in hello["arrays"]] == ["north", "south"]
         socket.send("messages of clients are ignored")
         following = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(2)]
-        assert {message["kind"] for message in following} <= {"arrays", "track"}
+        assert {message["kind"] for message in following} <= {"arrays", "track", "zone"}
         assert [message["seq"] for message in following] == [hello["last_seq"] + 1, hello["last_seq"] + 2]
 
 

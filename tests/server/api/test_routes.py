@@ -64,6 +64,18 @@ ROUTES = {
 """Every promised path but the WebSockets, which OpenAPI cannot describe."""
 
 
+CHANGES = {
+    "/enabled": {"put"},
+    "/armed": {"put"},
+    "/resend": {"post"},
+    "/verify": {"post"},
+    "/dead-letters": {"get", "delete"},
+    "/dead-letters/{number}": {"delete"},
+    "/zones/{name}": {"put", "delete"},
+}
+"""Methods of the paths that are not only read, by their ends."""
+
+
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
     with located_scene() as server:
@@ -87,8 +99,8 @@ def test_openapi_is_complete(client: httpx.Client) -> None:
     described = client.get("/api/v1/openapi.json").json()
     assert set(described["paths"]) == ROUTES
     for path, methods in described["paths"].items():
-        changes = {"/enabled": "put", "/armed": "put", "/resend": "post", "/verify": "post"}
-        assert set(methods) == {next((change for end, change in changes.items() if path.endswith(end)), "get")}
+        wanted = next((change for end, change in CHANGES.items() if path.endswith(end)), {"get"})
+        assert set(methods) == wanted, path
         assert all(method["description"] for method in methods.values()), path
     parameters = {p["name"] for p in described["paths"]["/api/v1/events"]["get"]["parameters"]}
     filters = {"since", "until", "zone", "status", "min_confidence", "min_level_dbfs", "array", "text"}
@@ -120,7 +132,7 @@ def test_site(client: httpx.Client) -> None:
     assert north["position_m"] == [1.9, 1.3, 1.4]
     assert np.shape(north["microphones_m"]) == (4, 3)
     assert north["band_hz"] == [100, 6000]
-    assert found["zones"]["door"] == SMALL["zones"]["door"]
+    assert found["zones"]["door"].items() >= SMALL["zones"]["door"].items()
 
 
 def test_arrays(client: httpx.Client) -> None:

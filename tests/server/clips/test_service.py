@@ -12,8 +12,10 @@ import pytest
 
 from alert_desk import START, refused, sound
 from livessl.core.stream.clock_offsets import ClockOffsets
+from livessl.core.stream.load_policy import LEVELS, NOTHING_SHED
 from livessl.core.types import FRAME_NS, Event, Frame, Status
 from livessl.server.clips import service
+from livessl.server.clips.record import write_clip
 from livessl.server.clips.service import SETTLE_NS, Clips
 from small_site import RATE_HZ, Changes, frame, site_of
 
@@ -41,7 +43,7 @@ class Switches:
     """Stands in for site time and overload."""
 
     is_replay = False
-    message: str | None = None
+    relief = NOTHING_SHED
 
 
 class Desk:
@@ -166,13 +168,17 @@ def test_replay_gives_neither_frames_nor_events(tmp_path: Path) -> None:
     assert desk.clips.counts.without_sound == 1
 
 
-def test_overloaded_server_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
+def test_server_that_gives_up_arrays_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
     desk = Desk(tmp_path)
     desk.clips.take(heard(range(-8, 16)), None)
-    desk.switches.message = "overloaded"
+    desk.switches.relief = LEVELS[1]  # updates are given up, and clips are still cut
+    desk.finish(event(1))
+    desk.work()
+    assert (desk.clips.counts.shed, desk.clips.counts.written) == (0, 1)
+    desk.switches.relief = next(relief for relief in LEVELS if relief.arrays is not None)
     desk.finish(event())
     desk.work()
-    assert (desk.clips.counts.shed, desk.clips.counts.written, desk.clips.waiting) == (1, 0, 0)
+    assert (desk.clips.counts.shed, desk.clips.counts.written, desk.clips.waiting) == (1, 1, 0)
 
 
 def test_clip_is_not_cut_before_its_last_frames_can_have_come(tmp_path: Path) -> None:
@@ -202,12 +208,11 @@ def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     desk, reached, release = Desk(tmp_path), threading.Event(), threading.Event()
-    writes = vars(service)["write_clip"]
 
     def slow(*arguments: Any) -> Any:
         reached.set()
         assert release.wait(60)
-        return writes(*arguments)
+        return write_clip(*arguments)
 
     monkeypatch.setattr(service, "write_clip", slow)
     monkeypatch.setattr(service, "MAX_WAITING", 3)
@@ -216,12 +221,13 @@ def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
     worker = threading.Thread(target=desk.work)
     worker.start()
     assert reached.wait(60)
-    desk.finish(*(event(number) for number in range(1, 6)))  # returns at once: the disk still hangs
+    desk.finish(*(event(number) for number in range(11, 16)))  # returns at once: the disk still hangs
     assert (desk.clips.waiting, desk.clips.counts.shed) == (3, 3)
     release.set()
     worker.join(60)
     assert not worker.is_alive()
-    assert desk.clips.counts.written == 1
+    desk.work()
+    assert (desk.clips.counts.written, desk.clips.counts.without_sound) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -241,6 +247,22 @@ def test_clips_are_deleted_at_their_age_or_with_their_event(
     desk.clock.ns += 3_600_000_000_000
     desk.work()
     assert (desk.clips.folder.count, desk.clips.counts.deleted) == (0, 1)
+
+
+def test_clips_kept_for_ever_that_leave_no_room_are_a_problem(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, max_bytes=1_000_000)
+    for number in range(2):
+        desk.clips.take(heard(range(-8 + 20 * number, 16 + 20 * number)), None)
+        desk.finish(event(number))
+        desk.work()
+        desk.clips.folder.keep(f"small-{number}", True)
+    assert desk.clips.problems == []
+    desk.clips.folder.put("small-0", lambda folder: {"start_ns": 0, "files": [{"name": "a", "bytes": 1_200_000}]})
+    [problem] = desk.clips.problems
+    assert problem.startswith("server.clips.max_bytes: clips that are kept for ever take 1.")
+    assert problem.endswith(" MB of 1.0 MB, so that new ones are deleted; keep fewer, or raise it")
+    desk.clips.folder.keep("small-0", False)
+    assert desk.clips.problems == []
 
 
 def test_enhanced_signal_can_be_left_out(tmp_path: Path) -> None:

@@ -147,9 +147,9 @@ class ChannelMeter:
         spectrum = scipy.fft.rfft(centred * self._hann, axis=1)[:, : self._low_bins]
         self._low.append(np.abs(spectrum).astype(np.float64) ** 2)
         frames = window[:, : self._window // self._frame * self._frame].reshape(len(window), -1, self._frame)
-        rough = (np.diff(frames, axis=2).astype(np.float64) ** 2).mean(axis=2)
-        self._rough.append(np.percentile(rough, _QUIET, axis=1))
-        self._quiet.append(np.percentile(frames.var(axis=2, dtype=np.float64), _QUIET, axis=1))
+        self._rough.append(np.percentile(_mean_square(np.diff(frames, axis=2)), _QUIET, axis=1))
+        about_mean = frames - frames.mean(axis=2, keepdims=True)
+        self._quiet.append(np.percentile(_mean_square(about_mean), _QUIET, axis=1))
 
     def figures(self) -> tuple[ChannelFigures, ...]:
         """Return the figures of each channel; nothing for less than a second of samples."""
@@ -214,6 +214,11 @@ def steady_faults(
     if noise_over_db is not None and noise_over_db > NOISY_DB:
         what = f"{where} has {noise_over_db:.0f} dB more noise than its neighbours"
         yield _warning("noisy", array, index, what, "check its cable, microphone and gain")
+
+
+def _mean_square(frames: Float32Array) -> FloatArray:
+    """Mean square of each frame (K, F, n) -> (K, F)."""
+    return np.asarray(np.einsum("kfi,kfi->kf", frames, frames) / frames.shape[2], dtype=np.float64)
 
 
 def _line(spectrum: FloatArray, at_hz: float) -> FloatArray:

@@ -8,7 +8,6 @@ clock; where some have one, the times between them may be used as well.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
@@ -56,10 +55,13 @@ class Freedom:
         Standard deviations of the position in metres and of the orientation in degrees; arrays that are not named stay.
     speed_std_m_s : float
         Standard deviation of the speed of sound, m/s; 0 if it is known.
+    microphone_std_m : float
+        Standard deviation of each microphone's place within its array along each axis, metres; 0 if it is known.
     """
 
     arrays: Mapping[str, tuple[float, float]]
     speed_std_m_s: float = 0.0
+    microphone_std_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,31 +184,36 @@ class _Problem:
         self._c_m_s, self._freedom, self._place_std_m = c_m_s, freedom, place_std_m
         self._delay_std_s, self._arrivals = delay_std_s, arrivals
         self._free = [name for name in microphones if name in freedom.arrays]
-        count = len(self._free) * _UNKNOWNS + (freedom.speed_std_m_s > 0.0)
-        self.start = np.concatenate([np.zeros(count), places_m.ravel()])
         pose_scale = [_SHIFT_SCALE_M] * 3 + [_TURN_SCALE_RAD] * 3
-        self.scale = np.array(
-            [*pose_scale * len(self._free), *([_SPEED_SCALE_M_S] if freedom.speed_std_m_s > 0.0 else [])]
-            + [1.0] * places_m.size
-        )
+        offsets = sum(microphones[name].size for name in delays) if freedom.microphone_std_m > 0.0 else 0
+        few = [
+            *pose_scale * len(self._free),
+            *([_SPEED_SCALE_M_S] if freedom.speed_std_m_s > 0.0 else []),
+            *([freedom.microphone_std_m] * offsets),
+        ]
+        self.start = np.concatenate([np.zeros(len(few)), places_m.ravel()])
+        self.scale = np.array(few + [1.0] * places_m.size)
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
         """Delays and priors, in standard deviations."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
-        parts = [self._off(poses, speed_m_s, places_m).ravel() / self._delay_std_s]
+        at_m = self._moved(poses, unknowns)
+        parts = [contradictions_s(at_m, self._delays, places_m, speed_m_s).ravel() / self._delay_std_s]
         for name, (shift_m, turn) in poses.items():
             position_std_m, orientation_std_deg = self._freedom.arrays[name]
             parts += [shift_m / position_std_m, turn / np.radians(orientation_std_deg)]
         if self._freedom.speed_std_m_s > 0.0:
             parts.append(np.array([(speed_m_s - self._c_m_s) / self._freedom.speed_std_m_s]))
+        if self._freedom.microphone_std_m > 0.0:
+            parts.append(self._offsets(unknowns) / self._freedom.microphone_std_m)
         if self._arrivals is not None:
-            off_s = self._arrivals.contradictions_s(self._moved(poses), places_m, speed_m_s)
+            off_s = self._arrivals.contradictions_s(at_m, places_m, speed_m_s)
             parts.append(off_s.ravel() / ARRIVAL_STD_S)
         parts.append(((places_m - self._places_m) / self._place_std_m).ravel())
         return np.concatenate(parts)
 
     def slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Slope of the residuals: by differences for poses and speed, which are few, exact for the places."""
+        """Slope of the residuals: by differences for poses, speed and microphones, exact for the places."""
         here = self.residuals(unknowns)
         slopes = np.zeros((len(here), len(unknowns)))
         few = len(unknowns) - self._places_m.size
@@ -217,12 +224,13 @@ class _Problem:
             slopes[:, column] = (self.residuals(moved) - here) / step
         poses, speed_m_s, places_m = self._unpack(unknowns)
         sounds = np.arange(len(places_m))
-        of_places = slopes_s_m(self._moved(poses), self._delays, places_m, speed_m_s) / self._delay_std_s
+        at_m = self._moved(poses, unknowns)
+        of_places = slopes_s_m(at_m, self._delays, places_m, speed_m_s) / self._delay_std_s
         rows = of_places.shape[1]
         blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
         blocks[sounds, :, sounds] = of_places
         if self._arrivals is not None:
-            of_times = self._arrivals.slopes_s_m(self._moved(poses), places_m, speed_m_s) / ARRIVAL_STD_S
+            of_times = self._arrivals.slopes_s_m(at_m, places_m, speed_m_s) / ARRIVAL_STD_S
             count = of_times.shape[0] * of_times.shape[1]
             rows_of_times = slopes[-places_m.size - count : -places_m.size, few:]
             rows_of_times.reshape(len(sounds), -1, len(sounds), 3)[sounds, :, sounds] = of_times
@@ -233,9 +241,7 @@ class _Problem:
         """The unknowns as a result, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
-        bias = covariance @ jacobian.T @ self._slopes_by_microphones(unknowns)
-        covariance += MICROPHONE_STD_M**2 * bias @ bias.T
-        off = self._off(poses, speed_m_s, places_m)
+        off = contradictions_s(self._moved(poses, unknowns), self._delays, places_m, speed_m_s)
         count = sum(np.isfinite(one).sum(axis=1) - 1 for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
         found = {}
@@ -247,19 +253,6 @@ class _Problem:
         c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
         return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
 
-    def _slopes_by_microphones(self, unknowns: FloatArray) -> FloatArray:
-        """Slope of the residuals by the places of all microphones along each axis, per metre."""
-        here, columns = self.residuals(unknowns), []
-        filed = self._microphones
-        for name in self._delays:
-            for entry in range(filed[name].size):
-                off_m = np.zeros(filed[name].size)
-                off_m[entry] = _STEP
-                others = copy(self)
-                others._microphones = dict(filed) | {name: filed[name] + off_m.reshape(-1, 3)}
-                columns.append((others.residuals(unknowns) - here) / _STEP)
-        return np.stack(columns, axis=1)
-
     def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
         poses, at = {}, 0
         for name in self._free:
@@ -267,19 +260,24 @@ class _Problem:
             at += _UNKNOWNS
         speed_m_s = self._c_m_s
         if self._freedom.speed_std_m_s > 0.0:
-            speed_m_s, at = self._c_m_s + unknowns[at], at + 1
-        return poses, float(speed_m_s), unknowns[at:].reshape(-1, 3)
+            speed_m_s = self._c_m_s + unknowns[at]
+        return poses, float(speed_m_s), unknowns[-self._places_m.size :].reshape(-1, 3)
 
-    def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, FloatArray]:
-        return {
-            name: moved(self._microphones[name], *poses[name]) if name in poses else self._microphones[name]
-            for name in self._delays
-        }
+    def _offsets(self, unknowns: FloatArray) -> FloatArray:
+        """Offsets of all microphones from their places within the arrays, metres."""
+        first = len(self._free) * _UNKNOWNS + (self._freedom.speed_std_m_s > 0.0)
+        return unknowns[first : -self._places_m.size]
 
-    def _off(
-        self, poses: Mapping[str, tuple[FloatArray, FloatArray]], c_m_s: float, places_m: FloatArray
-    ) -> FloatArray:
-        return contradictions_s(self._moved(poses), self._delays, places_m, c_m_s)
+    def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]], unknowns: FloatArray) -> dict[str, FloatArray]:
+        """Places (K, 3) of the microphones of each array, metres."""
+        offsets_m, found = self._offsets(unknowns).reshape(-1, 3), {}
+        for name in self._delays:
+            at_m = self._microphones[name]
+            at_m = moved(at_m, *poses[name]) if name in poses else at_m
+            if len(offsets_m):
+                at_m, offsets_m = at_m + offsets_m[: len(at_m)], offsets_m[len(at_m) :]
+            found[name] = at_m
+        return found
 
 
 def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ room cannot be determined so, and one array stays as it is filed.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.arrivals import Arrivals
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
-from livessl.core.commission.poses import DELAY_STD_S, UNKNOWN_DEG, Adjusted, Freedom, adjust
+from livessl.core.commission.poses import DELAY_STD_S, MICROPHONE_STD_M, UNKNOWN_DEG, Adjusted, Freedom, adjust
 from livessl.core.commission.resection import SPEED_STD_M_S, MeasuredSetUp, described_pose, received
 from livessl.core.types import FloatArray
 
@@ -98,7 +99,7 @@ def refine(
     kept = {name: measured[used] for name, measured in delays.items()}
     std_s = _delay_std_s(first.misfits_s[used], kept, len(free))
     times = None if arrivals is None else arrivals.of_sounds(np.flatnonzero(shared)[used])
-    last = _adjusted(start, kept, search, freedom, std_s, times)
+    last = _adjusted(start, kept, search, replace(freedom, microphone_std_m=MICROPHONE_STD_M), std_s, times)
     placed = {name: last.poses[name].applied(at_m) if name in free else at_m for name, at_m in start.items()}
     before_s = search.fit(microphones, kept).misfit_s
     after_s = PlaceSearch(bounds_m, last.c_m_s).fit(placed, kept).misfit_s

@@ -10,7 +10,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, centred
-from livessl.core.commission.poses import UNKNOWN_DEG, UNKNOWN_M, Adjusted, Freedom, Pose, adjust, moved
+from livessl.core.commission.poses import (
+    MICROPHONE_STD_M,
+    UNKNOWN_DEG,
+    UNKNOWN_M,
+    Adjusted,
+    Freedom,
+    Pose,
+    adjust,
+    moved,
+)
 from livessl.core.types import BoolArray, FloatArray
 
 LEAST_PLACES: Final = 4
@@ -175,7 +184,7 @@ def measure_poses(
         name: measure_pose(microphones[name], measured, places_m, c_m_s, place_std_m).microphones_m
         for name, measured in enough.items()
     }
-    freedom = Freedom(dict.fromkeys(rough, (UNKNOWN_M, UNKNOWN_DEG)), SPEED_STD_M_S)
+    freedom = Freedom(dict.fromkeys(rough, (UNKNOWN_M, UNKNOWN_DEG)), SPEED_STD_M_S, MICROPHONE_STD_M)
     adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
     known = KnownPlaces(places_m, adjusted.c_m_s)
     poses = {

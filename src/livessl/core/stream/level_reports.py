@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
 from livessl.core.commission.levels import LevelMeter
 from livessl.core.types import ChannelLevel, Float32Array, IntArray
 
@@ -29,15 +31,18 @@ class LevelReports:
         self._channels = {name: [used.index(index) for index in of.tolist()] for name, of in arrays.items()}
         self._meter = LevelMeter(len(used), sample_rate_hz, list(self._channels.values()))
         self._every = round(REPORT_S * sample_rate_hz)
+        self._parts: list[Float32Array] = []  # metered together, because metering each by itself takes twice as long
         self._samples = 0
         self._waiting: dict[str, tuple[ChannelLevel, ...]] = {}
 
     def push(self, samples: Float32Array) -> None:
         """Take in the next samples (channels, n) of the device."""
-        self._meter.push(samples[self._used])
+        self._parts.append(samples[self._used])
         self._samples += samples.shape[1]
         if self._samples < self._every:
             return
+        self._meter.push(np.concatenate(self._parts, axis=1))
+        self._parts.clear()
         self._samples = 0
         levels = self._meter.recent()
         for array, channels in self._channels.items():

@@ -85,7 +85,9 @@ class Pipeline:
         if self._levels is None or not isinstance(message, Mark):
             return message
         levels = self._levels.take(message.array)
-        return replace(message, levels=levels) if levels else message
+        if not levels:
+            return message
+        return replace(message, levels=levels, drift_error_ppm=self.framer.timeline.drift_error_ppm)
 
     def flush(self) -> list[Message]:
         """Return the messages held back, at the end of the sound."""

@@ -24,6 +24,9 @@ LOCKED_S: Final = 2.0
 _SLOPE_RIDGE_S2: Final = 1e4
 """Weight of the prior of the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
 
+_NOISE_FACTOR: Final = 3.0
+"""Multiple of the standard deviation of the drift that counts as its error."""
+
 _BOUNDARY: Final = 0.4
 """Rounding of frame boundaries to samples. It is not a half: at 22.05 kHz every other boundary would be a tie."""
 
@@ -48,7 +51,7 @@ class Timeline:
     def restart(self) -> None:
         """Forget the fit: the next stamp starts a new one."""
         self._origin: tuple[int, int] | None = None
-        self._weight = self._mean_x_s = self._mean_y_ns = self._cxx = self._cxy = 0.0
+        self._weight = self._mean_x_s = self._mean_y_ns = self._cxx = self._cxy = self._cyy = 0.0
         self._last_x_s = 0.0
 
     @property
@@ -60,6 +63,18 @@ class Timeline:
     def drift_ppm(self) -> float:
         """Excess of the device's clock rate over the nominal rate, in parts per million."""
         return -self._slope_ns_s / 1e3
+
+    @property
+    def drift_error_ppm(self) -> float | None:
+        """Error that `drift_ppm` may have, in parts per million; None as long as the fit is not trusted.
+
+        It is what the prior still holds back of the drift, and three standard deviations by the stamps' jitter.
+        """
+        if self._last_x_s < LOCKED_S or self._cxx <= 0.0:
+            return None
+        held_back = abs(self._slope_ns_s) * _SLOPE_RIDGE_S2 / self._cxx
+        jitter_ns = float(np.sqrt(max(0.0, self._cyy - self._cxy**2 / self._cxx) / self._weight))
+        return (held_back + _NOISE_FACTOR * jitter_ns / float(np.sqrt(self._cxx))) / 1e3
 
     @property
     def state(self) -> ClockState:
@@ -91,6 +106,7 @@ class Timeline:
         self._mean_y_ns += dy / self._weight
         self._cxx = keep * self._cxx + dx * (x_s - self._mean_x_s)
         self._cxy = keep * self._cxy + dx * (y_ns - self._mean_y_ns)
+        self._cyy = keep * self._cyy + dy * (y_ns - self._mean_y_ns)
         return stepped
 
     def time_ns(self, index: int) -> int:

@@ -56,6 +56,8 @@ class HostState:
         Blocks of the device that were lost since the node started because the machine did not keep up.
     load : float or None
         Programs that run or wait for a processor, over the last minute, per processor; None if it is not known.
+    sound_server : bool
+        Whether its device is read through a sound server or plug-in, whose stamps do not show the device's clock.
     machine : str
         Sign by which nodes on one machine are recognized, because they share its clock; empty if it is not known.
     """
@@ -66,4 +68,5 @@ class HostState:
     error_s: float | None = None
     lost_blocks: int = 0
     load: float | None = None
+    sound_server: bool = False
     machine: str = ""

@@ -160,6 +160,8 @@ class Mark:
         State of the mapping from sample index to site time.
     levels : tuple of ChannelLevel
         Level of each channel, in the first mark after each second of sound; empty in all others.
+    drift_error_ppm : float or None
+        Error that `drift_ppm` may have, parts per million, in marks with levels; None if it is not known.
     host : HostState or None
         State of the node's machine, in marks with levels of a node that captures now; None in all others.
     """
@@ -175,6 +177,7 @@ class Mark:
     drift_ppm: float = 0.0
     clock: ClockState = ClockState.SETTLING
     levels: tuple[ChannelLevel, ...] = ()
+    drift_error_ppm: float | None = None
     host: HostState | None = None
 
 

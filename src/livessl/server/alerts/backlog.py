@@ -47,8 +47,9 @@ class Backlog:
         self._missed: tuple[int, int] | None = None  # site time from and before which events did not fit
         self._added_ns: int | None = None  # the earliest start of those that were missed since the last look
         self._missing = threading.Lock()
+        self._changes: deque[tuple[JsonObject, int]] = deque()
         self.unqueued = 0
-        """Events that did not fit into the queue."""
+        """Events, and changes of tracks in zones, that did not fit into their queues."""
 
     def __len__(self) -> int:
         """Return the number of batches that wait."""
@@ -73,6 +74,21 @@ class Backlog:
             since_ns, newest_ns = (first_ns, until_ns) if self._missed is None else self._missed
             self._missed = min(first_ns, since_ns), max(until_ns, newest_ns)
             self._added_ns = first_ns if self._added_ns is None else min(first_ns, self._added_ns)
+
+    def add_change(self, change: JsonObject, time_ns: int) -> None:
+        """Queue what a track does in a zone, and its site time; without room it is given up."""
+        if len(self._changes) < MAX_QUEUE:
+            self._changes.append((change, time_ns))
+        else:
+            self.unqueued += 1
+
+    def work_off_changes(self, judge: Callable[[Sequence[tuple[JsonObject, int]]], None]) -> None:
+        """Hand over all changes of tracks that wait, together; what `judge` raises leaves them."""
+        waiting = list(self._changes)
+        if waiting:
+            judge(waiting)
+        for _ in waiting:
+            self._changes.popleft()
 
     def work_off(self, judge: Callable[[Batch], None]) -> None:
         """Hand over all that waits, oldest first; what `judge` raises leaves the rest, its own batch included.

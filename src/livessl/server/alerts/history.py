@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,7 +13,7 @@ from livessl.server.alerts.rules import SUPPRESSED, RuleState, Verdict, judge_ev
 from livessl.server.api.encode import JsonObject
 from livessl.server.store import Query, Store
 from livessl.server.zones.shapes import ZoneMap
-from livessl.site.alert_models import AlertRule
+from livessl.site.alert_models import AlertRule, AlertsConfig
 
 PAGE: Final = 500
 """Events that are read from the store at a time, so that other threads do not wait for the store for long."""
@@ -63,6 +64,44 @@ def past_pages(store: Store, since_ns: int, before_ns: int) -> Iterator[tuple[li
         page, query = _page(store, query)
         # events of the same instant may follow on the next page
         yield page, before_ns if query is None or query.before is None else query.before.time_ns
+
+
+class DryRunBusyError(Exception):
+    """Another dry run is under way."""
+
+
+class DryRuns:
+    """Tries rules on the stored events, one at a time; every thread may call it.
+
+    Parameters
+    ----------
+    config : AlertsConfig
+    store : Store
+    zones : callable
+        Returns the zones that are in force.
+    """
+
+    def __init__(self, config: AlertsConfig, store: Store, zones: Callable[[], ZoneMap]) -> None:
+        self._config = config
+        self._store = store
+        self._zones = zones
+        self._trying = threading.Lock()
+
+    def run(self, rule: str, since_ns: int, before_ns: int) -> DryRun:
+        """Return what a rule on events would have done in a span of site time.
+
+        Raises
+        ------
+        DryRunBusyError
+            If another one is under way: each may read a hundred thousand events.
+        """
+        if not self._trying.acquire(blocking=False):
+            raise DryRunBusyError
+        try:
+            rules, zone = self._config.rules, self._config.timezone
+            return try_rule(rules[rule], self._store, self._zones(), zone, since_ns, before_ns)
+        finally:
+            self._trying.release()
 
 
 def try_rule(

@@ -9,8 +9,7 @@ import asyncio
 import logging
 import sqlite3
 import threading
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -21,7 +20,7 @@ from livessl.core.types import FRAME_NS
 from livessl.server.alerts.actions import ActionSetting, make_action
 from livessl.server.alerts.backlog import Backlog, Batch, final_until_ns
 from livessl.server.alerts.courier import NS_PER_S, REST_S, Courier
-from livessl.server.alerts.history import DryRun, past_pages, try_rule
+from livessl.server.alerts.history import DryRuns, past_pages
 from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
@@ -35,9 +34,6 @@ from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.alert_checks import outbox_file
 from livessl.site.models import Site
 
-MAX_CHANGES: Final = 1000
-"""Most changes of tracks that wait to be judged."""
-
 POLL_S: Final = 0.5
 """Interval, in seconds, at which arrays and findings are looked at."""
 
@@ -50,10 +46,6 @@ STOP_S: Final = 3.0
 """Longest wait, in seconds, for the thread when the server stops."""
 
 _log = logging.getLogger(__name__)
-
-
-class DryRunBusyError(Exception):
-    """Another dry run is under way."""
 
 
 class Alerts:
@@ -111,52 +103,34 @@ class Alerts:
         self._judges_early = any(rule.events and rule.events.early for rule in self._config.rules.values())
         self._judges_tracks = "tracks" in kinds
         self._judges_conditions = not kinds.isdisjoint(("arrays", "findings"))
-        self._zones = fixed_zones(site) if zones is None else zones
+        zones = fixed_zones(site) if zones is None else zones
+        self.dry_runs = DryRuns(self._config, store, zones)
+        """Tries rules on the history."""
         self.outbox = Outbox(_outbox_path(site))
         """Alerts, deliveries and the rules' states."""
         base = self._config.url or url + site.server.http.root_path
         try:
-            self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base), self._zones)
-            self.couriers = {name: self._courier(name, base) for name in self._config.actions}
+            self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base), zones)
+            self.couriers = {name: _courier(name, site, clock, self.outbox, base) for name in self._config.actions}
             """The courier of each action, by name."""
-            self._leave_the_past()
+            _leave_the_past(self.outbox, self.couriers, None if self._judges_events else site.site)
         except BaseException:
             self.outbox.close()
             raise
         self._backlog = Backlog(site.site, store)
-        self._changes: deque[tuple[JsonObject, int]] = deque()
-        self.changes_lost = 0
-        """Changes of tracks that did not fit into the queue."""
         self._expired_ns = 0
         self._is_failing = False
-        self._trying = threading.Lock()
         self._news, self._end = asyncio.Event(), asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
-    def _courier(self, name: str, url: str) -> Courier:
-        config = self._config.actions[name]
-        rules = [rule for rule, each in self._config.rules.items() if name in each.actions]
-        alike = {other for other, each in self._config.actions.items() if each.kind == config.kind}
-        taken = {rule for rule, each in self._config.rules.items() if not alike.isdisjoint(each.actions)}
-        others = sorted((self._config.rules.keys() | self.outbox.states().keys()) - taken)
-        action = make_action(ActionSetting(name, config, self._site, self._clock, rules, others, url))
-        return Courier(name, config, action, self.outbox, self._clock)
-
-    def _leave_the_past(self) -> None:
-        """Close what a former site file began: rules on events that come back later must not judge the time between."""
-        if not self._judges_events:
-            self.outbox.forget_judged(self._site.site)
-        if gone := self.outbox.abandon(self.couriers):
-            _log.warning("%d alerts waited for actions that the site file no longer has; they are dead letters", gone)
-
     # --- for the fusion thread
 
     @property
     def unqueued(self) -> int:
-        """Events that did not fit into the queue; final ones are judged from the store instead."""
+        """Events and changes that did not fit into their queues; final events are judged from the store instead."""
         return self._backlog.unqueued
 
     def take_early(self, event: JsonObject, time_ns: int) -> None:
@@ -173,13 +147,9 @@ class Alerts:
 
     def take_change(self, change: JsonObject, time_ns: int) -> None:
         """Take in what a track does in a zone, and its site time; what does not fit is given up, and counted."""
-        if not self._judges_tracks:
-            return
-        if len(self._changes) < MAX_CHANGES:
-            self._changes.append((change, time_ns))
+        if self._judges_tracks:
+            self._backlog.add_change(change, time_ns)
             self._wake()
-        else:
-            self.changes_lost += 1
 
     # --- for the API
 
@@ -230,22 +200,6 @@ class Alerts:
             )
         self.outbox.resend(number, self._clock.now_ns())
         self._wake_couriers()
-
-    def dry_run(self, rule: str, since_ns: int, before_ns: int) -> DryRun:
-        """Return what a rule on events would have done in a span of site time.
-
-        Raises
-        ------
-        DryRunBusyError
-            If another one is under way: each may read a hundred thousand events.
-        """
-        if not self._trying.acquire(blocking=False):
-            raise DryRunBusyError
-        try:
-            rules, zone = self._config.rules, self._config.timezone
-            return try_rule(rules[rule], self._store, self._zones(), zone, since_ns, before_ns)
-        finally:
-            self._trying.release()
 
     # --- the thread
 
@@ -326,9 +280,7 @@ class Alerts:
 
     def _turn(self) -> None:
         self._backlog.work_off(self._judge_batch)
-        while self._changes:
-            self._announce(self._judge.judge_changes([self._changes[0]]))
-            self._changes.popleft()
+        self._backlog.work_off_changes(lambda changes: self._announce(self._judge.judge_changes(changes)))
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
             set_up = self._set_up_watch.state
@@ -361,6 +313,27 @@ class Alerts:
         if loop is not None:
             with suppress(RuntimeError):  # it has just been closed
                 loop.call_soon_threadsafe(work)
+
+
+def _courier(name: str, site: Site, clock: Clock, outbox: Outbox, url: str) -> Courier:
+    alerts, config = site.alerts, site.alerts.actions[name]
+    rules = [rule for rule, each in alerts.rules.items() if name in each.actions]
+    alike = {other for other, each in alerts.actions.items() if each.kind == config.kind}
+    taken = {rule for rule, each in alerts.rules.items() if not alike.isdisjoint(each.actions)}
+    others = sorted((alerts.rules.keys() | outbox.states().keys()) - taken)
+    action = make_action(ActionSetting(name, config, site, clock, rules, others, url))
+    return Courier(name, config, action, outbox, clock)
+
+
+def _leave_the_past(outbox: Outbox, actions: Iterable[str], unjudged: str | None) -> None:
+    """Close what a former site file began, for a site with these actions.
+
+    `unjudged` is the name of a site without rules on events: rules that come back must not judge the time between.
+    """
+    if unjudged is not None:
+        outbox.forget_judged(unjudged)
+    if gone := outbox.abandon(actions):
+        _log.warning("%d alerts waited for actions that the site file no longer has; they are dead letters", gone)
 
 
 def _outbox_path(site: Site) -> Path | None:

@@ -10,10 +10,10 @@ from typing import Annotated, Final
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 
 from livessl.clock import utc_text
+from livessl.server.alerts.history import DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
 from livessl.server.alerts.schedule import is_open
-from livessl.server.alerts.service import DryRunBusyError
 from livessl.server.api import alert_schema
 from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject
@@ -92,7 +92,7 @@ def alert_routes(parts: Parts) -> APIRouter:
         now_ns = parts.clock.now_ns()
         since_ns = now_ns - round(days * DAY_NS)
         try:
-            tried = alerts.dry_run(name, since_ns, now_ns)
+            tried = alerts.dry_runs.run(name, since_ns, now_ns)
         except DryRunBusyError as error:
             headers = {"Retry-After": str(DRY_RUN_RETRY_S)}
             raise HTTPException(503, "another dry run is under way; try again when it has ended", headers) from error

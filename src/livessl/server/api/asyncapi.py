@@ -12,10 +12,11 @@ from livessl import __version__
 from livessl.server.api.auth import PROTOCOL, TOKEN_PROTOCOL, Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.hosts import public_host
-from livessl.server.api.live import LIVE, MAP
+from livessl.server.api.live import LISTEN, LIVE, MAP
 from livessl.server.api.messages import MESSAGES
-from livessl.server.api.queries import LiveParameters, MapParameters
+from livessl.server.api.queries import ListenParameters, LiveParameters, MapParameters
 from livessl.server.api.routes import as_json
+from livessl.server.clips.listeners import HEADER as SOUND_HEADER
 from livessl.server.maps import HEADER
 from livessl.site.models import Site
 
@@ -74,7 +75,11 @@ def describe(site: str, host: str, protocol: str, root_path: str = "", *, tokens
         server["pathname"] = root_path
     components: JsonObject = {
         "schemas": schemas["$defs"],
-        "messages": {**{model.__name__: _message(model) for model in MESSAGES}, "Picture": _picture()},
+        "messages": {
+            **{model.__name__: _message(model) for model in MESSAGES},
+            "Picture": _picture(),
+            "Sound": _sound(),
+        },
     }
     if tokens:
         server["security"] = [{"$ref": "#/components/securitySchemes/token"}]
@@ -85,14 +90,17 @@ def describe(site: str, host: str, protocol: str, root_path: str = "", *, tokens
         "info": {
             "title": "livessl",
             "version": __version__,
-            "description": "Live messages and power maps over WebSockets. A wrong query is answered by closing the "
-            "connection with code 1008 and a reason. The REST API is described in `/api/v1/openapi.json`.",
+            "description": "Live messages, power maps and sound over WebSockets. A wrong query is answered by closing "
+            "the connection with code 1008 and a reason. The REST API is described in `/api/v1/openapi.json`.",
         },
         "defaultContentType": "application/json",
         "servers": {"site": server},
         "channels": {
             "live": _channel(LIVE, "Events, updates, tracks and states as they are published.", LiveParameters, live),
             "map": _channel(MAP, "Power maps of each new window.", MapParameters, ["Picture"]),
+            "listen": _channel(
+                LISTEN, "Sound of one microphone, for operators, if the site permits it.", ListenParameters, ["Sound"]
+            ),
         },
         "operations": {
             "sendLive": _operation(
@@ -101,6 +109,7 @@ def describe(site: str, host: str, protocol: str, root_path: str = "", *, tokens
             "sendMap": _operation(
                 "map", "Sends the newest window's pictures at once, then each new one's.", ["Picture"]
             ),
+            "sendListen": _operation("listen", "Sends each frame that the array's node sends.", ["Sound"]),
         },
         "components": components,
     }
@@ -141,6 +150,19 @@ def _picture() -> dict[str, Any]:
         "title": "Picture",
         "summary": "Power map of one view.",
         "description": _PICTURE,
+        "contentType": "application/octet-stream",
+        "payload": {"type": "string", "format": "binary"},
+    }
+
+
+def _sound() -> dict[str, Any]:
+    return {
+        "name": "sound",
+        "title": "Sound",
+        "summary": "A frame of one microphone's sound.",
+        "description": f"A header of {SOUND_HEADER.size} bytes, little-endian: int64, time of the first sample in "
+        "nanoseconds since the epoch; float64, sampling rate in hertz; uint32, messages left out before this one "
+        "because the client was slow. Then the samples as int16, little-endian. Nodes send sound only around sound.",
         "contentType": "application/octet-stream",
         "payload": {"type": "string", "format": "binary"},
     }

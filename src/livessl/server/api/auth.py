@@ -39,8 +39,8 @@ RELOAD_S: Final = 1.0
 CLOSE_S: Final = 1.0
 """Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
 
-_SOUND: Final = re.compile(r"/api/v1/events/[^/]*/clips/.+")
-"""Addresses of recordings: sound is for operators, whoever may see where it was."""
+_SOUND: Final = re.compile(r"/api/v1/(events/[^/]*/clips/.+|listen)")
+"""Addresses of recordings and of live sound: sound is for operators, whoever may see where it was."""
 
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 

@@ -1,4 +1,4 @@
-"""Prometheus metrics of the clips."""
+"""Prometheus metrics of kept and live sound."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from livessl.server.parts import Parts
 
 
 def clip_metrics(parts: Parts) -> Iterator[Metric]:
-    """Gauges and counters of the clips; none for a site that keeps none."""
+    """Gauges and counters of those who listen, and of the clips, if the site keeps any."""
+    yield GaugeMetricFamily("livessl_listeners", "Clients that listen live to a microphone.", parts.listeners.count)
     clips = parts.clips
     if clips is None:
         return

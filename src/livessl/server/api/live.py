@@ -1,9 +1,11 @@
-"""The two WebSockets: messages as JSON, and power maps as binary pictures."""
+"""The WebSockets: messages as JSON, power maps as binary pictures, and the sound of a microphone."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Coroutine, Sequence
+from contextlib import ExitStack
 from typing import Any, Final
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -13,6 +15,7 @@ from livessl.server.api import queries
 from livessl.server.api.auth import DOOR, caller
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.hosts import OTHER_PAGE, ServerNames, other_page
+from livessl.server.clips.listeners import Listener
 from livessl.server.fanout import Numbered, Subscription
 from livessl.server.maps import FUSED
 from livessl.server.parts import Parts
@@ -20,6 +23,7 @@ from livessl.server.refusals import Refusals
 
 LIVE: Final = "/api/v1/live"
 MAP: Final = "/api/v1/map"
+LISTEN: Final = "/api/v1/listen"
 
 SEND_TIMEOUT_S: Final = 30.0
 """A client that accepts no byte for this long, in seconds, is disconnected."""
@@ -31,8 +35,11 @@ POLICY_VIOLATION: Final = 1008
 """Close code of RFC 6455 for a request that the server refuses."""
 
 
+_log = logging.getLogger(__name__)
+
+
 def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
-    """The WebSocket of messages and the WebSocket of power maps."""
+    """The WebSockets of messages, of power maps, and of sound."""
     site, fanout, router = parts.site, parts.fanout, APIRouter()
     book = parts.zone_book
 
@@ -78,6 +85,23 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
 
         with parts.maps.watching(array, chosen, drawn):
             await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
+
+    @router.websocket(LISTEN)
+    async def listen(socket: WebSocket, array: str = "", channel: str = "1") -> None:
+        await socket.accept()
+        with ExitStack() as stack:
+            try:
+                _refuse_other_pages(socket, names, parts.refusals)
+                queries.check_parameters(socket.query_params, queries.ListenParameters)
+                number = queries.chosen_microphone(site, array, channel)
+                listener = stack.enter_context(parts.listeners.listening(array, number))
+            except ValueError as error:
+                await _refuse(socket, error)
+                return
+            who = socket.scope["client_name"]
+            _log.info("%r listens to microphone %d of array %r", who, number, array)
+            await _while_connected(socket, _send_sound(socket, listener))
+            _log.info("%r listens no longer", who)
 
     return router
 
@@ -149,6 +173,12 @@ async def _send_pictures(
                 if picture is not None and not await _sent(socket.send_bytes(picture.packed(parts.site_time.now_ns()))):
                     return
         await news.wait()
+
+
+async def _send_sound(socket: WebSocket, listener: Listener) -> None:
+    """Send a microphone's sound as it comes, until the client is gone."""
+    while await _sent(socket.send_bytes(await listener.next())):
+        await asyncio.sleep(0)
 
 
 async def _sent(sending: Coroutine[Any, Any, None]) -> bool:

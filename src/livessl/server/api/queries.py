@@ -56,6 +56,13 @@ class MapParameters(BaseModel):
     )
 
 
+class ListenParameters(BaseModel):
+    """Query parameters of the WebSocket of sound."""
+
+    array: str = Field(description="Name of an array.", examples=["north"])
+    channel: int = Field(default=1, ge=1, description="Microphone of the array, from 1.", examples=[1])
+
+
 async def refuse_unknown_parameters(request: Request) -> None:
     """Answer 422 to a request with a query parameter that its route does not have.
 
@@ -180,6 +187,24 @@ def array_names(site: Site) -> list[str]:
 def map_names(site: Site) -> list[str]:
     """Names of the power maps: `fused`, and one for each array."""
     return [FUSED, *array_names(site)]
+
+
+def chosen_microphone(site: Site, array: str, channel: str) -> int:
+    """Channel that a listener has chosen, from 1.
+
+    Raises
+    ------
+    ValueError
+        If the site permits nobody to listen, or the array or the channel does not exist.
+    """
+    if not site.server.listen:
+        raise ValueError("listen: the site file does not permit it; set server.listen: true")
+    if array not in array_names(site):
+        raise ValueError(f"array: no array {array!r}; there are {', '.join(array_names(site))}")
+    count = len(site.array(array).microphones_m)
+    if not channel.isascii() or not channel.isdigit() or not 1 <= int(channel) <= count:
+        raise ValueError(f"channel: expected a number from 1 to {count}, got {channel!r}")
+    return int(channel)
 
 
 def chosen_views(site: Site, array: str, views: str) -> tuple[str, ...]:

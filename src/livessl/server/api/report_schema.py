@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated
 
 from pydantic import BaseModel, Field
 
 Dbfs = Annotated[float, Field(description="Level over the whole band in dB relative to full scale.", examples=[-38.2])]
+
+
+class DriftState(StrEnum):
+    """How well the drift of a device's clock is known.
+
+    `settling`: its error may be above 5 ppm. `known`: it is below. `unmeasurable`: the device is read through a sound
+    server, whose times do not show the device's clock.
+    """
+
+    SETTLING = "settling"
+    KNOWN = "known"
+    UNMEASURABLE = "unmeasurable"
 
 
 class Channel(BaseModel):

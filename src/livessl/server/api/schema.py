@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, Field
 
 from livessl.core.types import ClockState, Status, TrackState
-from livessl.server.api.report_schema import Channel, Host
+from livessl.server.api.report_schema import Channel, DriftState, Host
 
 Version = Annotated[
     Literal[1],
@@ -354,5 +354,6 @@ class Array(BaseModel):
     channels_age_s: float | None = Field(
         ge=0, description="Seconds since that report; null if there is none.", examples=[0.6]
     )
+    drift: DriftState | None = Field(description="How well `drift_ppm` is known; null if its node does not report it.")
     host: Host | None = Field(description="State of its node's machine; null if it is not reported.")
     enabled: bool = Field(description="Whether its sound is used; an operator can disable an array.", examples=[True])

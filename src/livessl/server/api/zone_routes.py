@@ -24,6 +24,9 @@ _TEXTS: Final = {
     409: "The site file owns the zone or names no file for drawn ones, or a rule needs the zone.",
     503: "The file of the drawn zones cannot be written.",
 }
+_PICTURES: Final = (PNG, SVG, "application/octet-stream")
+"""Media types of the picture; the last one is for generators of clients that know no pictures."""
+
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _log = logging.getLogger(__name__)
 
@@ -74,7 +77,7 @@ def zone_routes(parts: Parts) -> APIRouter:
         "/api/v1/floor-plan",
         response_class=Response,
         responses={
-            200: {"description": "The picture under maps and zones.", "content": {PNG: _BINARY, SVG: _BINARY}},
+            200: {"description": "The picture under maps and zones.", "content": dict.fromkeys(_PICTURES, _BINARY)},
             **errors(404, texts={404: "The site file names no picture."}),
         },
     )

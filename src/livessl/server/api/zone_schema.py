@@ -68,7 +68,7 @@ class _Versioned(BaseModel):
 class ZoneList(_Versioned):
     """The zones in force, by name."""
 
-    zones: dict[str, ZoneShape]
+    zones: dict[str, ZoneShape] = Field(description="Zones by name.")
     can_draw: bool = Field(description="Whether the site file names a file for drawn zones.", examples=[True])
 
 

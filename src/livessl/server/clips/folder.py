@@ -104,6 +104,12 @@ class ClipFolder:
         with self._lock:
             return sum(entry.keep for entry in self._entries.values())
 
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the clips that are kept for ever."""
+        with self._lock:
+            return sum(entry.nbytes for entry in self._entries.values() if entry.keep)
+
     def about(self, event_id: str) -> About | None:
         """Return what is known of an event's clip; None if it has none."""
         if not _SAFE.fullmatch(event_id):

@@ -92,7 +92,7 @@ class Clips:
     site_time : SiteTime
         Knows whether a replay runs; its events get no clips.
     overload : Overload
-        No clip is cut while sound arrives faster than it is located.
+        No clip is cut while whole arrays are given up for the load: their frames have no samples then.
 
     Raises
     ------
@@ -169,7 +169,14 @@ class Clips:
     @property
     def problems(self) -> list[str]:
         """Sentences for the reasons of `health`."""
-        return [] if self._trouble is None else [self._trouble]
+        found = [] if self._trouble is None else [self._trouble]
+        kept, most = self.folder.kept_bytes, self._config.max_bytes
+        if kept > most:
+            found.append(
+                f"server.clips.max_bytes: clips that are kept for ever take {kept / 1e6:.1f} MB of {most / 1e6:.1f} MB"
+                ", so that new ones are deleted; keep fewer, or raise it"
+            )
+        return found
 
     def is_waiting(self, event_id: str) -> bool:
         """Return whether an event waits for its clip."""
@@ -209,7 +216,7 @@ class Clips:
             job = self._waiting[0] if self._waiting else None
         if job is None or job.due_ns > self._clock.monotonic_ns():
             return False
-        if self._overload.message is None:
+        if self._overload.relief.arrays is None:
             self._write(job)
         else:
             self.counts.shed += 1

@@ -44,6 +44,7 @@ async function request(url, { headers: others, ...options }) {
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
   const signal = AbortSignal.timeout(TIMEOUT_MS);
   const response = await fetch(url, { signal, ...options, cache: "no-store", headers });
-  if (response.status === 401) tokenNeeded(token !== null);
+  const isCurrent = token === sessionStorage.getItem(STORAGE_KEY); // it may have been entered since the request was sent
+  if (response.status === 401 && isCurrent) tokenNeeded(token !== null);
   return response;
 }

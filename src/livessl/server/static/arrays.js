@@ -188,7 +188,7 @@ function facts(array) {
   const { agreed, disagreed } = agreement;
   const found = [];
   const add = (text, title, problem = false) => found.push({ text, title, problem });
-  if (drift !== null) add(`drift ${signed(drift, 1)} ppm`, "Speed of the device's clock relative to the server's time");
+  if (drift !== null) add(driftText(drift, array.drift), "Speed of the device's clock relative to the server's time");
   if (clock !== null) add(`clock ${clock}`, "State of the device's clock against the server's time", clock === "stepped");
   if (offset !== null) add(offsetText(offset), "Clock offset measured from events", Math.abs(offset.offset_s) > FRAME_S);
   if (rate !== null) add(`${number(rate / 1000, 2)} kHz`, "Sample rate of the device");
@@ -206,6 +206,11 @@ function facts(array) {
     add(text, "Requests for frames of events that this array did not detect itself");
   }
   return found;
+}
+
+function driftText(drift, state) {
+  if (state === "unmeasurable") return "drift not measurable through a sound server";
+  return state === "settling" ? "drift settling" : `drift ${signed(drift, 1)} ppm`;
 }
 
 function hostText({ synchronized, service, reference, error_s: error }) {

@@ -64,9 +64,9 @@ export class Clips {
       el("span", { className: "clip-title", text: title }),
       el("span", { className: "clip-facts", text: parts.filter(Boolean).join(", ") }));
     if (this.mayListen) {
-      item.append(
+      item.append(el("span", { className: "clip-buttons" },
         this.#button("Listen", `Listen: ${title}`, async () => this.#listen(await this.#address(id, file), sound, title)),
-        this.#button("Save", `Save: ${title}`, async () => save(await this.#address(id, file), `${id}-${file.name}`)));
+        this.#button("Save", `Save: ${title}`, async () => save(await this.#address(id, file), `${id}-${file.name}`))));
     }
     item.append(sound);
     return item;

@@ -106,7 +106,7 @@ export class Plan {
 
   /** Metres at a pixel of the canvas, or null outside the room. */
   metresAt(px, py) {
-    return this.#under(px, py);
+    return this.under(px, py);
   }
 
   // What the layers draw with.

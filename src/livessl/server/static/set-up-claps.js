@@ -163,8 +163,8 @@ function words(place) {
 }
 
 function clapItem({ place_m: place, position_m: found, error_m: error, reason }, index) {
-  const off = error === null ? `not located: ${reason ?? ""}` : `found ${number(error)} m away`;
-  return el("li", { className: "clap", "data-testid": `clap-${index + 1}`, "data-error": error ?? "" },
+  const off = error === null ? "not located" : `found ${number(error)} m away`;
+  return el("li", { className: "clap", title: reason, "data-testid": `clap-${index + 1}`, "data-error": error ?? "" },
     el("b", { text: `${index + 1}` }), ` ${words(place)}: ${off}`,
     found ? el("span", { className: "clap-at", text: ` at ${words(found)}` }) : null);
 }

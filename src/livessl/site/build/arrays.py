@@ -16,6 +16,7 @@ from livessl.errors import ConfigError, Fault
 from livessl.site.findings import dotted, read_yaml, reason, unknown_array, validation_findings
 from livessl.site.models import (
     ArrayConfig,
+    CalibratedArray,
     CalibrationFile,
     GeometryFile,
     Orientation,
@@ -64,12 +65,12 @@ def _speed_of_sound_m_s(file: SiteFile) -> float:
 
 def _array_specs(file: SiteFile, directory: Path) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
     specs: list[ArraySpec] = []
-    measured, faults = _measured_m(file, directory)
+    measured, faults = _measured(file, directory)
     for name, array in file.arrays.items():
         try:
             positions = _microphones_m(array, directory)
             if name in measured:
-                positions = _replaced(name, positions, measured[name])
+                positions = _replaced(name, positions, as_positions_m(measured[name].microphones_m))
         except ConfigError as error:
             faults.append((("arrays", name, "geometry"), "; ".join(str(fault) for fault in error.faults)))
             continue
@@ -78,9 +79,18 @@ def _array_specs(file: SiteFile, directory: Path) -> tuple[tuple[ArraySpec, ...]
             faults.append((("arrays", name, "band_hz"), what))
             continue
         if file.band_hz[0] < file.band_hz[1]:
-            known = Uncertainty(**(file.uncertainty.model_dump() | _given(array.uncertainty)))
+            calibrated = _calibrated(measured.get(name))
+            known = Uncertainty(**(file.uncertainty.model_dump() | calibrated | _given(array.uncertainty)))
             specs.append(ArraySpec(name, positions, array.band_hz or file.band_hz, known))
     return tuple(specs), faults
+
+
+def _calibrated(measured: CalibratedArray | None) -> dict[str, float]:
+    """Return what the calibration says of its own accuracy; older files may say nothing."""
+    if measured is None:
+        return {}
+    stds = {"position_m": measured.position_std_m, "orientation_deg": measured.orientation_std_deg}
+    return {key: value for key, value in stds.items() if value > 0.0}
 
 
 def _given(uncertainty: UncertaintyConfig | None) -> dict[str, float]:
@@ -143,8 +153,8 @@ def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
     return posed(shape_m, array.position_m, turn.yaw, turn.pitch, turn.roll)
 
 
-def _measured_m(file: SiteFile, directory: Path) -> tuple[dict[str, FloatArray], list[Finding]]:
-    """Return the positions (K, 3) of the microphones that the calibration file holds, metres."""
+def _measured(file: SiteFile, directory: Path) -> tuple[dict[str, CalibratedArray], list[Finding]]:
+    """Return the arrays that the calibration file holds."""
     if file.calibration is None:
         return {}, []
     try:
@@ -154,7 +164,7 @@ def _measured_m(file: SiteFile, directory: Path) -> tuple[dict[str, FloatArray],
     strangers: list[Finding] = [
         (("calibration",), unknown_array(name, file.arrays)) for name in calibrated.arrays.keys() - file.arrays
     ]
-    return {name: as_positions_m(array.microphones_m) for name, array in calibrated.arrays.items()}, strangers
+    return dict(calibrated.arrays), strangers
 
 
 def _replaced(name: str, filed_m: FloatArray, measured_m: FloatArray) -> FloatArray:
