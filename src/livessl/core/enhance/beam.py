@@ -45,7 +45,7 @@ _LEAST_POWER: Final = 1e-20
 
 @dataclass(frozen=True, slots=True)
 class ArraySound:
-    """What one array recorded around a sound.
+    """The samples that one array recorded around a sound.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Enhancement:
-    """How one signal is made of the recordings of several arrays.
+    """The way in which one signal is made of the recordings of several arrays.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ def clip_routes(parts: Parts) -> APIRouter:
 
     @router.get("/clips", response_model=clip_schema.ClipsState)
     def get_clips() -> Response:
-        """How many events have recordings, how large they are, and what was left out since the start."""
+        """Number and size of the recordings, and counts of what was left out since the start."""
         config = parts.site.server.clips
         limits = {
             "max_bytes": None if config is None else config.max_bytes,

@@ -1,3 +1,3 @@
-"""What is kept of an event's sound: the arrays' recordings around it, and the beam at its place."""
+"""The sound of events: the arrays' recordings around them, and the beam at their place."""
 
 from __future__ import annotations

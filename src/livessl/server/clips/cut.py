@@ -18,7 +18,7 @@ that is too quiet to be active."""
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What an array recorded around an event.
+    """The samples that an array recorded around an event.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The folder of clips: for each event a folder with its recordings and one JSON file about them; nobody else writes.
+"""The folder of clips: for each event a folder with its recordings and one JSON file about them.
 
 A clip is written into a folder of another name first, so that a killed server leaves no half of one.
 """
@@ -39,7 +39,7 @@ class ClipsError(RunError):
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """What retention needs to know of a clip."""
+    """The properties of a clip that retention needs."""
 
     start_ns: int
     nbytes: int

@@ -1,4 +1,4 @@
-"""Passes the sound of single microphones to people who listen live. Nothing is stored, and nobody waits for them."""
+"""Passes the sound of single microphones to people who listen live. Nothing is stored."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEADER: Final = struct.Struct("<qdI")
 (int64), sampling rate in hertz (float64), and messages left out just before it (uint32)."""
 
 MOST_QUEUED: Final = 40
-"""Most frames that wait for a client, two seconds; of more the oldest are left out, and the client is told."""
+"""Most frames that wait for a client, two seconds; beyond it the oldest are left out and counted."""
 
 MOST_LISTENERS: Final = 8
 """Most clients that listen at once; the fusion thread converts each frame for each of them."""

@@ -28,7 +28,7 @@ MOST_GAIN: Final = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What is to be written of an event.
+    """An event, and the recordings that its clip is made of.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ class Counts:
     written: int = 0
     """Clips that were written."""
     incomplete: int = 0
-    """Of those, clips in which frames of an event are missing for at least one array."""
+    """Written clips in which frames of the event are missing for at least one array."""
     without_sound: int = 0
     """Events of which no frame was left when the clip was cut."""
     shed: int = 0
@@ -113,7 +113,7 @@ class Clips:
         self._lock = threading.Lock()
         self._waiting: deque[_Job] = deque()
         self.counts = Counts()
-        """What has become of the events since the server started."""
+        """Outcomes of the events since the server started."""
         self._trouble: str | None = None
         self._expired_ns: int | None = None
         self._stop = threading.Event()
