@@ -25,7 +25,7 @@ export class ClapTest {
     this.waits = 0;
     this.waiting = false;
     plan.canvas.addEventListener("click", ({ offsetX, offsetY }) => {
-      const metres = isOpen() ? plan.under(offsetX, offsetY) : null;
+      const metres = isOpen() ? plan.metresAt(offsetX, offsetY) : null;
       if (metres !== null) this.#choose(metres);
     });
     find("clap-form").addEventListener("submit", (event) => {
