@@ -115,7 +115,7 @@ class Desk:
         self.site = site
         self.published: list[JsonObject] = []
         self.arrays, self.findings, self.time = QuietArrays(state), NoFindings(), LiveTime()
-        self.store = Store(site.file(site.server.events_db) if site.server.events_db else None)
+        self.store = Store.of(site)
         arrays, findings, time = cast(Any, self.arrays), cast(Any, self.findings), cast(Any, self.time)
         publish, url = self.published.append, "http://127.0.0.1:8000"
         self.alerts = Alerts(site, self.clock, self.store, arrays, findings, time, publish, url)

@@ -10,7 +10,7 @@ from hypothesis import settings
 
 from livessl.core.locate.peak_search import warm_up
 
-pytest_plugins = ["api_contract"]
+pytest_plugins = ["api_contract", "history_places"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background: children would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -41,11 +41,12 @@ def test_a_running_system_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: p
     site = site_of({**PRIVATE, "server.events_db": str(tmp_path / "events.db")}, tmp_path)
     with running_server(site) as server:
         send_session(site, server.endpoint, scene_recordings(0), UnpacedClock(), CLOCK, "run", lambda: False)
-        wait_until(lambda: server.parts.event_log.published == 2, "both events")
+        log = server.parts.event_log
+        wait_until(lambda: log.published == 2 and not log.unsaved and log.is_saved, "both events")
         written = {path.name for path in tmp_path.rglob("*")}
         assert {name.partition("-")[0] for name in written} == {"events.db"}
     with closing(sqlite3.connect(tmp_path / "events.db")) as db:
-        texts = [text for (text,) in db.execute("SELECT json FROM events")]
+        texts = [text for (text,) in db.execute("SELECT body FROM events")]
     assert len(texts) == 2
     assert max(map(len, texts)) < 2 * 4 * 0.05 * 16000  # 16 bit, four channels
 

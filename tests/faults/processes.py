@@ -215,7 +215,7 @@ class Playing:
     def events(self) -> list[Event]:
         """What is stored, oldest first, whether or not a server runs; `at_s` counts from the recordings' start."""
         with closing(sqlite3.connect(self.directory / "events.db", timeout=HANG_S)) as db:
-            rows = db.execute("SELECT json FROM events ORDER BY time_ns").fetchall()
+            rows = db.execute("SELECT body FROM events ORDER BY time_ns").fetchall()
         events = [json.loads(text) for (text,) in rows]
         return [{**event, "at_s": (utc_ns(event["time_utc"]) - self.start_ns) / 1e9} for event in events]
 

@@ -25,6 +25,7 @@ from livessl.core.locate.estimator import Localization, PowerMaps, Sound, regist
 from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
 from livessl.server.app import assemble
 from livessl.server.fanout import Fanout
+from livessl.server.history.backlog import Backlog
 from livessl.server.ingest import Ingest
 from livessl.server.latency import Arrivals
 from livessl.server.parts import Parts
@@ -330,6 +331,7 @@ class World:
 
     def kill_server(self) -> None:
         self.server = None
+        self.store.backlog = Backlog(self.store.prepare)  # what waited in the process's memory is gone
         self.wires.clear()
 
     def start_node(self, name: str) -> None:

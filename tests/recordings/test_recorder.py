@@ -159,6 +159,7 @@ class Ailing:
     channels = 8
     problem: str | None = None
     lost_blocks = 0
+    through_sound_server = False
 
     def __enter__(self) -> Self:
         return self

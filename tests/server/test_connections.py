@@ -136,3 +136,11 @@ def test_a_connection_may_send_requests_one_after_another(impatient: Server) -> 
             assert client.get(f"{impatient.url}/api/v1/health").status_code == 200
             with opened(impatient) as idle:
                 assert is_closed(idle)
+
+
+def test_small_answers_do_not_wait_for_acknowledgements() -> None:
+    """Connections send at once (TCP_NODELAY): an answer of two packets would wait 40 ms for the client."""
+    with http.listen("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0

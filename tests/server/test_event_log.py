@@ -14,7 +14,8 @@ from world import START, HandClock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Estimate, Event, Status
 from livessl.server.api.encode import JsonObject, Messages
-from livessl.server.event_log import MAX_UNSAVED, RETRY_NS, EventLog
+from livessl.server.event_log import EventLog
+from livessl.server.history.backlog import MAX_UNSAVED, RETRY_NS
 from livessl.server.latency import Arrivals, Latency
 from livessl.server.store import Query, Store, StoreError
 from small_site import site_of
@@ -172,17 +173,21 @@ def test_events_beyond_the_limit_are_given_up_and_counted() -> None:
     assert desk.log.published == sum(sizes)
 
 
-def test_early_event_that_was_not_stored_is_published_again_as_final() -> None:
+def test_early_event_that_waits_for_the_disk_is_replaced_like_others() -> None:
     desk = Desk()
     desk.store.full = True
     desk.log.add_early(event(10, 19), MESSAGES)
-    desk.store.full = False
+    assert (desk.log.is_saved, desk.log.unsaved) == (True, 1)  # its frames are kept until its final event is stored
     desk.finish([event(10, 19)])
-    assert [message["id"] for message in desk.published] == ["small-10", "small-10"]
-    assert len(desk.stored) == 1
+    desk.store.full = False
+    desk.clock.time_ns += RETRY_NS
+    desk.log.retry()
+    assert [message["id"] for message in desk.published] == ["small-10"]
+    assert desk.stored == desk.published
+    assert desk.store.early_events() == []
 
 
-def test_replayed_events_replace_nothing_and_are_not_kept_waiting() -> None:
+def test_replayed_events_replace_nothing_and_hold_back_no_frames() -> None:
     desk = Desk()
     desk.log.begin_replay()
     desk.log.add_early(event(10, 19), MESSAGES)
@@ -190,6 +195,6 @@ def test_replayed_events_replace_nothing_and_are_not_kept_waiting() -> None:
     assert [message["replaces"] for message in desk.published] == [[], []]
     desk.store.full = True
     desk.finish([event(30, 39)])
-    assert (desk.log.is_saved, desk.log.unkept) == (True, 1)
+    assert (desk.log.is_saved, desk.log.unsaved) == (True, 1)
     assert len(desk.published) == 3
     assert desk.restored == Desk(desk.store).restored  # a replay does not move the final pass

@@ -1,17 +1,20 @@
-"""The history of events: queries, pages, bounds, and files."""
+"""The history of events in each database: queries, pages, bounds, and files."""
 
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import pytest
+from sqlalchemy import text
 
 from livessl.core.types import FRAME_NS
 from livessl.server.api.encode import JsonObject
+from livessl.server.history.database import READERS
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 from small_site import HANG_S
 
@@ -29,12 +32,28 @@ def event(number: int, confidence: float = 0.5, zones: tuple[str, ...] = ()) -> 
     }
 
 
-def filled(count: int, path: Path | None = None) -> Store:
-    """Return a store of events of which number k began k seconds after the start."""
-    store = Store(path)
-    for k in range(count):
-        store.add(event(k, k / count, ("door",) if k % 3 == 0 else ()), START_NS + k * NS)
+def fill(store: Store, count: int) -> Store:
+    """Store events of which number k began k seconds after the start."""
+    store.add_all([(event(k, k / count, ("door",) if k % 3 == 0 else ()), START_NS + k * NS) for k in range(count)])
     return store
+
+
+def filled(count: int, path: Path | None = None) -> Store:
+    """Return a store of such events."""
+    return fill(Store(path), count)
+
+
+@pytest.fixture(scope="module", params=["memory", "sqlite", "postgresql"])
+def ten(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """Ten events, which no test changes."""
+    place: Path | str | None = None
+    if request.param == "sqlite":
+        place = tmp_path_factory.mktemp("ten") / "events.db"
+    elif request.param == "postgresql":
+        place = request.getfixturevalue("postgresql").url()
+    store = fill(Store(place), 10)
+    yield store
+    store.close()
 
 
 def ids(store: Store, **query: Any) -> list[int]:
@@ -42,8 +61,7 @@ def ids(store: Store, **query: Any) -> list[int]:
     return [int(found["id"].removeprefix("e-")) for found in events]
 
 
-def test_event_comes_back_as_it_was() -> None:
-    store = Store()
+def test_event_comes_back_as_it_was(store: Store) -> None:
     whole = {**event(1, 0.25, ("Tür",)), "reason": None, "covariance_m2": [[0.1, 0, 0]], "nested": {"ä": [1.5, None]}}
     store.add(whole, START_NS)
     assert store.get("e-1") == whole
@@ -51,8 +69,8 @@ def test_event_comes_back_as_it_was() -> None:
     assert store.find(Query()) == ([whole], None)
 
 
-def test_newest_come_first() -> None:
-    assert ids(filled(5)) == [4, 3, 2, 1, 0]
+def test_newest_come_first(ten: Store) -> None:
+    assert ids(ten) == [9, 8, 7, 6, 5, 4, 3, 2, 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -73,15 +91,14 @@ def test_newest_come_first() -> None:
         ({"limit": 2, "zone": "door"}, [9, 6]),
     ],
 )
-def test_query_finds_what_matches(query: dict[str, Any], expected: list[int]) -> None:
-    assert ids(filled(10), **query) == expected
+def test_query_finds_what_matches(ten: Store, query: dict[str, Any], expected: list[int]) -> None:
+    assert ids(ten, **query) == expected
 
 
-@pytest.mark.parametrize("limit", [1, 3, 5, 7, 100])
-@pytest.mark.parametrize("zone", [None, "door"])
-def test_pages_leave_nothing_out_and_repeat_nothing(limit: int, zone: str | None) -> None:
+@pytest.mark.parametrize(("limit", "zone"), [(1, "door"), (3, None), (5, "door"), (7, None), (100, None)])
+def test_pages_leave_nothing_out_and_repeat_nothing(store: Store, limit: int, zone: str | None) -> None:
     """Even while new events come and an old one is stored again."""
-    store = filled(20)
+    fill(store, 20)
     expected = ids(store, limit=1000, zone=zone)
     seen: list[int] = []
     cursor: Cursor | None = None
@@ -95,26 +112,31 @@ def test_pages_leave_nothing_out_and_repeat_nothing(limit: int, zone: str | None
     assert seen == expected
 
 
-def test_last_page_has_no_next() -> None:
-    store = filled(4)
-    _, cursor = store.find(Query(limit=4))
+def test_last_page_has_no_next(ten: Store) -> None:
+    _, cursor = ten.find(Query(limit=10))
     assert cursor is None
-    _, cursor = store.find(Query(limit=3))
+    _, cursor = ten.find(Query(limit=9))
     assert cursor is not None
 
 
-def test_event_stored_again_replaces_itself() -> None:
-    store = filled(3)
+def test_event_stored_again_replaces_itself(store: Store) -> None:
+    fill(store, 3)
     store.add({**event(1), "confidence": 0.99}, START_NS)
     assert store.count() == 3
     found = store.get("e-1")
     assert found is not None
     assert found["confidence"] == 0.99
+    assert ids(store, min_confidence=0.9) == [1]
 
 
-def test_event_stored_again_keeps_its_place_among_equals() -> None:
+def test_event_stored_again_is_found_by_its_new_zones_only(store: Store) -> None:
+    fill(store, 3)
+    store.add(event(0, zones=("hall",)), START_NS)
+    assert (ids(store, zone="door"), ids(store, zone="hall")) == ([], [0])
+
+
+def test_event_stored_again_keeps_its_place_among_equals(store: Store) -> None:
     """A cursor from before stays valid."""
-    store = Store()
     for k in range(3):
         store.add(event(k), START_NS)
     assert ids(store) == [2, 1, 0]
@@ -124,8 +146,7 @@ def test_event_stored_again_keeps_its_place_among_equals() -> None:
     assert ids(store, before=cursor) == [1, 0]
 
 
-def test_order_is_by_time_and_not_by_storing() -> None:
-    store = Store()
+def test_order_is_by_time_and_not_by_storing(store: Store) -> None:
     for k in (3, 0, 2, 1):
         store.add(event(k), START_NS + k * NS)
     assert ids(store) == [3, 2, 1, 0]
@@ -161,22 +182,28 @@ def test_file_that_another_program_holds_is_an_error(tmp_path: Path) -> None:
     store.close()
 
 
-def test_slow_query_does_not_delay_an_event(tmp_path: Path) -> None:
-    """The reader's lock is held throughout, as by a slow query."""
-    store = filled(1, tmp_path / "events.db")
+def test_slow_query_does_not_delay_an_event(opened: Callable[[], Store]) -> None:
+    """All connections for reading are taken throughout, as by slow queries."""
+    store = fill(opened(), 1)
     adding = Thread(target=lambda: store.add(event(1), START_NS + NS))
-    with store._reading.lock:
+    with ExitStack() as reading:
+        for _ in range(READERS):
+            reading.enter_context(store._database.reading()).execute(text("SELECT * FROM events"))
         adding.start()
         adding.join(timeout=HANG_S)
         assert not adding.is_alive()
     assert ids(store) == [1, 0]
-    store.close()
 
 
-def test_file_is_read_without_the_right_to_write(tmp_path: Path) -> None:
+def test_searches_cannot_change_the_database(opened: Callable[[], Store]) -> None:
+    store = fill(opened(), 1)
+    with pytest.raises(StoreError, match=r"cannot read: .*read-?only"), store._database.reading() as connection:
+        connection.execute(text("DELETE FROM events"))
+    assert ids(store) == [0]
+
+
+def test_file_of_an_odd_name_is_read(tmp_path: Path) -> None:
     store = filled(1, tmp_path / "odd ?#%20 name.db")
-    with pytest.raises(sqlite3.OperationalError, match="readonly"):
-        store._reading.rows("DELETE FROM events")
     assert ids(store) == [0]
     store.close()
 
@@ -188,15 +215,13 @@ def test_memory_is_bounded() -> None:
     assert store.get("e-25") is not None
 
 
-def test_file_persists(tmp_path: Path) -> None:
-    path = tmp_path / "events.db"
-    store = filled(3, path)
-    store.close()
-    again = Store(path)
+def test_database_persists(opened: Callable[[], Store]) -> None:
+    fill(opened(), 3).close()
+    again = opened()
+    assert again.count() == 3
     assert ids(again) == [2, 1, 0]
     again.add(event(3), START_NS)
     assert ids(again) == [2, 1, 3, 0]  # the last one told is among the oldest
-    again.close()
 
 
 def test_unusable_path_is_an_error(tmp_path: Path) -> None:
@@ -209,11 +234,9 @@ def test_unusable_path_is_an_error(tmp_path: Path) -> None:
         assert said.endswith("; name a file in a writable folder")
 
 
-def test_any_thread_may_query_and_add() -> None:
-    store = Store()
-
+def test_any_thread_may_query_and_add(store: Store) -> None:
     def add(offset: int) -> None:
-        for k in range(100):
+        for k in range(25):
             store.add(event(offset + k), START_NS + k)
             store.find(Query(limit=3))
 
@@ -222,19 +245,17 @@ def test_any_thread_may_query_and_add() -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert store.count() == 400
-    assert len(set(ids(store, limit=1000))) == 400
+    assert store.count() == 100
+    assert len(set(ids(store, limit=1000))) == 100
 
 
-def test_quotes_in_a_zone_are_only_quotes() -> None:
-    store = filled(3)
-    assert ids(store, zone="' OR 1=1 --") == []
-    assert store.get("' OR 1=1 --") is None
+def test_quotes_in_a_zone_are_only_quotes(ten: Store) -> None:
+    assert ids(ten, zone="' OR 1=1 --") == []
+    assert ten.get("' OR 1=1 --") is None
 
 
-def test_final_events_take_the_place_of_early_ones(tmp_path: Path) -> None:
-    path = tmp_path / "events.db"
-    store = Store(path)
+def test_final_events_take_the_place_of_early_ones(opened: Callable[[], Store]) -> None:
+    store = opened()
     assert store.finalized("lab") == (None, None)
     for n in range(3):
         store.add(event(n), START_NS + n * NS, early=True)
@@ -244,11 +265,10 @@ def test_final_events_take_the_place_of_early_ones(tmp_path: Path) -> None:
     assert ids(store) == [2, 1, 7]
     assert store.early_events() == [(START_NS + 2 * NS, event(2))]  # e-1 is final now
     store.close()
-    again = Store(path)
+    again = opened()
     assert again.finalized("lab") == (frame_index, {"heard": {"b": [[1, 0.15]]}})
     assert again.finalized("elsewhere") == (None, None)
     assert again.early_events() == [(START_NS + 2 * NS, event(2))]
-    again.close()
 
 
 def test_database_of_an_older_version_is_read(tmp_path: Path) -> None:
@@ -266,13 +286,36 @@ def test_database_of_an_older_version_is_read(tmp_path: Path) -> None:
 def test_finalize_is_all_or_nothing(tmp_path: Path) -> None:
     store = filled(1, tmp_path / "events.db")
     large = {**event(6), "note": "x" * 500_000}
-    pages = store._writing.rows("PRAGMA page_count")[0][0]
-    store._writing.rows(f"PRAGMA max_page_count = {pages + 3}")  # the disk is as good as full
+
+    def limit(pages: int) -> None:
+        with store._database.writing("test") as connection:
+            connection.execute(text(f"PRAGMA max_page_count = {pages}"))
+
+    with store._database.writing("test") as connection:
+        pages = connection.execute(text("PRAGMA page_count")).scalar_one()
+    limit(pages + 3)  # the disk is as good as full
     with pytest.raises(StoreError, match="cannot store 2 events: database or disk is full; free space"):
         store.finalize("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
     assert ids(store) == [0]
     assert store.finalized("lab") == (None, None)
-    store._writing.rows("PRAGMA max_page_count = 1000000")
+    limit(1_000_000)
     store.finalize("lab", [(event(5), START_NS), (large, START_NS + NS)], ["e-0"], 1000, {})
-    assert ids(store) == [6, 5]
+    assert (ids(store), store.count()) == ([6, 5], 2)
     store.close()
+
+
+def test_disabled_arrays_are_remembered(opened: Callable[[], Store]) -> None:
+    store = opened()
+    store.enable("lab", "north", False)
+    store.enable("lab", "north", False)
+    store.enable("lab", "south", False)
+    store.enable("lab", "south", True)
+    store.enable("elsewhere", "west", False)
+    assert opened().disabled("lab") == {"north"}
+
+
+def test_expired_events_are_gone_in_batches(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 3)
+    fill(store, 10)
+    assert store.expire(START_NS + 7 * NS) == 7
+    assert (ids(store), ids(store, zone="door"), store.count()) == ([9, 8, 7], [9], 3)

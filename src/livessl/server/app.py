@@ -207,7 +207,7 @@ class Server:
             undo.callback(self._listener.close)
             sinks = Sinks([sink.model_copy(update={"path": str(site.file(sink.path))}) for sink in site.server.sinks])
             undo.callback(sinks.close)
-            store = Store(site.file(site.server.events_db) if site.server.events_db else None)
+            store = Store.of(site)
             undo.callback(store.close)
             self._compiler = load_kernels()
             if self._compiler is not None:
@@ -264,6 +264,7 @@ class Server:
         if self.parts.clips is not None:
             self.parts.clips.start()
         if not self._stepped:
+            self.parts.store.backlog.start()
             self.parts.engine.start()
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]

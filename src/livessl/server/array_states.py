@@ -21,7 +21,7 @@ from livessl.server.node_clocks import clock_is_behind
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
-from livessl.server.store import Store
+from livessl.server.store import Store, StoreError
 from livessl.site.build.pipeline import activity_parameters
 from livessl.site.build.set_up import with_inputs
 from livessl.site.models import Site
@@ -79,10 +79,20 @@ class ArrayStates:
         self._set_up_watch = set_up_watch
         self._publish = publish
         self._fusion: TwoPassFusion | None = None
-        self._disabled = store.disabled(site.site)  # replaced as a whole, never changed, so that readers need no lock
+        self._disabled: frozenset[str] = frozenset()  # replaced as a whole, never changed: readers need no lock
         self._switching = threading.Lock()
         self._reported: dict[str, str] = {}
         self._reported_ns = self._watched_ns = 0
+        try:
+            self._restore()
+        except StoreError as error:
+            _log.error("%s; no array is disabled until then", error)
+            store.when_ready(self._restore)
+
+    def _restore(self) -> None:
+        """Disable the arrays that were disabled when the server ended."""
+        with self._switching:
+            self._disabled |= self._store.disabled(self._site.site)
 
     def follow(self, fusion: TwoPassFusion) -> None:
         """Describe the arrays as this fusion sees them, from now on; past sounds say nothing about them any more."""

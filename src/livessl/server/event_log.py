@@ -7,23 +7,18 @@ It is read again only from the store, at the beginning of a live run.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol, Self
+from functools import partial
+from typing import NamedTuple, Protocol, Self
 
 from livessl.clock import Clock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Event
 from livessl.server.api.encode import JsonObject, Messages, Stages, where
+from livessl.server.history.backlog import Write
 from livessl.server.latency import Latency
 from livessl.server.store import Finalized, Store, StoreError
-
-RETRY_NS: Final = 1_000_000_000
-"""Interval, in nanoseconds, at which the store is offered again what it did not take."""
-
-MAX_UNSAVED: Final = 10_000
-"""Most final events that wait for the store, about 10 MB; beyond it the oldest are given up, and counted."""
 
 _log = logging.getLogger(__name__)
 
@@ -104,16 +99,6 @@ class EarlyEvent:
         return next(same_source, overlapping[0] if overlapping else None)
 
 
-@dataclass(frozen=True, slots=True)
-class _Unsaved:
-    """Results of one final pass that the store has not taken yet: the arguments of `Store.finalize`."""
-
-    events: Sequence[tuple[JsonObject, int]]
-    replaced: Sequence[str]
-    until: int
-    clocks: JsonObject
-
-
 class EventLog:
     """Publishes and stores early and final events. For the fusion thread; every thread may read the counters.
 
@@ -148,45 +133,46 @@ class EventLog:
         self._watcher = watcher
         self._is_replay = False
         self._early: list[EarlyEvent] = []
-        self._waiting: deque[_Unsaved] = deque()
-        self._tried_ns = 0
         self.published = 0
         """Events published since the start."""
-        self.unkept = 0
-        """Events given up because the store did not take them."""
-        self.unsaved = 0
-        """Final events that wait for the store to take them."""
 
     @property
     def is_saved(self) -> bool:
         """True if the store has taken all final events; until then no node may forget their frames."""
-        return not self._waiting
+        return self._store.backlog.is_saved
+
+    @property
+    def unsaved(self) -> int:
+        """Events that wait for the store to take them."""
+        return self._store.backlog.unsaved
+
+    @property
+    def unkept(self) -> int:
+        """Events given up because the store did not take them."""
+        return self._store.backlog.unkept
 
     def begin_live(self) -> Finalized:
         """Begin a live run where the last one stopped: restore its early events, and return how far it came."""
         self._is_replay = False
         try:
             self._early = [EarlyEvent.restored(start_ns, row) for start_ns, row in self._store.early_events()]
+            return self._store.finalized(self._site)
         except StoreError as error:  # early events are then published anew instead of replaced
             _log.error("%s", error)
             self._early = []
-        return self._store.finalized(self._site)
+            return Finalized(None, None)
 
     def begin_replay(self) -> None:
-        """Begin a replay: its events replace nothing, and are stored without retries."""
+        """Begin a replay: its events replace nothing."""
         self._is_replay = True
         self._early = []
 
     def add_early(self, event: Event, messages: Messages) -> None:
         """Publish an event that cannot wait for an array that is late or away."""
         message = messages.event(event, self._stages(event))
-        try:
-            self._store.add(message, event.start_ns, early=True)
-        except StoreError as error:  # the final event is kept until the store takes it
-            _log.error("%s", error)
-        else:
-            if not self._is_replay:
-                self._remember(EarlyEvent.of(event, message))
+        self._write(lambda: self._store.add(message, event.start_ns, early=True), 1)
+        if not self._is_replay:
+            self._remember(EarlyEvent.of(event, message))
         if self._watcher is not None and not self._is_replay:
             self._watcher.take_early(message, event.start_ns)
         self._publish_event(message)
@@ -222,8 +208,8 @@ class EventLog:
         replaced = [early.id for early, successor in successors if successor is not None]
         done = {event.id for event in results.events} | {early.id for early in before}
         self._early = [early for early in self._early if early.id not in done]
-        self._waiting.append(_Unsaved(rows, replaced, results.until, clocks))
-        self._save()
+        site, until = self._site, results.until
+        self._write(lambda: self._store.finalize(site, rows, replaced, until, clocks), len(rows), is_final=True)
         if self._watcher is not None:
             self._watcher.take_final(rows, results.until)
         for message in news:
@@ -231,8 +217,7 @@ class EventLog:
 
     def retry(self) -> None:
         """Offer the store what it has not taken yet, if it is time to."""
-        if self._waiting and self._clock.monotonic_ns() - self._tried_ns >= RETRY_NS:
-            self._save()
+        self._store.backlog.retry(self._clock.monotonic_ns())
 
     def _remember(self, early: EarlyEvent) -> None:
         others = [other for other in self._early if other.id != early.id]
@@ -241,28 +226,12 @@ class EventLog:
     def _add_replayed(self, events: Sequence[Event], messages: Messages) -> None:
         for event in events:
             message = messages.event(event)
-            try:
-                self._store.add(message, event.start_ns)
-            except StoreError as error:  # a full disk must not delay what is published
-                self.unkept += 1
-                _log.error("%s", error)
+            self._write(partial(self._store.add, message, event.start_ns), 1)
             self._publish_event(message)
 
-    def _save(self) -> None:
-        self._tried_ns = self._clock.monotonic_ns()
-        while self._waiting:
-            first = self._waiting[0]
-            try:
-                self._store.finalize(self._site, first.events, first.replaced, first.until, first.clocks)
-            except StoreError as error:
-                _log.error("%s", error)
-                break
-            self._waiting.popleft()
-        count = sum(len(unsaved.events) for unsaved in self._waiting)
-        while count > MAX_UNSAVED:
-            lost = len(self._waiting.popleft().events)
-            self.unkept, count = self.unkept + lost, count - lost
-        self.unsaved = count
+    def _write(self, work: Callable[[], None], events: int, *, is_final: bool = False) -> None:
+        """Have something stored, without waiting for it while the server runs."""
+        self._store.backlog.put(Write(work, events, is_final), self._clock.monotonic_ns())
 
     def _publish_event(self, message: JsonObject) -> None:
         self.published += 1

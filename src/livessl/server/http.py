@@ -94,6 +94,9 @@ def listen(host: str, port: int) -> socket.socket:
             listener = undo.enter_context(LimitedListener(family, MAX_CONNECTIONS))
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_UNREAD_BYTES)  # accepted sockets inherit it
+            # they inherit this, too; asyncio sets it only if the protocol was named. Without it, an answer of two
+            # packets waits 40 ms for the client's delayed acknowledgement
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             address: tuple[Any, ...] = (host, port)
             if family == socket.AF_INET6:
                 listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # :: is every IPv4 address as well

@@ -58,6 +58,6 @@ class Parts:
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        threads = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips)
-        failures = (thread.failure for thread in threads if thread is not None)
+        parts = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips, self.store.backlog)
+        failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)

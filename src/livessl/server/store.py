@@ -1,71 +1,44 @@
-"""The history of events, in SQLite: in memory, or in a file where the site names one."""
+"""The history of events, and what a restarted server must know: in memory, in an SQLite file, or in PostgreSQL."""
 
 from __future__ import annotations
 
-import json
-import re
-import sqlite3
+import logging
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from livessl.core.types import FRAME_NS
-from livessl.errors import RunError
-from livessl.server.api.encode import JsonObject
+import orjson
+from sqlalchemy import func, select
+
+from livessl.server.history import records
+from livessl.server.history.backlog import Backlog
+from livessl.server.history.database import CURE, Database, StoreError
+from livessl.server.history.heat_map import Cells, HeatMap, count_by_cell
+from livessl.server.history.query import Cursor, Page, Query, Row
+from livessl.server.history.search import page_statement
+from livessl.server.history.tables import disabled, events, progress
+from livessl.site.history_place import history_place
+from livessl.site.models import Site
+
+__all__ = ["CURE", "MAX_EVENTS_IN_MEMORY", "Cursor", "Finalized", "JsonObject", "Query", "Store", "StoreError"]
+
+JsonObject = dict[str, Any]
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
-"""Most events kept in memory, about 10 MB; a file has no such limit."""
+"""Most events kept in memory, about 10 MB; a database on a disk has no such limit."""
 
-BUSY_S: Final = 0.2
-"""Longest wait, in seconds, for a file that another program has locked; it can delay the fusion thread by as much."""
+EXPIRED_AT_ONCE: Final = 1000
+"""Old events that are deleted in one transaction: the longest that a new event waits for their deletion."""
 
-UNLOCK: Final = "close the program that locks the file"
-CURE: Final = f"free space on its disk, or {UNLOCK}"
-"""Cures of a database that cannot be written."""
+SCANNED_AT_ONCE: Final = 1000
+"""Events that an export reads at a time."""
 
+PAUSE_S: Final = 0.01
+"""Pause, in seconds, between two of these transactions, in which what waits is written."""
 
-class Cursor(NamedTuple):
-    """Position of the last event of a page; the next page begins after it."""
-
-    time_ns: int
-    number: int
-
-    def __str__(self) -> str:
-        return f"{self.time_ns}-{self.number}"
-
-    @classmethod
-    def parse(cls, text: str) -> Cursor:
-        """Return the cursor of which `text` is the text form.
-
-        Raises
-        ------
-        ValueError
-            If the text is not that of a cursor.
-        """
-        parts = re.fullmatch(r"(-?[0-9]{1,19})-([0-9]{1,19})", text, re.ASCII)
-        cursor = None if parts is None else cls(*map(int, parts.groups()))
-        if cursor is None or not all(abs(part) < 2**63 for part in cursor):
-            raise ValueError(f"expected the next_cursor of the page before, got {text!r}")
-        return cursor
-
-
-@dataclass(frozen=True, slots=True)
-class Query:
-    """A search for events: times in nanoseconds since the epoch, both ends included.
-
-    `before` is the cursor of the page before. Events come newest first unless `oldest_first` is set.
-    """
-
-    since_ns: int | None = None
-    until_ns: int | None = None
-    zone: str | None = None
-    min_confidence: float | None = None
-    limit: int = 50
-    before: Cursor | None = None
-    oldest_first: bool = False
+_log = logging.getLogger(__name__)
 
 
 class Finalized(NamedTuple):
@@ -83,57 +56,89 @@ class Finalized(NamedTuple):
     clocks: JsonObject | None
 
 
-class StoreError(RunError):
-    """The database cannot be read or written."""
-
-
 class Store:
     """Keeps events, and what a restarted server must know; every thread may call it.
 
-    A file has one connection for writing and one for reading, so that no slow query delays an event.
+    Every method that reads or writes raises `StoreError` if the database cannot be used. What must not wait for a
+    database goes through `backlog`; what is read includes what was put there before, unless the database fails.
 
     Parameters
     ----------
-    path : Path or None
-        The database file; None keeps the newest `MAX_EVENTS_IN_MEMORY` in memory.
+    place : Path, str or None
+        The SQLite file, or the URL of a PostgreSQL database; None keeps the newest `MAX_EVENTS_IN_MEMORY` in memory.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be used. A PostgreSQL server that cannot be reached is tried again later.
+    ConfigError
+        If the driver of PostgreSQL is not installed.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
-        self._bounded = path is None
+    def __init__(self, place: Path | str | None = None) -> None:
+        self._bounded = place is None
+        self._count: int | None = None
+        self._counting = threading.Lock()
+        self._when_ready: list[Callable[[], None]] = []
+        self._database = Database(place)
+        self.backlog = Backlog(self.prepare)
+        """Events that wait to be stored."""
         try:
-            self._writing = self._reading = _Connection(path or ":memory:")
-            with self._writing.lock, self._writing.db as db:
-                db.execute("PRAGMA journal_mode=WAL")
-                db.execute("PRAGMA secure_delete=ON")  # deleted rows are overwritten
-                db.execute(
-                    "CREATE TABLE IF NOT EXISTS events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, "
-                    "time_ns INTEGER, confidence REAL, json TEXT)"
-                )
-                db.execute("CREATE INDEX IF NOT EXISTS events_time ON events (time_ns)")
-                db.execute("CREATE TABLE IF NOT EXISTS provisional (id TEXT PRIMARY KEY)")
-                # existing databases have these names: `settled` stands for final, `raster` for frame index
-                db.execute("CREATE TABLE IF NOT EXISTS settled (site TEXT PRIMARY KEY, raster INTEGER)")
-                db.execute("CREATE TABLE IF NOT EXISTS disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))")
-                db.execute("CREATE TABLE IF NOT EXISTS clocks (site TEXT PRIMARY KEY, json TEXT)")
-            if path is not None:
-                self._reading = _Connection(f"{path.resolve().as_uri()}?mode=ro")
-        except sqlite3.Error as error:
-            raise StoreError(
-                f"server.events_db: cannot use {path}: {error}; name a file in a writable folder"
-            ) from error
+            self.prepare()
+        except StoreError as error:
+            if not self._database.is_remote:
+                self._database.close()
+                raise
+            self.backlog.is_failing = True
+            _log.error("%s; events are kept in memory until then", error)
+
+    @classmethod
+    def of(cls, site: Site) -> Store:
+        """Return the store that a site file names."""
+        return cls(history_place(site))
+
+    @property
+    def problem(self) -> str | None:
+        """Why a database cannot be used that has not been usable since the start, as PostgreSQL can be; else None."""
+        return self._database.problem
+
+    @property
+    def cure(self) -> str:
+        """What to do if the database cannot be written."""
+        return self._database.cure
+
+    def prepare(self) -> None:
+        """Make or migrate the tables, unless that is done."""
+        if not self._database.prepare():
+            return
+        with self._database.reading() as connection:
+            count = int(connection.execute(select(func.count()).select_from(events)).scalar_one())
+        with self._counting:
+            self._count = count
+        for work in self._when_ready:
+            work()
+
+    def when_ready(self, work: Callable[[], None]) -> None:
+        """Have something done as soon as a database that cannot be used now can be used, on any thread."""
+        self._when_ready.append(work)
 
     def add(self, event: JsonObject, time_ns: int, *, early: bool = False) -> None:
-        """Store an event, replacing one of the same id; an early event stays early until `finalize` passes its time.
-
-        Raises
-        ------
-        StoreError
-            If the file is locked, or its disk is full.
-        """
-        with self._kept(f"event {event['id']!r}") as db:
-            self._insert(db, event, time_ns)
+        """Store an event, replacing one of the same id; an early event stays early until `finalize` passes its time."""
+        with self._database.writing(f"store event {event['id']!r}") as connection:
+            change = records.put_events(connection, [(event, time_ns)])
             if early:
-                db.execute("INSERT OR IGNORE INTO provisional VALUES (?)", (event["id"],))
+                records.put_early(connection, event["id"])
+            if self._bounded:
+                change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
+        self._counted(change)
+
+    def add_all(self, given: Sequence[tuple[JsonObject, int]]) -> None:
+        """Store many events, each with its start, all or nothing."""
+        with self._database.writing(f"store {len(given)} events") as connection:
+            change = records.put_events(connection, given)
+            if self._bounded:
+                change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
+        self._counted(change)
 
     def finalize(
         self,
@@ -157,150 +162,109 @@ class Store:
             All other events before it become final as they are.
         clocks : JsonObject
             What is known of the arrays' clocks, which relates their frame indices to those of the site.
-
-        Raises
-        ------
-        StoreError
-            If the file is locked, or its disk is full.
         """
-        with self._kept(f"{len(events)} events") as db:
-            db.executemany("DELETE FROM events WHERE id = ?", [(old,) for old in replaced])
-            for event, time_ns in events:
-                self._insert(db, event, time_ns)
-            db.execute(
-                "DELETE FROM provisional WHERE NOT EXISTS (SELECT 1 FROM events WHERE events.id = provisional.id "
-                "AND time_ns >= ?)",
-                (frame_index * FRAME_NS,),
-            )
-            db.execute("INSERT OR REPLACE INTO settled VALUES (?, ?)", (site, frame_index))
-            db.execute("INSERT OR REPLACE INTO clocks VALUES (?, ?)", (site, json.dumps(clocks)))
+        with self._database.writing(f"store {len(events)} events") as connection:
+            change = -records.remove_events(connection, replaced)
+            change += records.put_events(connection, events)
+            if self._bounded:
+                change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
+            records.end_early(connection, frame_index)
+            records.put_progress(connection, site, frame_index, clocks)
+        self._counted(change)
 
     def finalized(self, site: str) -> Finalized:
         """Return how far the final pass of the site has come."""
-        sql = "SELECT raster, json FROM settled LEFT JOIN clocks USING (site) WHERE site = ?"
-        rows = self._reading.rows(sql, (site,))
-        if not rows:
+        self.backlog.settle()
+        query = select(progress.c.frame_index, progress.c.clocks).where(progress.c.site == site)
+        with self._database.reading() as connection:
+            row = connection.execute(query).one_or_none()
+        if row is None:
             return Finalized(None, None)
-        frame_index, clocks = rows[0]
-        return Finalized(int(frame_index), None if clocks is None else json.loads(clocks))
+        return Finalized(int(row.frame_index), None if row.clocks is None else orjson.loads(row.clocks))
 
     def disabled(self, site: str) -> frozenset[str]:
         """Return the names of the site's disabled arrays."""
-        rows = self._reading.rows("SELECT array FROM disabled WHERE site = ?", (site,))
-        return frozenset(array for (array,) in rows)
+        with self._database.reading() as connection:
+            found = connection.execute(select(disabled.c.array).where(disabled.c.site == site))
+            return frozenset(found.scalars())
 
     def enable(self, site: str, array: str, enabled: bool) -> None:
-        """Remember whether an array is enabled.
-
-        Raises
-        ------
-        StoreError
-            If the file is locked, or its disk is full.
-        """
-        sql = (
-            "DELETE FROM disabled WHERE site = ? AND array = ?"
-            if enabled
-            else "INSERT OR IGNORE INTO disabled VALUES (?, ?)"
-        )
-        with self._kept(f"the state of array {array!r}") as db:
-            db.execute(sql, (site, array))
+        """Remember whether an array is enabled."""
+        with self._database.writing(f"store the state of array {array!r}") as connection:
+            records.put_disabled(connection, site, array, is_disabled=not enabled)
 
     def early_events(self) -> list[tuple[int, JsonObject]]:
-        """Return the events that are still early, oldest first, each with its start in nanoseconds of site time.
-
-        Raises
-        ------
-        StoreError
-            If the file cannot be read.
-        """
-        sql = "SELECT time_ns, json FROM events JOIN provisional USING (id) ORDER BY time_ns"
-        try:
-            return [(time_ns, json.loads(text)) for time_ns, text in self._writing.rows(sql)]
-        except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: cannot read: {error}; {UNLOCK}") from error
-
-    def _insert(self, db: sqlite3.Connection, event: JsonObject, time_ns: int) -> None:
-        db.execute(
-            "INSERT INTO events (id, time_ns, confidence, json) VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE "
-            "SET time_ns = excluded.time_ns, confidence = excluded.confidence, json = excluded.json",
-            (event["id"], time_ns, event["confidence"], json.dumps(event)),
-        )
-        if self._bounded:
-            db.execute(
-                "DELETE FROM events WHERE number <= (SELECT max(number) FROM events) - ?", (MAX_EVENTS_IN_MEMORY,)
-            )
-
-    @contextmanager
-    def _kept(self, what: str) -> Iterator[sqlite3.Connection]:
-        try:
-            with self._writing.lock, self._writing.db as db:
-                yield db
-        except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: cannot store {what}: {error}; {CURE}") from error
+        """Return the events that are still early, oldest first, each with its start in nanoseconds of site time."""
+        self.backlog.settle()
+        query = select(events.c.time_ns, events.c.body).order_by(events.c.time_ns)
+        with self._database.reading() as connection:
+            rows = connection.execute(query.where(events.c.id.in_(records.early_ids(connection)))).all()
+        return [(time_ns, orjson.loads(body)) for time_ns, body in rows]
 
     def expire(self, before_ns: int) -> int:
-        """Delete the events that began before a time, and overwrite them in the file; return their number.
-
-        Raises
-        ------
-        StoreError
-            If the file is locked.
-        """
-        try:
-            with self._writing.lock:
-                with self._writing.db as db:
-                    gone = db.execute("DELETE FROM events WHERE time_ns < ?", (before_ns,)).rowcount
-                busy, *_ = self._writing.db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
-                if busy:
-                    raise StoreError(f"server.events_db: its journal was not emptied of old events; {UNLOCK}")
-        except sqlite3.Error as error:
-            raise StoreError(f"server.events_db: old events were not deleted: {error}; {UNLOCK}") from error
+        """Delete the events that began before a time, and overwrite them in an SQLite file; return their number."""
+        gone, pause = 0, threading.Event()
+        while True:
+            with self._database.writing("delete old events") as connection:
+                some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
+            self._counted(-some)
+            gone += some
+            if some < EXPIRED_AT_ONCE:
+                break
+            pause.wait(PAUSE_S)
+        self._database.erase()
         return gone
 
     def get(self, event_id: str) -> JsonObject | None:
         """Return the event of that id, None if there is none."""
-        rows = self._reading.rows("SELECT json FROM events WHERE id = ?", (event_id,))
-        return dict(json.loads(rows[0][0])) if rows else None
+        self.backlog.settle()
+        with self._database.reading() as connection:
+            body = connection.execute(select(events.c.body).where(events.c.id == event_id)).scalar()
+        return None if body is None else dict(orjson.loads(body))
+
+    def page(self, query: Query) -> Page:
+        """Return a page of events, newest first by their start, with the cursors of its neighbours."""
+        self.backlog.settle()
+        with self._database.reading() as connection:
+            found = connection.execute(page_statement(query, query.limit + 1)).all()
+        rows = [Row(*row) for row in found[: query.limit]]
+        has_more = len(found) > query.limit
+        if query.after is not None:
+            rows.reverse()
+            return Page(rows, rows[-1].cursor if rows else None, rows[0].cursor if rows else query.after)
+        return Page(rows, rows[-1].cursor if has_more else None, rows[0].cursor if rows else None)
 
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
-        """Return events, newest first by their time unless asked otherwise, and the cursor of the next page or None."""
-        beyond, order = (">", "ASC") if query.oldest_first else ("<", "DESC")
-        conditions: dict[str, tuple[Any, ...]] = {
-            "time_ns >= ?": (query.since_ns,),
-            "time_ns <= ?": (query.until_ns,),
-            "confidence >= ?": (query.min_confidence,),
-            f"(time_ns, number) {beyond} (?, ?)": query.before or (None,),
-            "EXISTS (SELECT 1 FROM json_each(events.json, '$.zones') WHERE value = ?)": (query.zone,),
-        }
-        used = {text: values for text, values in conditions.items() if values != (None,)}
-        where = f"WHERE {' AND '.join(used)} " if used else ""
-        ordered = f"ORDER BY time_ns {order}, number {order} LIMIT ?"
-        sql = f"SELECT time_ns, number, json FROM events {where}{ordered}"  # noqa: S608 - fixed texts
-        rows = self._reading.rows(sql, (*(value for values in used.values() for value in values), query.limit + 1))
-        page = rows[: query.limit]
-        next_page = Cursor(*page[-1][:2]) if len(rows) > query.limit else None
-        return [json.loads(text) for _, _, text in page], next_page
+        """Return events, newest first unless the query says otherwise, and the cursor of the next page or None."""
+        page = self.page(query)
+        return [row.event for row in page.rows], page.older
 
-    def count(self) -> int:
-        """Return the number of events."""
-        return int(self._reading.rows("SELECT count(*) FROM events")[0][0])
+    def scan(self, query: Query) -> Iterator[Sequence[Row]]:
+        """Yield all events that a query admits, newest first, a page at a time; between pages nothing is locked."""
+        following: Query | None = replace(query, limit=SCANNED_AT_ONCE)
+        while following is not None:
+            page = self.page(following)
+            if page.rows:
+                yield page.rows
+            following = None if page.older is None else replace(following, before=page.older)
+
+    def heat_map(self, query: Query, cells: Cells) -> HeatMap:
+        """Return how many of the events that a query admits lie in each cell of a floor plan."""
+        self.backlog.settle()
+        with self._database.reading() as connection:
+            return count_by_cell(connection, query, cells)
+
+    def count(self) -> int | None:
+        """Return the number of events; None as long as the database could not be read."""
+        with self._counting:
+            return self._count
 
     def close(self) -> None:
-        """Release the file."""
-        for connection in (self._reading, self._writing):
-            with connection.lock:
-                connection.db.close()
+        """Write what waits, and release the database."""
+        self.backlog.stop()
+        self._database.close()
 
-
-class _Connection:
-    """A connection to the database, and the lock that guards its use."""
-
-    def __init__(self, path: Path | str) -> None:
-        self.lock = threading.Lock()
-        uri = str(path).startswith("file:")
-        self.db = sqlite3.connect(path, timeout=BUSY_S, check_same_thread=False, uri=uri)
-
-    def rows(self, sql: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """Return all rows of a query."""
-        with self.lock:
-            return self.db.execute(sql, values).fetchall()
+    def _counted(self, change: int) -> None:
+        with self._counting:
+            if self._count is not None:
+                self._count += change

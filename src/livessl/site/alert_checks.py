@@ -9,6 +9,7 @@ from typing import Final
 
 from livessl.site.alert_models import AlertRule
 from livessl.site.findings import unknown_array
+from livessl.site.history_place import history_place
 from livessl.site.models import Site
 from livessl.site.place import Finding, Place
 
@@ -22,7 +23,8 @@ def outbox_file(site: Site) -> Path | None:
     """Return the file of what alerts must not forget; None keeps it in memory."""
     if site.alerts.outbox is not None:
         return site.file(site.alerts.outbox)
-    return None if site.server.events_db is None else site.file(site.server.events_db).with_name(OUTBOX)
+    place = history_place(site)
+    return place.with_name(OUTBOX) if isinstance(place, Path) else None
 
 
 def alert_faults(site: Site) -> Iterator[Finding]:

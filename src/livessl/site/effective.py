@@ -88,8 +88,7 @@ def _measured(site: Site) -> set[str]:
 
 def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | None:
     """Return the uncertainty of an array that the calibration file gives; None for any other setting."""
-    section, *rest = (*setting.place, "", "", "")
-    array, group, key = rest[:3]
+    section, array, group, key = (*setting.place, "", "", "", "")[:4]
     if section != "arrays" or array not in measured or group != "uncertainty" or setting.line is not None:
         return None
     if key not in ("", "position_m", "orientation_deg"):

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
 from livessl.site.fields import FileName, Model, Positive
+from livessl.site.history_place import check_history_place
 from livessl.site.sink_types import check_sink_type
 
 
@@ -76,7 +77,7 @@ class ServerConfig(Model):
 
     bind: str = "tcp://127.0.0.1:5570"
     http: HttpConfig = HttpConfig()
-    events_db: str | None = None
+    events_db: Annotated[str | None, AfterValidator(check_history_place)] = None
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
     listen: bool = False

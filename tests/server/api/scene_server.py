@@ -44,7 +44,7 @@ def replay_scene(server: Server) -> None:
     server.wait_idle()
 
 
-def get(client: httpx.Client, path: str, status: int = 200, **query: Any) -> dict[str, Any]:
+def get(client: httpx.Client, path: str, status: int = 200, /, **query: Any) -> dict[str, Any]:
     """Answer to a request of the API, whose status is checked."""
     response = client.get(f"/api/v1/{path}", params=query)
     assert response.status_code == status, response.text

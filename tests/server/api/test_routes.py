@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import re
@@ -21,8 +23,10 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from livessl.clock import utc_ns, utc_text
+from livessl.server.api import history_routes
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
+from livessl.server.store import Store
 from livessl.site.tokens import add_token
 from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
 
@@ -32,7 +36,11 @@ ROUTES = {
     "/api/v1/arrays",
     "/api/v1/arrays/{name}/enabled",
     "/api/v1/events",
+    "/api/v1/events.csv",
+    "/api/v1/events.jsonl",
+    "/api/v1/events.parquet",
     "/api/v1/events/{event_id}",
+    "/api/v1/history/heat-map",
     "/api/v1/tracks",
     "/api/v1/map",
     "/api/v1/findings",
@@ -51,6 +59,10 @@ ROUTES = {
     "/api/v1/zones/{name}",
     "/api/v1/zone-changes",
     "/api/v1/floor-plan",
+    "/api/v1/clips",
+    "/api/v1/events/{event_id}/clips",
+    "/api/v1/events/{event_id}/clips/keep",
+    "/api/v1/events/{event_id}/clips/{name}",
     "/metrics",
 }
 """Every promised path but the WebSockets, which OpenAPI cannot describe."""
@@ -64,6 +76,8 @@ CHANGES = {
     "/dead-letters": {"get", "delete"},
     "/dead-letters/{number}": {"delete"},
     "/zones/{name}": {"put", "delete"},
+    "/{event_id}/clips": {"get", "delete"},
+    "/clips/keep": {"put"},
 }
 """Methods of the paths that are not only read, by their ends."""
 
@@ -95,7 +109,10 @@ def test_openapi_is_complete(client: httpx.Client) -> None:
         assert set(methods) == wanted, path
         assert all(method["description"] for method in methods.values()), path
     parameters = {p["name"] for p in described["paths"]["/api/v1/events"]["get"]["parameters"]}
-    assert parameters == {"since", "until", "zone", "min_confidence", "limit", "cursor"}
+    filters = {"since", "until", "zone", "status", "min_confidence", "min_level_dbfs", "array", "text"}
+    assert parameters == filters | {"limit", "cursor", "after"}
+    for path in ("/api/v1/events.csv", "/api/v1/events.jsonl", "/api/v1/events.parquet"):
+        assert {p["name"] for p in described["paths"][path]["get"]["parameters"]} == filters
     assert set(described["paths"]["/api/v1/map"]["get"]["responses"]) >= {"200", "204", "422"}
 
 
@@ -190,6 +207,69 @@ def test_events_page_by_page(client: httpx.Client) -> None:
     second = get(client, "events", limit=1, cursor=first["next_cursor"])
     assert second["events"] == [oldest]
     assert second["next_cursor"] is None
+    back = get(client, "events", limit=1, after=second["previous_cursor"])
+    assert back["events"] == [newest]
+    nothing = get(client, "events", after=back["previous_cursor"])
+    assert (nothing["events"], nothing["previous_cursor"]) == ([], back["previous_cursor"])
+
+
+def test_events_by_status_array_level_and_text(client: httpx.Client) -> None:
+    newest, oldest = get(client, "events")["events"]
+    both, neither = [newest, oldest], list[Any]()
+    loud = max(newest, oldest, key=lambda event: event["level_dbfs"])
+    for filters, expected in (
+        ({"status": "located"}, both),
+        ({"status": "refused"}, neither),
+        ({"array": "north", "zone": "room"}, both),
+        ({"min_level_dbfs": loud["level_dbfs"]}, [loud]),
+        ({"text": newest["id"].upper()}, [newest]),
+        ({"text": "nowhere"}, neither),
+    ):
+        assert get(client, "events", **filters)["events"] == expected, filters
+
+
+def test_unchanged_answer_is_not_sent_again(client: httpx.Client) -> None:
+    event_id = get(client, "events")["events"][0]["id"]
+    for path in ("events", f"events/{event_id}", "history/heat-map"):
+        first = client.get(f"/api/v1/{path}")
+        for known in (first.headers["ETag"], f'"other", W/{first.headers["ETag"]}'):
+            again = client.get(f"/api/v1/{path}", headers={"If-None-Match": known})
+            assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", first.headers["ETag"])
+        assert client.get(f"/api/v1/{path}", headers={"If-None-Match": '"other"'}).status_code == 200
+
+
+def test_exports_are_files_of_the_same_events(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = get(client, "events")["events"]
+    lines = client.get("/api/v1/events.jsonl")
+    assert [json.loads(line) for line in lines.text.splitlines()] == events
+    table = client.get("/api/v1/events.csv", params={"text": events[0]["id"]})
+    assert table.headers["Content-Disposition"] == 'attachment; filename="small-events.csv"'
+    assert [row["id"] for row in csv.DictReader(io.StringIO(table.text, newline=""))] == [events[0]["id"]]
+    assert client.get("/api/v1/events.parquet").content.startswith(b"PAR1")
+    assert client.get("/api/v1/events.csv", params={"limit": 1}).status_code == 422
+    monkeypatch.setattr(Store, "scan", None)  # HEAD reads no event
+    head = client.head("/api/v1/events.csv")
+    assert (head.status_code, head.headers["Content-Disposition"]) == (200, table.headers["Content-Disposition"])
+
+
+def test_export_without_its_library_says_what_to_install(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history_routes, "find_spec", lambda name: None)
+    answer = client.get("/api/v1/events.parquet")
+    assert (answer.status_code, answer.json()["detail"]) == (
+        501,
+        "Parquet needs the package pyarrow; pip install 'livessl[export]'",
+    )
+
+
+def test_heat_map_has_each_event_in_its_cell(client: httpx.Client) -> None:
+    found = get(client, "history/heat-map", spacing_m=0.5)
+    assert (found["bounds_m"], found["shape"], found["events"]) == ([[0, 4], [0, 5]], [8, 10], 2)
+    for event in get(client, "events")["events"]:
+        x_m, y_m, _ = event["position_m"]
+        assert found["counts"][int(x_m / 0.5)][int(y_m / 0.5)] >= 1
+    assert get(client, "history/heat-map", status="refused")["events"] == 0
+    picture = client.get("/api/v1/history/heat-map", params={"format": "png"})
+    assert picture.content.startswith(b"\x89PNG")
 
 
 def test_events_of_a_time(client: httpx.Client) -> None:
@@ -225,6 +305,12 @@ def test_events_of_a_zone_and_confidence(client: httpx.Client) -> None:
         ({"limit": 0}, 422, "greater than or equal to 1"),
         ({"limit": 1001}, 422, "less than or equal to 1000"),
         ({"limit": "many"}, 422, "valid integer"),
+        ({"status": "lost"}, 422, "'located', 'direction-only' or 'refused'"),
+        ({"array": "west"}, 404, "no array 'west'; there are north, south"),
+        ({"min_level_dbfs": "loud"}, 422, "valid number"),
+        ({"text": ""}, 422, "at least 1 character"),
+        ({"after": "rubbish"}, 422, "after: expected the next_cursor"),
+        ({"after": "1-1", "cursor": "1-1"}, 422, "expected cursor or after, got both"),
         ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of the page before, got 'rubbish'"),
         ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of the page before"),
     ],
@@ -251,23 +337,33 @@ def test_health(client: httpx.Client, fresh: httpx.Client) -> None:
 
 
 def test_events_are_published_while_the_database_is_locked(tmp_path: Path) -> None:
-    """Health and metrics report that the history of these events is lost."""
+    """Health and metrics report that these events wait; they are stored when the file is free."""
     path = tmp_path / "events.db"
     with running_server(site_of({"server.events_db": str(path)})) as server, closing(sqlite3.connect(path)) as other:
         other.execute("BEGIN IMMEDIATE")
         with live(server, "?kinds=event") as socket:
             replay_scene(server)
             kinds = [json.loads(socket.recv(timeout=HANG_S))["kind"] for _ in range(3)]
-        other.rollback()
         assert kinds == ["hello", "event", "event"]
         with httpx.Client(base_url=server.url) as client:
-            assert get(client, "events")["events"] == []
-            assert "\nlivessl_events_unkept_total 2.0\n" in client.get("/metrics").text
             cure = "free space on its disk, or close the program that locks the file"
-            lost = f"server.events_db: 2 events were not stored; {cure}"
-            assert lost in get(client, "health")["reasons"]
-            replay_scene(server)
+            waits = f"server.events_db: 2 events wait to be stored; {cure}"
+            wait_until(lambda: waits in get(client, "health")["reasons"], "a first attempt")
+            assert get(client, "events")["events"] == []
+            assert "\nlivessl_events_unsaved 2.0\n" in client.get("/metrics").text
+            other.rollback()
             wait_until(lambda: len(get(client, "events")["events"]) == 2, "both events, now that the file is free")
+            assert "\nlivessl_events_unkept_total 0.0\n" in client.get("/metrics").text
+
+
+def test_search_without_a_database_says_what_to_do(tmp_path: Path) -> None:
+    with running_server(site_of({"server.events_db": "postgresql://127.0.0.1:1/events"})) as server:
+        for path in ("events", "events/small-1", "history/heat-map"):
+            answer = httpx.get(f"{server.url}/api/v1/{path}")
+            assert (answer.status_code, "see that PostgreSQL runs" in answer.json()["detail"]) == (503, True)
+        assert "livessl_events_stored" not in httpx.get(f"{server.url}/metrics").text
+        health = httpx.get(f"{server.url}/api/v1/health").json()
+        assert (health["status"], "cannot use" in " ".join(health["reasons"])) == ("starting", True)
 
 
 def test_metrics(client: httpx.Client) -> None:

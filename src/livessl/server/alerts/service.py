@@ -29,7 +29,7 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
-from livessl.server.store import Store
+from livessl.server.store import Store, StoreError
 from livessl.server.zones.shapes import ZoneMap, fixed_zones
 from livessl.site.alert_checks import outbox_file
 from livessl.site.models import Site
@@ -253,7 +253,7 @@ class Alerts:
                     caught_up = True
                 self._turn()
                 self._is_failing = False
-            except (OutboxError, sqlite3.Error) as error:
+            except (OutboxError, StoreError, sqlite3.Error) as error:
                 if not self._is_failing:
                     _log.error("%s", error)
                 self._is_failing, wait_s = True, REST_S

@@ -176,10 +176,30 @@ class EventPage(_Versioned):
         description="Cursor of the next page: pass it unchanged as `cursor` and treat it as opaque. Null at the end.",
         examples=["1767225600050000000-17"],
     )
+    previous_cursor: str | None = Field(
+        description="Cursor of the first event: pass it unchanged as `after` for events that are newer, now or later. "
+        "Null if no event was found.",
+        examples=["1767225900050000000-42"],
+    )
 
 
 class OneEvent(_Versioned, Event):
     """One event."""
+
+
+class HeatMap(_Versioned):
+    """Number of events in each square cell of the floor plan."""
+
+    since_utc: UtcTime | None = Field(description="Earliest start of an event; null for the beginning.")
+    until_utc: UtcTime | None = Field(description="Latest start of an event; null for now.")
+    bounds_m: Annotated[list[IntervalM], Field(min_length=2, max_length=2)] = Field(
+        description="Intervals in x and y; the last cells may reach beyond.", examples=[[[0, 8], [0, 10]]]
+    )
+    spacing_m: float = Field(gt=0, description="Edge of a cell in metres.", examples=[0.25])
+    shape: list[int] = Field(min_length=2, max_length=2, description="Number of cells in x and y.", examples=[[32, 40]])
+    counts: list[list[int]] = Field(description="Number of events by x and y, from the lowest coordinates on.")
+    events: int = Field(ge=0, description="Number of events in all cells.", examples=[123])
+    elsewhere: int = Field(ge=0, description="Number of events outside the cells or without a position.", examples=[4])
 
 
 class Secured(BaseModel):
@@ -335,7 +355,8 @@ _REASONS: Final = {
     411: "The body's length is not declared.",
     413: "The body is too long.",
     422: "A parameter or the body is not valid, or a parameter is unknown.",
-    503: "The event database cannot be written.",
+    501: "A library that it needs is not installed.",
+    503: "The event database cannot be used.",
 }
 
 Responses = dict[int | str, dict[str, Any]]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fastapi import Depends, FastAPI, Request, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -22,6 +22,7 @@ from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.clip_routes import clip_routes
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
@@ -30,6 +31,7 @@ from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.set_up_routes import set_up_routes
 from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
+from livessl.server.store import StoreError
 
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""
@@ -80,7 +82,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.state_routes(parts),
         routes.switch_route(parts),
         routes.access_route(parts, access),
-        routes.event_routes(parts),
+        history_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
         dead_letter_routes(parts),
@@ -94,14 +96,24 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     app.include_router(asyncapi_route(site, access))
     documentation.add_documentation(app)
 
+    app.add_exception_handler(StoreError, _without_database)
+
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
         return FileResponse(STATIC / "index.html")
+
+    @app.get("/history", include_in_schema=False)
+    async def history_page() -> FileResponse:
+        return FileResponse(STATIC / "history.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     if access.wanted:
         _describe_tokens(app.openapi())
     return app
+
+
+async def _without_database(_request: Request, error: Exception) -> Response:
+    return JSONResponse({"detail": str(error)}, 503)
 
 
 async def _with_safe_headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
@@ -136,4 +148,4 @@ class _HeadAsGet:
                 message = {**message, "body": b""}
             await send(message)
 
-        await self._app({**scope, "method": "GET"}, receive, send_head)
+        await self._app({**scope, "method": "GET", "head_only": True}, receive, send_head)

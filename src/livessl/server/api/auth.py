@@ -198,7 +198,7 @@ def needed_role(method: str, path: str) -> Role | None:
 
     Every path is covered: a route that is added later is guarded from the start.
     """
-    if method in _READING and (path in ("/", "/docs", HEALTH) or path.startswith(("/static/", "/docs/"))):
+    if method in _READING and (path in ("/", "/docs", "/history", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
     if path == ACCESS:
         return Role.ADMIN

@@ -105,7 +105,9 @@ def event_metrics(parts: Parts) -> Iterator[Metric]:
     yield CounterMetricFamily("livessl_events", "Events published since the server started.", log.published)
     yield CounterMetricFamily("livessl_events_unkept", "Events that could not be stored.", log.unkept)
     yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait to be stored.", log.unsaved)
-    yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", parts.store.count())
+    stored = parts.store.count()
+    if stored is not None:
+        yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", stored)
     yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not accept.", parts.sinks.failures)
 
 

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Final
 
 from fastapi import HTTPException, Request
+from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field
 
@@ -73,7 +74,7 @@ async def refuse_unknown_parameters(request: Request) -> None:
     if not request.query_params:
         return
     route: APIRoute = request.scope["route"]
-    known = [parameter.alias for parameter in route.dependant.query_params]
+    known = _query_parameters(route.dependant)
     faults = [
         {"type": "extra_forbidden", "loc": ["query", name], "msg": unknown_parameter(name, known), "input": value}
         for name, value in request.query_params.items()
@@ -81,6 +82,12 @@ async def refuse_unknown_parameters(request: Request) -> None:
     ]
     if faults:
         raise HTTPException(422, faults)
+
+
+def _query_parameters(dependant: Dependant) -> list[str]:
+    """Names of the query parameters of a route and of what it depends on."""
+    here = [parameter.alias for parameter in dependant.query_params]
+    return here + [name for other in dependant.dependencies for name in _query_parameters(other)]
 
 
 def unknown_parameter(name: str, known: Collection[str]) -> str:
@@ -123,8 +130,8 @@ def instant(name: str, text: str | None) -> int | None:
     return max(-(2**63), min(2**63 - 1, time_ns))
 
 
-def page_cursor(text: str | None) -> Cursor | None:
-    """The place in the list of events that a page's `next_cursor` stands for.
+def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
+    """The place in the list of events that a page's `next_cursor` or `previous_cursor` stands for.
 
     Raises
     ------
@@ -134,7 +141,7 @@ def page_cursor(text: str | None) -> Cursor | None:
     try:
         return None if text is None else Cursor.parse(text)
     except ValueError as error:
-        raise unprocessable("cursor", f"cursor: {error}") from error
+        raise unprocessable(name, f"{name}: {error}") from error
 
 
 def live_filter(zones: Collection[str], kinds: str | None, min_confidence: str, zone: str | None) -> Filter:

@@ -20,11 +20,10 @@ from livessl.server.api.answers import errors
 from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
-from livessl.server.api.queries import array_names, instant, map_names, page_cursor, unprocessable
+from livessl.server.api.queries import array_names, map_names, unprocessable
 from livessl.server.maps import FUSED, bounds_of_view_m, projection
 from livessl.server.parts import Parts
-from livessl.server.store import CURE, StoreError
-from livessl.server.store import Query as EventQuery
+from livessl.server.store import StoreError
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 
@@ -161,10 +160,12 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
     unkept, unsaved = parts.event_log.unkept, parts.event_log.unsaved
     if unkept:
-        reasons.append(f"server.events_db: {unkept} events were not stored; {CURE}")
+        reasons.append(f"server.events_db: {unkept} events were not stored; {parts.store.cure}")
     if unsaved:
-        reasons.append(f"server.events_db: {unsaved} events wait to be stored; {CURE}")
-    if (unkept or unsaved) and status == "ok":
+        reasons.append(f"server.events_db: {unsaved} events wait to be stored; {parts.store.cure}")
+    if parts.store.problem is not None:
+        reasons.append(parts.store.problem)
+    if (unkept or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if problems and status == "ok":
@@ -220,53 +221,6 @@ def access_route(parts: Parts, access: Access) -> APIRouter:
             ],
         }
         return as_json(found)
-
-    return router
-
-
-def event_routes(parts: Parts) -> APIRouter:
-    """The history of events."""
-    store, router = parts.store, APIRouter()
-
-    @router.get(
-        "/api/v1/events",
-        tags=["estimates"],
-        response_model=answers.EventPage,
-        responses=errors(404, texts={404: "There is no zone of that name."}),
-    )
-    def get_events(
-        since: Annotated[Time | None, Query(description="only events that began then or later; RFC 3339")] = None,
-        until: Annotated[Time | None, Query(description="only events that began then or earlier; RFC 3339")] = None,
-        zone: Annotated[str | None, Query(description="only events inside this zone")] = None,
-        min_confidence: Annotated[
-            float | None, Query(ge=0, le=1, description="only events of at least this confidence")
-        ] = None,
-        limit: Annotated[int, Query(ge=1, le=1000, description="most events on a page")] = 50,
-        cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page, unchanged")] = None,
-    ) -> Response:
-        """Finished events, newest first."""
-        zones = parts.zone_book.current.zones
-        if zone is not None and zone not in zones:
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
-        query = EventQuery(
-            instant("since", since), instant("until", until), zone, min_confidence, limit, page_cursor(cursor)
-        )
-        events, following = store.find(query)
-        next_cursor = None if following is None else str(following)
-        return as_json({"v": API_VERSION, "events": events, "next_cursor": next_cursor})
-
-    @router.get(
-        "/api/v1/events/{event_id}",
-        tags=["estimates"],
-        response_model=answers.OneEvent,
-        responses=errors(404, texts={404: "There is no event of that id."}),
-    )
-    def get_event(event_id: str) -> Response:
-        """One event."""
-        event = store.get(event_id)
-        if event is None:
-            raise HTTPException(404, f"no event {event_id!r}")
-        return as_json({"v": API_VERSION, **event})
 
     return router
 

@@ -36,11 +36,14 @@ export const remove = (url) => request(url, { method: "DELETE" });
 export const post = (url, value) =>
   request(url, { method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
 
+/** Read a resource whose answer may take long. */
+export const getStream = (url) => request(url, { signal: null });
+
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);
   const headers = token === null ? { ...others } : { ...others, Authorization: `Bearer ${token}` };
   const signal = AbortSignal.timeout(TIMEOUT_MS);
-  const response = await fetch(url, { ...options, cache: "no-store", headers, signal });
+  const response = await fetch(url, { signal, ...options, cache: "no-store", headers });
   const isCurrent = token === sessionStorage.getItem(STORAGE_KEY); // it may have been entered since the request was sent
   if (response.status === 401 && isCurrent) tokenNeeded(token !== null);
   return response;

@@ -1,0 +1,290 @@
+"""Connections to the database of the history: SQLite in memory or in a file, or PostgreSQL, with its tables made."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, SQLAlchemyError
+from sqlalchemy.pool import QueuePool
+
+from livessl.errors import ConfigError, Fault, RunError
+from livessl.server.history.tables import metadata
+
+HEAD: Final = "0002"
+"""The newest revision in `migrations/`; a database that has it needs no Alembic."""
+
+BUSY_S: Final = 0.2
+"""Longest wait, in seconds, for an SQLite file that another program has locked."""
+
+CONNECT_S: Final = 3
+"""Longest wait, in seconds, for a connection to PostgreSQL."""
+
+STATEMENT_S: Final = 30
+"""Longest time, in seconds, that PostgreSQL may take for one statement of a search or an insertion."""
+
+MIGRATION_LOCK: Final = 0x11_7E_55_1
+"""Number of the PostgreSQL lock that is held during migrations, so that of two servers one waits."""
+
+READERS: Final = 4
+"""Connections for reading that are kept open."""
+
+UNLOCK: Final = "close the program that locks the file"
+CURE: Final = f"free space on its disk, or {UNLOCK}"
+"""Cures of an SQLite file that cannot be written."""
+
+CURE_OF_SERVER: Final = "see that PostgreSQL runs, has space, and admits this user"
+"""Cure of a PostgreSQL database that cannot be used."""
+
+
+class StoreError(RunError):
+    """The database cannot be read or written."""
+
+
+class RejectedError(StoreError):
+    """The database refuses what it was given, and would refuse it again."""
+
+
+class Database:
+    """A connection for writing and some for reading, so that no slow search delays an event; every thread may use it.
+
+    Parameters
+    ----------
+    place : Path, str or None
+        An SQLite file, the URL of a PostgreSQL database, or None for SQLite in memory.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be used. A PostgreSQL server may come later: see `prepare`.
+    ConfigError
+        If the driver of PostgreSQL is not installed.
+    """
+
+    def __init__(self, place: Path | str | None) -> None:
+        self.is_remote = isinstance(place, str)
+        self.cure = CURE_OF_SERVER if self.is_remote else CURE
+        """What to do if the database cannot be written."""
+        self._preparing = threading.Lock()
+        self._is_prepared = False
+        self._problem = ""
+        if isinstance(place, str):
+            self.name = make_url(place).render_as_string(hide_password=True)
+            self._writing = _postgresql(place, readers=0)
+            self._reading = _postgresql(place, readers=READERS)
+        elif place is None:
+            self.name = "memory"
+            self._writing = self._reading = _sqlite(":memory:", 1, writes=True)
+        else:
+            self.name = str(place)
+            self._writing = _sqlite(str(place), 1, writes=True)
+            self._reading = _sqlite(f"{place.resolve().as_uri()}?mode=ro", READERS, writes=False)
+        self._in_memory = place is None
+
+    @property
+    def is_prepared(self) -> bool:
+        """True once the tables are known to be there."""
+        return self._is_prepared
+
+    @property
+    def problem(self) -> str | None:
+        """Why the tables could not be prepared yet; None if they are."""
+        return None if self._is_prepared else self._problem
+
+    def prepare(self) -> bool:
+        """Make or migrate the tables, once, before anything else; return True if this call has done it.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be reached or used.
+        """
+        if self._is_prepared:
+            return False
+        with self._preparing:
+            if self._is_prepared:
+                return False
+            try:
+                with self._writing.begin() as connection:
+                    if self._in_memory:
+                        metadata.create_all(connection)
+                    else:
+                        _migrate(connection)
+            except (SQLAlchemyError, KeyError, TypeError, ValueError) as error:  # the last ones: of a damaged old event
+                cure = CURE_OF_SERVER if self.is_remote else "name a file in a writable folder"
+                self._problem = f"server.events_db: cannot use {self.name}: {told(error)}; {cure}"
+                raise StoreError(self._problem) from error
+            self._is_prepared = True
+        return True
+
+    @contextmanager
+    def writing(self, what: str) -> Iterator[Connection]:
+        """A transaction that is kept if its block ends, and else undone.
+
+        Parameters
+        ----------
+        what : str
+            What is done, for the error: "cannot WHAT".
+
+        Raises
+        ------
+        StoreError
+            If it cannot be done.
+        """
+        self._check()
+        try:
+            with self._writing.begin() as connection:
+                yield connection
+        except (DataError, IntegrityError) as error:
+            raise RejectedError(f"server.events_db: cannot {what}: {told(error)}") from error
+        except SQLAlchemyError as error:
+            raise StoreError(f"server.events_db: cannot {what}: {told(error)}; {self.cure}") from error
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection that sees one state of the database, and cannot change it.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be read.
+        """
+        self._check()
+        try:
+            with self._reading.connect() as connection:
+                yield connection
+        except SQLAlchemyError as error:
+            cure = CURE_OF_SERVER if self.is_remote else UNLOCK
+            raise StoreError(f"server.events_db: cannot read: {told(error)}; {cure}") from error
+
+    def erase(self) -> None:
+        """Remove deleted rows from an SQLite file's journal; PostgreSQL's own vacuum does it there.
+
+        Raises
+        ------
+        StoreError
+            If the file is locked.
+        """
+        if self.is_remote or self._in_memory:
+            return
+        try:
+            with self._writing.connect() as connection:
+                driver: Any = connection.connection.dbapi_connection  # outside of any transaction
+                busy, *_ = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        except (SQLAlchemyError, sqlite3.Error) as error:
+            raise StoreError(f"server.events_db: old events were not erased: {told(error)}; {UNLOCK}") from error
+        if busy:
+            raise StoreError(f"server.events_db: its journal was not emptied of old events; {UNLOCK}")
+
+    def _check(self) -> None:
+        """Raise the error of the last `prepare`, so that nobody waits for a server that is known to be away."""
+        if not self._is_prepared:
+            raise StoreError(self._problem)
+
+    def close(self) -> None:
+        """Release the database."""
+        self._reading.dispose()
+        self._writing.dispose()
+
+
+def told(error: Exception) -> str:
+    """Return what the driver says, in one line and without the statement."""
+    cause = error.orig if isinstance(error, DBAPIError) else error
+    return " ".join(str(cause).split())
+
+
+def upgrade(connection: Connection) -> None:
+    """Apply all migrations that the database lacks, in the transaction of the connection."""
+    from alembic import command  # most starts do not need it, and it takes a while to load
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+def _migrate(connection: Connection) -> None:
+    if connection.dialect.name == "postgresql":
+        connection.execute(text("SELECT pg_advisory_xact_lock(:number)"), {"number": MIGRATION_LOCK})
+        connection.execute(text("SET LOCAL statement_timeout = 0"))
+    if inspect(connection).has_table("alembic_version"):
+        revision = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        if revision == HEAD:
+            return
+        if revision is not None and revision > HEAD:
+            raise StoreError(
+                f"server.events_db: expected a database of revision {HEAD} or before, got {revision} of a newer "
+                "livessl; update livessl, or name another database"
+            )
+    upgrade(connection)
+
+
+def _sqlite(name: str, connections: int, *, writes: bool) -> Engine:
+    """Return an engine for an SQLite file or URI, or for one in memory, whose only connection is never closed."""
+
+    def connect() -> sqlite3.Connection:
+        return sqlite3.connect(
+            name, timeout=BUSY_S, isolation_level=None, check_same_thread=False, uri=name.startswith("file:")
+        )
+
+    engine = create_engine(
+        "sqlite://",
+        creator=connect,
+        poolclass=QueuePool,
+        pool_size=connections,
+        max_overflow=0,
+        pool_reset_on_return="rollback",
+    )
+    _on_connect(engine, _set_up_for_writing if writes else _set_up_for_reading)
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    return engine
+
+
+def _on_connect(engine: Engine, set_up: Callable[[Any], None]) -> None:
+    @event.listens_for(engine, "connect")
+    def _connected(driver: Any, _record: Any) -> None:
+        set_up(driver)
+
+
+def _set_up_for_writing(driver: Any) -> None:
+    driver.execute("PRAGMA journal_mode=WAL")
+    driver.execute("PRAGMA secure_delete=ON")  # deleted rows are overwritten
+
+
+def _set_up_for_reading(driver: Any) -> None:
+    driver.execute("PRAGMA query_only=ON")
+
+
+def _postgresql(url: str, *, readers: int) -> Engine:
+    if find_spec("psycopg") is None:
+        what = "PostgreSQL needs the package psycopg; pip install 'livessl[postgres]'"
+        raise ConfigError([Fault("server.events_db", what)])
+    made = make_url(url).set(drivername="postgresql+psycopg")
+    options = f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout={STATEMENT_S * 1000}"
+    if readers:
+        options += " -c default_transaction_read_only=on"
+    arguments: dict[str, Any] = {
+        "connect_timeout": CONNECT_S,
+        "application_name": "livessl",
+        "tcp_user_timeout": 1000 * CONNECT_S,
+        "keepalives_idle": 10,
+    }
+    given = {name: arguments[name] for name in arguments if name not in made.query}
+    return create_engine(
+        made,
+        pool_size=readers or 1,
+        max_overflow=0,
+        pool_pre_ping=True,
+        connect_args={**given, "options": f"{options} {made.query.get('options', '')}".strip()},
+    )

@@ -1,0 +1,71 @@
+"""How many events lie in each cell of a floor plan, counted by the database."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, func, select, text
+
+from livessl.server.history.query import Query
+from livessl.server.history.search import matching
+from livessl.server.history.tables import events
+
+
+class Cells(NamedTuple):
+    """Square cells of a floor plan, in millimetres.
+
+    Parameters
+    ----------
+    low_mm : (int, int)
+        Lowest x and y.
+    high_mm : (int, int)
+        Highest x and y; the last cells may reach beyond.
+    spacing_mm : int
+        Edge of a cell.
+    """
+
+    low_mm: tuple[int, int]
+    high_mm: tuple[int, int]
+    spacing_mm: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of cells in x and y."""
+        nx, ny = (
+            max(1, -((low - high) // self.spacing_mm)) for low, high in zip(self.low_mm, self.high_mm, strict=True)
+        )
+        return nx, ny
+
+
+class HeatMap(NamedTuple):
+    """Counts of events.
+
+    Parameters
+    ----------
+    counts : ndarray of int, shape (nx, ny)
+    elsewhere : int
+        Events outside the cells, or without a position.
+    """
+
+    counts: NDArray[np.int64]
+    elsewhere: int
+
+
+def count_by_cell(connection: Connection, query: Query, cells: Cells) -> HeatMap:
+    """Return how many of the events that a query admits lie in each cell.
+
+    Those on the last edges are in the last cells. The pages of the query do not matter.
+    """
+    places = [events.c.x_mm, events.c.y_mm]
+    indices = [(place - low) // cells.spacing_mm for place, low in zip(places, cells.low_mm, strict=True)]
+    statement, _ = matching(query, *indices, func.count())
+    for place, low, high in zip(places, cells.low_mm, cells.high_mm, strict=True):
+        statement = statement.where(place >= low, place <= high)
+    counts = np.zeros(cells.shape, dtype=np.int64)
+    for i, j, count in connection.execute(statement.group_by(text("1"), text("2"))):
+        counts[min(i, cells.shape[0] - 1), min(j, cells.shape[1] - 1)] += count
+    everything, _ = matching(query, events.c.number)
+    total = connection.execute(select(func.count()).select_from(everything.subquery())).scalar_one()
+    return HeatMap(counts, int(total) - int(counts.sum()))

@@ -1,0 +1,11 @@
+"""What Alembic runs to apply migrations: on the connection, and in the transaction, of its caller."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from livessl.server.history.tables import metadata
+
+context.configure(connection=context.config.attributes["connection"], target_metadata=metadata)
+with context.begin_transaction():
+    context.run_migrations()

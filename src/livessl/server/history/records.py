@@ -1,0 +1,120 @@
+"""What is written into the history: statements on a connection whose transaction the caller ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import orjson
+from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
+
+from livessl.core.types import FRAME_NS
+from livessl.server.history.query import JsonObject
+from livessl.server.history.tables import disabled, early, event_row, events, progress, tag_rows, tags
+
+_INSERT_EVENT = insert(events)
+_INSERT_TAG = insert(tags)
+_UPDATE_EVENT = (
+    update(events)
+    .where(events.c.number == bindparam("place"))
+    .values({name: bindparam(name) for name in events.c.keys() if name != "number"})  # noqa: SIM118 - not a dict
+)
+
+
+def put_events(connection: Connection, given: Sequence[tuple[JsonObject, int]]) -> int:
+    """Store events, each with its start in nanoseconds; one of a known id replaces it in its place.
+
+    Returns
+    -------
+    int
+        Number of new events.
+    """
+    latest = {event["id"]: (event, time_ns) for event, time_ns in given}
+    if not latest:
+        return 0
+    before = _numbers(connection, list(latest))
+    rows = {name: event_row(event, time_ns) for name, (event, time_ns) in latest.items()}
+    if before:
+        connection.execute(delete(tags).where(tags.c.number.in_(list(before.values()))))
+        connection.execute(_UPDATE_EVENT, [{**rows[name], "place": number} for name, number in before.items()])
+    new = [row for name, row in rows.items() if name not in before]
+    if new:
+        connection.execute(_INSERT_EVENT, new)
+    numbers = before | (_numbers(connection, [row["id"] for row in new]) if new else {})
+    tagged = [row for name, (event, _) in latest.items() for row in tag_rows(event, rows[name], numbers[name])]
+    if tagged:
+        connection.execute(_INSERT_TAG, tagged)
+    return len(new)
+
+
+def remove_events(connection: Connection, ids: Iterable[str]) -> int:
+    """Delete the events of these ids; return how many there were."""
+    names = list(ids)
+    return remove_numbers(connection, list(_numbers(connection, names).values())) if names else 0
+
+
+def remove_numbers(connection: Connection, numbers: Sequence[int]) -> int:
+    """Delete the events of these numbers; return how many there were."""
+    if not numbers:
+        return 0
+    connection.execute(delete(tags).where(tags.c.number.in_(numbers)))
+    return connection.execute(delete(events).where(events.c.number.in_(numbers))).rowcount
+
+
+def remove_older(connection: Connection, before_ns: int, most: int) -> int:
+    """Delete the oldest events that began before a time, a limited number of them; return how many."""
+    query = select(events.c.number).where(events.c.time_ns < before_ns).order_by(events.c.time_ns).limit(most)
+    return remove_numbers(connection, connection.execute(query).scalars().all())
+
+
+def keep_newest(connection: Connection, most: int) -> int:
+    """Delete the events that were stored first, so that at most so many stay; return how many."""
+    newest = connection.execute(select(func.max(events.c.number))).scalar()
+    if newest is None:
+        return 0
+    query = select(events.c.number).where(events.c.number <= newest - most)
+    return remove_numbers(connection, connection.execute(query).scalars().all())
+
+
+def put_early(connection: Connection, name: str) -> None:
+    """Note that the final pass may still replace the event of that id."""
+    connection.execute(delete(early).where(early.c.id == name))
+    connection.execute(insert(early), {"id": name})
+
+
+def end_early(connection: Connection, frame_index: int) -> None:
+    """Let the early events before a frame index be final, and forget those that are gone."""
+    ids = early_ids(connection)
+    if not ids:
+        return
+    later = select(events.c.id).where(events.c.id.in_(ids), events.c.time_ns >= frame_index * FRAME_NS)
+    ended = set(ids) - set(connection.execute(later).scalars())
+    connection.execute(delete(early).where(early.c.id.in_(ended)))
+
+
+def early_ids(connection: Connection) -> list[str]:
+    """Return the ids of early events: few. A join would have PostgreSQL read all events, as it knows no better."""
+    return list(connection.execute(select(early.c.id)).scalars())
+
+
+def put_progress(connection: Connection, site: str, frame_index: int, clocks: JsonObject) -> None:
+    """Note how far the final pass of a site has come, and what was known of its clocks."""
+    connection.execute(delete(progress).where(progress.c.site == site))
+    text = orjson.dumps(clocks).decode()
+    connection.execute(insert(progress), {"site": site, "frame_index": frame_index, "clocks": text})
+
+
+def put_disabled(connection: Connection, site: str, array: str, *, is_disabled: bool) -> None:
+    """Note whether an array is disabled."""
+    connection.execute(delete(disabled).where(disabled.c.site == site, disabled.c.array == array))
+    if is_disabled:
+        connection.execute(insert(disabled), {"site": site, "array": array})
+
+
+def _numbers(connection: Connection, ids: Sequence[str]) -> dict[str, int]:
+    """Return the numbers of the events of these ids, as far as they are stored."""
+    found: dict[str, int] = {}
+    for first in range(0, len(ids), 500):
+        some = ids[first : first + 500]
+        rows = connection.execute(select(events.c.id, events.c.number).where(events.c.id.in_(some)))
+        found |= {row.id: row.number for row in rows}
+    return found

@@ -1,0 +1,69 @@
+"""The statements that find events; both databases answer them from indices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, FromClause, Select, Tuple, and_, exists, literal, select, tuple_
+
+from livessl.server.history.query import Cursor, Query
+from livessl.server.history.tables import events, tags
+
+
+def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], FromClause]:
+    """Return the statement for these columns of the events that a query admits, regardless of its pages.
+
+    Returns
+    -------
+    Select, FromClause
+        The statement, and the table that has `time_ns` and `number` in the order of the index that is searched: with
+        a zone or an array that of the tags, else that of the events.
+    """
+    wanted = [(kind, name) for kind, name in (("zone", query.zone), ("array", query.array)) if name is not None]
+    searched: FromClause = tags if wanted else events
+    statement = select(*columns)
+    if wanted:
+        kind, name = wanted[0]
+        statement = statement.select_from(tags.join(events, events.c.number == tags.c.number))
+        statement = statement.where(tags.c.kind == kind, tags.c.name == name)
+    for kind, name in wanted[1:]:
+        other = tags.alias()
+        here = (other.c.kind == kind, other.c.name == name, other.c.time_ns == searched.c.time_ns)
+        statement = statement.where(exists().where(and_(*here, other.c.number == searched.c.number)))
+    compared = searched.c
+    if query.since_ns is not None:
+        statement = statement.where(compared.time_ns >= query.since_ns)
+    if query.until_ns is not None:
+        statement = statement.where(compared.time_ns <= query.until_ns)
+    if query.min_confidence is not None:
+        statement = statement.where(compared.confidence >= query.min_confidence)
+    if query.status is not None:
+        statement = statement.where(compared.status == query.status)
+    if query.min_level_dbfs is not None:
+        statement = statement.where(compared.level_dbfs >= query.min_level_dbfs)
+    if query.text is not None:
+        statement = statement.where(events.c.words.contains(query.text.lower(), autoescape=True))
+    return statement, searched
+
+
+def page_statement(query: Query, most: int) -> Select[Any]:
+    """Return the statement for a page of at most so many events: time, number and JSON.
+
+    They come newest first, or oldest first if the query wants this or names the event after which the page begins.
+    """
+    statement, searched = matching(query, events.c.time_ns, events.c.number, events.c.body)
+    place, time_ns = tuple_(searched.c.time_ns, searched.c.number), searched.c.time_ns
+    newer_than, older_than = query.after, query.before
+    if query.oldest_first:
+        newer_than, older_than = query.before, query.after
+    if older_than is not None:
+        statement = statement.where(time_ns <= older_than.time_ns, place < _place(older_than))
+    if newer_than is not None:
+        statement = statement.where(time_ns >= newer_than.time_ns, place > _place(newer_than))
+    if query.oldest_first or query.after is not None:
+        return statement.order_by(time_ns, searched.c.number).limit(most)
+    return statement.order_by(time_ns.desc(), searched.c.number.desc()).limit(most)
+
+
+def _place(cursor: Cursor) -> Tuple:
+    return tuple_(literal(cursor.time_ns), literal(cursor.number))

@@ -1,0 +1,130 @@
+"""Tables of the history, the same for SQLite and PostgreSQL, and an event's columns.
+
+The migrations make these tables; a test compares both. A new column or table needs a migration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import orjson
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Double,
+    Index,
+    Integer,
+    MetaData,
+    PrimaryKeyConstraint,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+
+from livessl.server.history.query import JsonObject
+
+metadata: Final = MetaData(
+    naming_convention={
+        "ix": "%(table_name)s_%(column_0_N_name)s",
+        "pk": "%(table_name)s_key",
+        "uq": "%(table_name)s_%(column_0_name)s_unique",
+    }
+)
+"""All tables of the history."""
+
+ROW_NUMBER: Final = BigInteger().with_variant(Integer(), "sqlite")  # of SQLite's integers, only INTEGER counts up
+
+events: Final = Table(
+    "events",
+    metadata,
+    Column("number", ROW_NUMBER, autoincrement=True),
+    Column("id", String, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("confidence", Double, nullable=False),
+    Column("status", String),
+    Column("level_dbfs", Double),
+    Column("x_mm", Integer),
+    Column("y_mm", Integer),
+    Column("z_mm", Integer),
+    Column("words", Text, nullable=False),
+    Column("body", Text, nullable=False),
+    PrimaryKeyConstraint("number"),
+    UniqueConstraint("id"),
+    sqlite_autoincrement=True,
+)
+"""Events. `words` is what a text is searched in, in lower case; `body` is the event's JSON."""
+
+Index(
+    "events_time",
+    *(events.c[name] for name in ("time_ns", "number", "confidence", "status", "level_dbfs", "x_mm", "y_mm")),
+)
+
+tags: Final = Table(
+    "event_tags",
+    metadata,
+    Column("kind", String, nullable=False),
+    Column("name", String, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("number", BigInteger, nullable=False),
+    Column("confidence", Double, nullable=False),
+    Column("status", String),
+    Column("level_dbfs", Double),
+    PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
+    sqlite_with_rowid=False,
+)
+"""Zones and arrays of the events: rows of kind `zone` and `array`, with what a search compares besides."""
+
+Index("event_tags_number", tags.c.number)
+
+early: Final = Table("early", metadata, Column("id", String, nullable=False), PrimaryKeyConstraint("id"))
+"""Ids of events that a final pass may still replace."""
+
+progress: Final = Table(
+    "progress",
+    metadata,
+    Column("site", String, nullable=False),
+    Column("frame_index", BigInteger, nullable=False),
+    Column("clocks", Text),
+    PrimaryKeyConstraint("site"),
+)
+"""How far the final pass of each site has come."""
+
+disabled: Final = Table(
+    "disabled",
+    metadata,
+    Column("site", String, nullable=False),
+    Column("array", String, nullable=False),
+    PrimaryKeyConstraint("site", "array"),
+)
+"""Arrays that an operator has disabled."""
+
+
+def event_row(event: JsonObject, time_ns: int) -> dict[str, Any]:
+    """Return an event's columns, without its number."""
+    position_m = event.get("position_m")
+    x_mm, y_mm, z_mm = (None, None, None) if position_m is None else (round(1000 * metres) for metres in position_m)
+    zones, arrays = event.get("zones") or (), event.get("arrays") or ()
+    words = (event["id"], event.get("status"), event.get("method"), event.get("reason"), *zones, *arrays)
+    return {
+        "id": event["id"],
+        "time_ns": time_ns,
+        "confidence": event["confidence"],
+        "status": event.get("status"),
+        "level_dbfs": event.get("level_dbfs"),
+        "x_mm": x_mm,
+        "y_mm": y_mm,
+        "z_mm": z_mm,
+        "words": "\n".join(word for word in words if word).lower(),
+        "body": orjson.dumps(event).decode(),
+    }
+
+
+def tag_rows(event: JsonObject, row: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of an event's zones and arrays, each once."""
+    arrays = [*(event.get("arrays") or ()), *(event.get("heard_by") or ())]
+    compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
+    for kind, names in (("zone", event.get("zones") or ()), ("array", arrays)):
+        for name in dict.fromkeys(names):
+            yield {"kind": kind, "name": name, "number": number, **compared}

@@ -1,0 +1,237 @@
+"""The database of the history: its migrations, its outages, and what waits meanwhile."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from threading import Event as Flag
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+
+from livessl.errors import ConfigError
+from livessl.server.api.encode import JsonObject
+from livessl.server.history import backlog as backlog_module
+from livessl.server.history import database, migrations
+from livessl.server.history.backlog import MAX_UNSAVED, Backlog, Write
+from livessl.server.history.tables import metadata
+from livessl.server.store import Query, Store, StoreError
+from messages import event_message
+from postgresql import PostgreSQL, running_postgresql
+from small_site import site_of, wait_until
+
+DAY_NS = 86_400_000_000_000
+OLD_TABLES = (
+    "CREATE TABLE events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, time_ns INTEGER, "
+    "confidence REAL, json TEXT)",
+    "CREATE INDEX events_time ON events (time_ns)",
+    "CREATE TABLE provisional (id TEXT PRIMARY KEY)",
+    "CREATE TABLE settled (site TEXT PRIMARY KEY, raster INTEGER)",
+    "CREATE TABLE disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))",
+    "CREATE TABLE clocks (site TEXT PRIMARY KEY, json TEXT)",
+)
+"""The tables of a file of the release before migrations existed."""
+
+
+def event(number: int, **changes: object) -> JsonObject:
+    return event_message(id=f"small-{number}", **changes)
+
+
+def write_old_file(path: Path, events: list[JsonObject]) -> None:
+    """Write what the release before migrations wrote; event number k began on day k and has the number 10 k + 1."""
+    with closing(sqlite3.connect(path)) as db, db:
+        for sql in OLD_TABLES:
+            db.execute(sql)
+        for k, each in enumerate(events):
+            row = (10 * k + 1, each["id"], k * DAY_NS, each["confidence"], json.dumps(each))
+            db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", row)
+        db.execute("INSERT INTO provisional VALUES ('small-4')")
+        db.execute("INSERT INTO settled VALUES ('lab', 1000), ('hall', 7)")
+        db.execute("INSERT INTO disabled VALUES ('lab', 'north')")
+        db.execute("INSERT INTO clocks VALUES ('lab', '{\"b\": 0.15}')")
+
+
+@pytest.mark.parametrize("batch", [2, 2000])
+def test_older_file_is_migrated_without_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int) -> None:
+    monkeypatch.setattr(migrations, "BATCH", batch)
+    refused: JsonObject = {
+        "position_m": None,
+        "covariance_m2": None,
+        "status": "refused",
+        "confidence": 0.0,
+        "zones": [],
+    }
+    events = [event(k, zones=["Tür"] if k % 2 else [], reason="größer") for k in range(4)] + [event(4, **refused)]
+    write_old_file(tmp_path / "events.db", events)
+    for _ in range(2):  # the second time there is nothing to migrate
+        store = Store(tmp_path / "events.db")
+        assert store.find(Query())[0] == events[::-1]
+        assert [cursor.number for cursor in (row.cursor for row in store.page(Query()).rows)] == [41, 31, 21, 11, 1]
+        assert [found["id"] for found in store.find(Query(zone="Tür"))[0]] == ["small-3", "small-1"]
+        assert [found["id"] for found in store.find(Query(status="refused"))[0]] == ["small-4"]
+        assert len(store.find(Query(array=events[0]["arrays"][0]))[0]) == 5
+        assert len(store.find(Query(text="GRÖSSER".replace("SS", "ß")))[0]) == 4
+        assert store.early_events() == [(4 * DAY_NS, events[4])]
+        assert store.finalized("lab") == (1000, {"b": 0.15})
+        assert store.finalized("hall") == (7, None)
+        assert store.disabled("lab") == {"north"}
+        assert store.count() == 5
+        store.close()
+
+
+def test_migration_that_fails_leaves_the_older_file_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "events.db"
+    write_old_file(path, [event(0), event(1)])
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE events SET json = NULL, confidence = NULL WHERE number = 11")
+        before = list(db.iterdump())
+    with pytest.raises(StoreError, match=r"cannot use .*events.db: .* NoneType"):
+        Store(path)
+    with closing(sqlite3.connect(path)) as db:
+        assert list(db.iterdump()) == before
+
+
+def test_migrations_make_the_tables_that_the_code_names(opened: Callable[[], Store]) -> None:
+    store = opened()
+    with store._database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+
+
+def test_the_newest_migration_is_the_one_that_the_code_expects() -> None:
+    assert ScriptDirectory(str(Path(database.__file__).parent / "migrations")).get_current_head() == database.HEAD
+
+
+def test_database_of_a_newer_release_is_refused(tmp_path: Path) -> None:
+    Store(tmp_path / "events.db").close()
+    with closing(sqlite3.connect(tmp_path / "events.db")) as db, db:
+        db.execute("UPDATE alembic_version SET version_num = '9000'")
+    with pytest.raises(StoreError, match=r"got 9000 of a newer livessl; update livessl, or name another database"):
+        Store(tmp_path / "events.db")
+
+
+def test_server_that_comes_late_gets_what_waited(caplog: pytest.LogCaptureFixture) -> None:
+    """Nothing waits for PostgreSQL at the start, and everything is there when it comes."""
+    with running_postgresql() as server:
+        url = server.url()
+        server.stop()
+        store, ready = Store(url), Flag()
+        store.when_ready(ready.set)
+        try:
+            assert "cannot use postgresql://livessl@127.0.0.1" in caplog.text
+            assert store.count() is None
+            for read in (lambda: store.find(Query()), lambda: store.get("small-1"), lambda: store.finalized("lab")):
+                with pytest.raises(StoreError, match="see that PostgreSQL runs"):
+                    read()
+            store.backlog.start()
+            store.backlog.put(Write(lambda: store.finalize("lab", [(event(1), 0)], [], 5, {}), 1, True), 0)
+            wait_until(lambda: store.backlog.is_failing, "a failure")
+            assert (store.backlog.unsaved, store.backlog.is_saved) == (1, False)
+            server.start()
+            wait_until(lambda: store.backlog.is_saved, "the event to be stored")
+            assert ready.is_set()
+            assert store.find(Query())[0] == [event(1)]
+            _go_down_and_come_back(server, store)
+        finally:
+            store.close()
+
+
+def _go_down_and_come_back(server: PostgreSQL, store: Store) -> None:
+    """What is put while the server is down is stored in order when it is there again."""
+    server.stop()
+    for k in range(2, 30):
+        store.backlog.put(Write(lambda k=k: store.add(event(k % 20, duration_s=float(k)), k), 1, False), 0)  # type: ignore[misc]
+    wait_until(lambda: store.backlog.is_failing, "a failure")
+    with pytest.raises(StoreError):
+        store.find(Query())
+    server.start()
+    wait_until(lambda: store.backlog.unsaved == 0, "all to be stored")
+    found, _ = store.find(Query())
+    assert store.backlog.unkept == 0
+    assert {each["id"]: each["duration_s"] for each in found if each["duration_s"] >= 2} == {
+        f"small-{k % 20}": float(k) for k in range(10, 30)
+    }
+    assert store.count() == 20
+
+
+def test_readers_see_what_was_put_before_they_asked(opened: Callable[[], Store]) -> None:
+    store = opened()
+    store.backlog.start()
+    for k in range(50):
+        store.backlog.put(Write(lambda k=k: store.add(event(k), k), 1, False), 0)  # type: ignore[misc]
+        assert store.get(f"small-{k}") == event(k)
+
+
+def test_event_that_the_database_refuses_holds_up_no_other(
+    postgresql: PostgreSQL, caplog: pytest.LogCaptureFixture
+) -> None:
+    """PostgreSQL's texts cannot hold NUL."""
+    store = Store(postgresql.url())
+    for name in ("small-1", "small\0-2", "small-3"):
+        store.backlog.put(Write(lambda name=name: store.add(event_message(id=name), 0), 1, False), 0)  # type: ignore[misc]
+    assert [found["id"] for found in store.find(Query())[0]] == ["small-3", "small-1"]
+    assert (store.backlog.unkept, store.backlog.unsaved) == (1, 0)
+    assert "cannot store event 'small\\x00-2'" in caplog.text
+    store.close()
+
+
+class Jammed:
+    """A database that stands still until it is let go, and counts what it was given."""
+
+    def __init__(self) -> None:
+        self.go, self.begun, self.done = Flag(), Flag(), list[int]()
+
+    def write(self, number: int) -> None:
+        self.begun.set()
+        assert self.go.wait(60)
+        self.done.append(number)
+
+
+def test_nobody_waits_for_a_database_that_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the bound the oldest are given up, but not the one that is being written."""
+    monkeypatch.setattr(backlog_module, "SETTLE_S", 0.0)
+    jam, waiting = Jammed(), Backlog(lambda: None)
+    waiting.start()
+    waiting.put(Write(lambda: jam.write(0), 1, False), 0)
+    assert jam.begun.wait(60)
+    for k in range(1, MAX_UNSAVED + 6):
+        waiting.put(Write(lambda k=k: jam.write(k), 1, False), 0)  # type: ignore[misc]
+    waiting.settle()
+    assert (waiting.unsaved, waiting.unkept) == (MAX_UNSAVED, 6)
+    jam.go.set()
+    wait_until(lambda: waiting.unsaved == 0, "all to be written")
+    waiting.stop()
+    assert jam.done == [0, *range(7, MAX_UNSAVED + 6)]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("mysql://root@localhost/events", "got a URL of 'mysql'"),
+        ("sqlite:///events.db", "expected the name of a file for SQLite"),
+        ("postgresql://localhost:port/events", "got a URL with Port could not be cast"),
+    ],
+)
+def test_url_of_another_database_is_a_fault(name: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        site_of({"server.events_db": name})
+
+
+def test_missing_driver_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"server.events_db: PostgreSQL needs .* pip install 'livessl\[postgres\]'"):
+        Store.of(site_of({"server.events_db": "postgres://livessl@localhost/events"}))
+
+
+def test_password_is_not_shown(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    store = Store("postgresql://livessl:geheim@127.0.0.1:1/events")
+    with pytest.raises(StoreError) as caught:
+        store.find(Query())
+    store.close()
+    assert "geheim" not in caplog.text + str(caught.value)
