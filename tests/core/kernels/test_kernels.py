@@ -69,7 +69,7 @@ def test_cross_spectra_are_weighed_sums_of_whitened_spectra(kernels: ModuleType,
         assert levels[0] > 5.0 * levels[2]
 
 
-def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array, ...]:
+def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array | ComplexArray, ...]:
     """Weights of some windows, six to a frame, and the state after them."""
     state = fresh_state()
     all_weights, all_noises = [], []
