@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from livessl.core.geometry import microphone_pairs
 from livessl.core.kernels import with_numba, with_numpy
 from livessl.core.kernels.arguments import NO_LAG, OnsetParameters, OnsetState
-from livessl.core.types import ComplexArray
+from livessl.core.types import ComplexArray, Float32Array
 
 KERNELS = [pytest.param(with_numba, id="numba"), pytest.param(with_numpy, id="NumPy")]
 LOW, BINS = 3, 40
@@ -71,7 +69,7 @@ def test_cross_spectra_are_weighed_sums_of_whitened_spectra(kernels: ModuleType,
         assert levels[0] > 5.0 * levels[2]
 
 
-def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[NDArray[Any], ...]:
+def weighed(kernels: ModuleType, quiet: list[bool], level: list[float]) -> tuple[Float32Array | ComplexArray, ...]:
     """Weights of some windows, six to a frame, and the state after them."""
     state = fresh_state()
     all_weights, all_noises = [], []

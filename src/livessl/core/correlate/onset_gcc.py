@@ -19,8 +19,8 @@ other.
 Windows in which the noise happens to be above its mean have a little weight, and there are many of them. If the phases
 of the noise are random, their sum stays small; those of a fan add up, and outweigh the sound. The cross-spectrum of the
 noise, N_ik, is therefore learned in the quiet frames before a sound. As far as it is coherent, c = 0 to 1, only power
-above r N with r = 1 + c can be direct, and 2 c N_ik is subtracted from conj(X_i) X_k where magnitudes count: about the
-noise that there is in windows which have weight. Nothing here knows geometry or another array.
+above r N with r = 1 + c can be direct, and 2 c N_ik is subtracted from conj(X_i) X_k: about the noise that there
+is in windows which have weight. Nothing here knows geometry or another array.
 """
 
 from __future__ import annotations
@@ -220,16 +220,19 @@ class OnsetFrontEnd:
         weights, noises = np.empty((2, hops, len(self._state.noise)), dtype=np.float32)
         state, coherent = self._state, self._coherent_share()
         parameters = self._parameters._replace(reach=np.float32(1.0 + coherent))
-        background = np.float32(2.0 * coherent) * state.cross if coherent > 0.0 and not self._wide else None
+        background = np.float32(2.0 * coherent) * state.cross if coherent > 0.0 else None
         kernels.onset_weights(spectra, self._band.start, self._learned, quiet, parameters, state, weights, noises)
         cross = self._cross(Spectra(spectra, self._n_fft), weights, noises, background)
         noise_power = self._shared_cells * float(np.vdot(weights, weights))
         return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels, noise_power)
 
     def _coherent_share(self) -> float:
-        """Return how coherent the noise is between the microphones, 0 to 1; 0 before it is known."""
+        """Return how coherent the noise is between the microphones, 0 to 1; 0 before it is known.
+
+        It is 0 for wide arrays, too: their windows are so long that the pre-roll has hardly any independent ones.
+        """
         windows = int(self._state.windows[1])
-        if windows <= self._parameters.warm_up:
+        if self._wide or windows <= self._parameters.warm_up:
             return 0.0
         if self._coherent is None or self._coherent[0] != windows:
             cross, own = np.split(self._state.cross, [len(self._pairs)])
