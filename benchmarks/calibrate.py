@@ -34,6 +34,7 @@ from livessl.core.types import Float32Array, FloatArray
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.simulation.scene import NamedSound, Scene, make_scene, render, synthesised_sounds
+from livessl.site.load import parse_site
 from livessl.site.models import Site
 
 CLAPS: Final = 8
@@ -90,6 +91,7 @@ def heard(
     count: int,
     seed: int,
     at_m: FloatArray | None = None,
+    keep_away: Site | None = None,
 ) -> tuple[list[HeardSound], FloatArray, list[AssignedRecording]]:
     """What the arrays observed of sounds at random or given places, and the places; without events, none."""
     scene = make_scene(
@@ -99,7 +101,7 @@ def heard(
         count=count,
         sample_rate_hz=RATE_HZ,
         c_m_s=site.c_m_s,
-        keep_away_m=[spec.centre_m for spec in site.specs],
+        keep_away_m=[spec.centre_m for spec in (keep_away or site).specs],
         seed=seed + 100,
     )
     if at_m is not None:
@@ -209,6 +211,32 @@ def one_room(arrays: int, seed: int) -> Iterator[dict[str, Any]]:
         yield {"task": f"{UNKNOWN} unknown sounds, one clock", "arrays": arrays, "seed": seed} | row
 
 
+def located(arrays: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Yield the errors of sounds that are located with the true set-up, with the calibrated one, and as filed."""
+    site = site_of(arrays, seed)
+    shape = {spec.name: spec.microphones_m for spec in site.specs}
+    placed = built(site, seed, position_std_m=0.0, orientation_std_deg=0.0)
+    rng = np.random.default_rng([seed, 11])
+    filed = wrong(shape, rng, FILED_STD_M, FILED_STD_DEG)
+    claps, places_m, _ = heard(site, placed, [("clap", clap(seed))], CLAPS, seed)
+    delays = sharp_delays(shape, [sound.observations for sound in claps], [])
+    known_m = places_m + rng.normal(0.0, PLACE_STD_M, places_m.shape)
+    poses = measure_poses(filed, delays, known_m, site.c_m_s, PLACE_STD_M).poses
+    calibrated = {name: pose.microphones_m for name, pose in poses.items()}
+    for name, set_up in (("true", placed), (f"{CLAPS} claps", calibrated), ("as filed", filed)):
+        own = with_microphones(site, set_up)
+        sounds, true_m, _ = heard(own, placed, synthesised_sounds(RATE_HZ, seed), UNKNOWN, seed, keep_away=site)
+        pairs = zip(sounds, true_m, strict=True)
+        off_m = [float(np.linalg.norm(one.position_m - at_m)) for one, at_m in pairs if one.position_m is not None]
+        yield {"task": "located", "arrays": arrays, "seed": seed, "set_up": name, "count": len(sounds), "off_m": off_m}
+
+
+def with_microphones(site: Site, set_up: Arrays) -> Site:
+    """The site with its microphones elsewhere."""
+    arrays = {name: {"microphones_m": at_m.tolist()} for name, at_m in set_up.items()}
+    return parse_site(json.dumps({"site": site.site, "room": {"size_m": list(site.room.size_m)}, "arrays": arrays}))
+
+
 def verdict(
     fault: Fault, filed: Arrays, delays: Mapping[str, FloatArray], places_m: FloatArray, c_m_s: float
 ) -> dict[str, Any]:
@@ -266,25 +294,39 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def table_of_located(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The errors of sounds with each set-up, as a table."""
+    lines = ["| arrays | set-up | located | error: median / 95 % (cm) |", "|---|---|---|---|"]
+    for arrays, name in dict.fromkeys((row["arrays"], row["set_up"]) for row in rows):
+        own = [row for row in rows if (row["arrays"], row["set_up"]) == (arrays, name)]
+        off_cm = 100.0 * np.array([off_m for row in own for off_m in row["off_m"]])
+        median, most = (np.median(off_cm), np.quantile(off_cm, 0.95)) if len(off_cm) else (np.nan, np.nan)
+        count = sum(row["count"] for row in own)
+        lines.append(f"| {arrays} | {name} | {len(off_cm)} of {count} | {median:.1f} / {most:.1f} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Run the campaign and write its rows and its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--arrays", type=int, nargs="+", default=[2, 3], choices=range(2, len(POSITIONS_M) + 1))
+    parser.add_argument("--locate", action="store_true", help="locate sounds with the measured poses instead")
     parser.add_argument("--out", type=Path, help="folder for rows.jsonl and table.md")
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for arrays in arguments.arrays:
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            for row in one_room(arrays, seed):
+            for row in located(arrays, seed) if arguments.locate else one_room(arrays, seed):
                 rows.append(row)
                 print(json.dumps(row), flush=True)
-    print(table(rows))
+    text = table_of_located(rows) if arguments.locate else table(rows)
+    print(text)
     if arguments.out is not None:
         arguments.out.mkdir(parents=True, exist_ok=True)
         (arguments.out / "rows.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
-        (arguments.out / "table.md").write_text(table(rows) + "\n", encoding="utf-8")
+        (arguments.out / "table.md").write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,9 @@ frames of about 1 m. The two channels of a recorder are exact; the two recorders
 samples only. `recorders` takes each recorder as an array of its own, and `frames` each frame as one array whose clocks
 inside disagree. A clap is one recording: nothing is learned from one clap for the next. The recordings are not part of
 the project (`benchmarks/recordings.py`).
+
+`--aligned` shows what the disagreeing clocks cost: it shifts the second recorder of each frame by the samples with
+which the frame agrees best about the true place. That needs the truth, so it is a bound and not a method.
 """
 
 from __future__ import annotations
@@ -43,6 +46,9 @@ FADE_S: Final = 0.005
 
 LEAD_S: Final = 1.5
 """Quiet, in seconds, before and after each clap."""
+
+LARGEST_SHIFT: Final = 12
+"""Samples by which the recorders of a frame may be apart; they are known to 0 to 8."""
 
 FAR_M: Final = 0.5
 """Error, in metres, from which a place is wrong."""
@@ -104,9 +110,31 @@ def _joined(before: Float32Array, after: Float32Array, fade: int) -> Float32Arra
     return np.concatenate([before[:, :-fade], overlap, after[:, fade:]], axis=1)
 
 
-def heard(name: str, arrays: Site, method: str | None = None) -> list[Event]:
-    """Return the events of one clap."""
+def aligned(samples: Float32Array, rate_hz: float) -> Float32Array:
+    """Return samples (16, n) with the second recorder of each frame shifted to agree best with the first."""
+    truth = json.loads((FOLDER / "truth.json").read_text())
+    places_m = np.array([channel["position_m"] for channel in truth["channels"][:16]])
+    travel = np.linalg.norm(places_m - np.array(truth["source_m"]), axis=1) / 343.0 * rate_hz
+    shifted = samples.copy()
+    lags = np.arange(-LARGEST_SHIFT, LARGEST_SHIFT + 1)
+    for first in range(0, 16, 4):
+        spectra = np.fft.rfft(samples[first : first + 4], 2 * samples.shape[1])
+        height = np.zeros(len(lags))
+        for one in (0, 1):
+            for other in (2, 3):
+                cross = spectra[other] * np.conj(spectra[one])
+                gcc = np.fft.irfft(cross / np.maximum(np.abs(cross), 1e-12))
+                expected = round(travel[first + other] - travel[first + one])
+                height += gcc[expected + lags]
+        shifted[first + 2 : first + 4] = np.roll(samples[first + 2 : first + 4], -lags[height.argmax()], axis=1)
+    return shifted
+
+
+def heard(name: str, arrays: Site, method: str | None = None, *, in_line: bool = False) -> list[Event]:
+    """Return the events of one clap, `in_line` if the recorders of a frame are `aligned`."""
     samples, rate_hz = samples_of(name)
+    if in_line:
+        samples = aligned(samples, rate_hz)
     parts, first = [], 0
     for spec in arrays.specs:
         channels = tuple(range(first + 1, first + 1 + len(spec.microphones_m)))
@@ -115,10 +143,10 @@ def heard(name: str, arrays: Site, method: str | None = None) -> list[Event]:
     return events_in(arrays, parts, method)
 
 
-def clap(name: str, arrays: Site, method: str | None = None) -> Clap:
-    """Locate one clap: its first source is the loudest event's."""
+def clap(name: str, arrays: Site, method: str | None = None, *, in_line: bool = False) -> Clap:
+    """Locate one clap, `in_line` if the recorders of a frame are `aligned`: its first source is the loudest event's."""
     truth_m = placed_m(json.loads((FOLDER / "truth.json").read_text())["source_m"])
-    events = heard(name, arrays, method)
+    events = heard(name, arrays, method, in_line=in_line)
     first = max((event for event in events if event.source == 1), key=lambda event: event.power or 0.0)
     further = [event for event in events if event is not first and event.status is Status.LOCATED]
     estimate, error_m, inside = first.estimate, None, None
@@ -159,11 +187,12 @@ def main() -> None:
     parser.add_argument("--arrays", choices=("recorders", "frames"), default="recorders")
     parser.add_argument("--every", type=int, default=1, help="locate every N-th clap only")
     parser.add_argument("--method")
+    parser.add_argument("--aligned", action="store_true", help="as if the clocks of each frame agreed")
     given = parser.parse_args()
     claps = []
     arrays = site(given.arrays)
     for name in names()[:: given.every]:
-        claps.append(clap(name, arrays, given.method))
+        claps.append(clap(name, arrays, given.method, in_line=given.aligned))
         print(json.dumps(asdict(claps[-1])), flush=True)
     print(json.dumps(summary(claps)))
 

@@ -26,7 +26,9 @@ def live(site_file: str, count: int) -> None:
     """Let the sounds become final that are not, and deliver all alerts."""
     desk = Desk(load_site(Path(site_file)))
     desk.alerts.start()
-    for number in range(desk.store.count(), count):
+    stored = desk.store.count()
+    assert stored is not None
+    for number in range(stored, count):
         desk.finish(event(number))
         time.sleep(0.003)
     wanted = len(range(0, count, 3))

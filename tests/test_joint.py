@@ -75,14 +75,14 @@ def distances_m(events: Sequence[Event]) -> list[float]:
 
 
 def facts(events: Sequence[Event]) -> list[tuple[Any, ...]]:
-    """Return all fields of an event as exact values; the covariance is rounded and without the set-up."""
+    """Return all fields of an event as exact values; covariance, rounded, and confidence are those of the sound."""
     told: list[tuple[Any, ...]] = []
     for event in events:
         assert event.estimate is not None
         estimate = event.estimate
         # the frames of joint arrays may be off each by itself, those of one array only together
         covariance_m2 = np.round(estimate.sound_covariance_m2, 12) + 0.0
-        bits = (estimate.position_m.tobytes(), covariance_m2.tobytes(), estimate.confidence)
+        bits = (estimate.position_m.tobytes(), covariance_m2.tobytes(), estimate.sound_confidence)
         told.append((*bits, replace(event, estimate=None)))
     return told
 

@@ -544,7 +544,7 @@ def soak(
             end_mb=round(resting[-1], 1),
             peak_mb=round(max(sample.resident_mb for sample in world.memory), 1),
             resting=len(resting) / len(after),
-            stored=world.http.parts.store.count(),
+            stored=world.http.parts.store.count() or 0,
             faults=dict(world.faults),
             clients=dict(crowd.heard),
             seconds=round(time.monotonic() - began_s, 1),

@@ -66,6 +66,21 @@ def sound_of(spec: ArraySpec, samples: Float32Array, quiet: Float32Array) -> Sou
     return Sound((samples,), RATE_HZ, [pushed(front, samples, quiet=False)])
 
 
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=3)
+def test_a_click_is_located_and_not_a_steady_source_that_was_there_before(seed: int) -> None:
+    rng, before, n = np.random.default_rng(seed), 6400, 22400
+    click = np.zeros(n)
+    click[before + 1000 : before + 1160] = np.hanning(160) * rng.standard_normal(160)
+    steady = rng.standard_normal(n)
+    sounds = {}
+    for spec in (NORTH, SOUTH):  # over its second, the steady source has five times the energy of the click
+        heard_m = heard(spec, SOURCE_M, 0.1 * click) + heard(spec, ELSEWHERE_M, 0.014 * steady)
+        samples = np.asarray(heard_m + noise(n, 1e-4, seed), dtype=np.float32)
+        sounds[spec.name] = sound_of(spec, samples[:, before:], samples[:, :before])
+    assert np.linalg.norm(located(sounds) - SOURCE_M) < NEAR_M
+
+
 @pytest.mark.parametrize("rms", [0.0, 0.002])
 def test_the_first_sound_is_located_and_not_its_louder_tail(rms: float) -> None:
     sounds = {s.name: sound_of(s, echoing(s, rms), noise(6400, rms)) for s in (NORTH, SOUTH)}

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, tetra
+from free_field import BAND_HZ, C_M_S, RATE_HZ, burst, heard, ideal_gcc, tetra, true_lags_s
 from livessl.core.geometry import Grid, posed, tetrahedron
-from livessl.core.locate.contributing import FALSE_ALARMS, height, threshold
+from livessl.core.locate.contributing import FALSE_ALARMS, contributing, height, is_fixed, threshold
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.locate.onset import Onset
-from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.core.locate.srp import SRPFunctional
+from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 
 FRAME: Final = 800
 QUIET: Final = 8
@@ -70,7 +71,7 @@ def received(spec: ArraySpec, rng: np.random.Generator, frames: int, level: floa
     count = (QUIET + frames) * FRAME
     sound = np.zeros(count)
     sound[QUIET * FRAME :] = level * burst(frames * FRAME, seed=int(rng.integers(1 << 30)))
-    return heard(spec, SOURCE_M, sound) + noise(rng, 4, QUIET + frames, rms)
+    return heard(spec, SOURCE_M, sound) + noise(rng, len(spec.microphones_m), QUIET + frames, rms)
 
 
 def located(north: Float32Array, south: Float32Array, *, south_detected: bool) -> Localization:
@@ -116,6 +117,71 @@ def test_an_array_that_receives_only_its_own_noise_changes_nothing() -> None:
         np.testing.assert_array_equal(found.position_m, alone.position_m)
         assert found.confidence == alone.confidence
     assert passed <= 1
+
+
+EAST: Final = tetra("east", [5.2, 3.6, 1.9], yaw_deg=-40.0)
+THREE: Final = Onset([NORTH, SOUTH, EAST], GRID, C_M_S)
+AROUND_M: Final = [np.array([3.0 + 2.4 * np.cos(k), 3.5 + 2.8 * np.sin(k), 1.0 + 0.1 * k]) for k in range(8)]
+PAIRS: Final = [
+    ArraySpec(f"p{k}", posed(SHAPES["pair"], at_m, 50.0 * k, 20.0 * k, 0.0), BAND_HZ) for k, at_m in enumerate(AROUND_M)
+]
+
+
+def test_noise_beside_two_arrays_that_fix_the_place_seldom_contributes_and_moves_little() -> None:
+    """Of 40 sounds 2 are expected in which it does; eight are as likely as 1 in 1000."""
+    rng = np.random.default_rng(21)
+    passed = 0
+    for _ in range(40):
+        frames = int(rng.integers(2, 12))
+        sounds = {
+            spec.name: as_sound(THREE, spec, received(spec, rng, frames, 0.5, 1e-3), detected=True)
+            for spec in (NORTH, SOUTH)
+        }
+        two = THREE.locate(sounds)
+        empty = noise(rng, 4, QUIET + frames, 1e-3, rng.uniform(0.0, 1.5))
+        three = THREE.locate({**sounds, "east": as_sound(THREE, EAST, empty, detected=False)})
+        passed += "east" not in three.unneeded
+        assert np.linalg.norm(three.position_m - two.position_m) < 0.02
+    assert passed <= 8
+
+
+def of_pairs(rng: np.random.Generator, heights: FloatArray, place_m: FloatArray) -> tuple[Evidence, ...]:
+    """Evidence of pairs of microphones for a place, so many standard deviations above the noise of each."""
+    evidence = []
+    for spec, above in zip(PAIRS, heights, strict=True):
+        gcc = ideal_gcc(spec, true_lags_s(spec.microphones_m, place_m))
+        values = 0.1 * (above * gcc.values + rng.standard_normal(gcc.values.shape))
+        evidence.append(
+            Evidence(spec, replace(gcc, values=values.astype(np.float32)), noise_rms=0.1, is_presumed=False)
+        )
+    return tuple(evidence)
+
+
+def nowhere(_: Evidence) -> float:
+    """Own peak of an array that does not stand out."""
+    return 0.0
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 1 << 30), above=st.floats(4.0, 4.3))
+def test_pairs_that_do_not_stand_out_contribute_where_the_others_fix_the_place(seed: int, above: float) -> None:
+    """As in a reverberant room: each is below its threshold, and all are high at one place."""
+    evidence = of_pairs(np.random.default_rng(seed), np.full(8, above), SOURCE_M)
+    functional = SRPFunctional(evidence, C_M_S)
+    there = contributing(evidence, functional.pair_terms(SOURCE_M), nowhere, C_M_S)
+    elsewhere = contributing(evidence, functional.pair_terms(np.array([5.1, 0.7, 2.2])), nowhere, C_M_S)
+    assert len(there) >= 6
+    assert len(elsewhere) <= 3
+
+
+@pytest.mark.parametrize(("microphones", "fixed"), [((2, 2), False), ((2, 2, 2), True), ((4,), False), ((4, 2), True)])
+def test_the_others_must_determine_three_coordinates(microphones: tuple[int, ...], fixed: bool) -> None:
+    """Two pairs leave a curve, and one array a line, on which the noise of a further array fits somewhere."""
+    shapes = {2: SHAPES["pair"], 4: SHAPES["tetrahedron"]}
+    specs = [ArraySpec(str(n), shapes[count], BAND_HZ) for n, count in enumerate((*microphones, 4))]
+    heights = [20.0] * len(microphones) + [2.0]
+    assert is_fixed(specs, heights, len(microphones)) is fixed
+    assert not is_fixed(specs, [3.0] * len(microphones) + [2.0], len(microphones))
 
 
 def test_an_array_of_zeros_changes_nothing() -> None:

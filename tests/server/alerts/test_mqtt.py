@@ -177,12 +177,13 @@ def test_rule_that_was_taken_out_of_the_site_file_is_forgotten(tmp_path: Path, p
 def test_two_actions_at_one_broker_leave_each_others_rules(tmp_path: Path, port: int) -> None:
     actions = {name: {**PATIENT, "mqtt": {"port": port}} for name in ("home", "yard")}
     rules = {"door": RULE, "hall": {**RULE, "actions": ["yard"]}}
-    with running_desk(alert_site(tmp_path, actions=actions, rules=rules)) as desk:
-        clients: list[Any] = [courier._action for courier in desk.alerts.couriers.values()]
-        wait_until(lambda: all(client._client for client in clients), "both connections")
-    kept = {f"homeassistant/event/livessl_small/{rule}/config" for rule in rules}
-    with Listener(port) as later:
-        wait_until(lambda: {topic for topic, text in later.messages if text} >= kept, "both rules")
+    topics = {f"homeassistant/event/livessl_small/{rule}/config" for rule in rules}
+    with Listener(port) as listener, running_desk(alert_site(tmp_path, actions=actions, rules=rules)):
+        online = "livessl/small/availability"  # the last message with which an action introduces itself
+        wait_until(lambda: listener.of(online).count(b"online") == 2, "both introductions")
+        introduced = [(topic, text) for topic, text in listener.messages if topic in topics]
+    assert {topic for topic, text in introduced if text} == topics
+    assert [topic for topic, text in introduced if not text] == []
 
 
 def test_discovery_can_be_switched_off_and_the_topic_chosen(tmp_path: Path, port: int) -> None:

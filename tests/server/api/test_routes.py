@@ -59,6 +59,10 @@ ROUTES = {
     "/api/v1/zones/{name}",
     "/api/v1/zone-changes",
     "/api/v1/floor-plan",
+    "/api/v1/clips",
+    "/api/v1/events/{event_id}/clips",
+    "/api/v1/events/{event_id}/clips/keep",
+    "/api/v1/events/{event_id}/clips/{name}",
     "/metrics",
 }
 """Every promised path but the WebSockets, which OpenAPI cannot describe."""
@@ -72,6 +76,8 @@ CHANGES = {
     "/dead-letters": {"get", "delete"},
     "/dead-letters/{number}": {"delete"},
     "/zones/{name}": {"put", "delete"},
+    "/{event_id}/clips": {"get", "delete"},
+    "/clips/keep": {"put"},
 }
 """Methods of the paths that are not only read, by their ends."""
 

@@ -188,6 +188,8 @@ class CrossSpectra:
         Weights of each frame's bins in the band. Given weights make correlations weighted sums; None makes them means.
     noise : (L, B) float32 or None
         Power of the noise in each frame's bins in the band; magnitudes count where it dominates. None uses phases only.
+    background : (P + K, B) complex64 or None
+        Cross-spectra of the background in the band, and its power at each microphone, which are subtracted.
 
     Attributes
     ----------
@@ -204,6 +206,7 @@ class CrossSpectra:
         weights: Float32Array | None = None,
         *,
         noise: Float32Array | None = None,
+        background: ComplexArray | None = None,
     ) -> None:
         self.n_fft = spectra.n_fft
         self.sample_rate_hz = sample_rate_hz
@@ -216,8 +219,10 @@ class CrossSpectra:
             weights = np.ones((frames, bins), dtype=np.float32)
         if noise is None:
             noise = np.zeros((frames, bins), dtype=np.float32)
+        if background is None:
+            background = np.empty((0, bins), dtype=np.complex64)
         self.levels = np.zeros(spectra.values.shape[1])
-        kernels.cross_spectra(spectra.values, self.low, pairs, weights, noise, self.whitened, self.levels)
+        kernels.cross_spectra(spectra.values, self.low, pairs, weights, noise, background, self.whitened, self.levels)
 
     def bins_below(self, cut_off_hz: float) -> int:
         """Number of the band's bins at or below a cut-off."""

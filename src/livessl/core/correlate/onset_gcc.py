@@ -1,7 +1,7 @@
 """The onset front end: a GCC of one array's frames in which each window and bin counts by how direct its sound is.
 
 Reverberation follows from the past. In each bin of the short-time spectrum the power P is compared with what the past
-explains, I = max(N, max_s lambda^s P(t - s)): the stationary noise N, and all earlier power, decaying. The excess
+explains, I = max(r N, max_s lambda^s P(t - s)): the stationary noise N, and all earlier power, decaying. The excess
 S = max(P - I, 0) is taken to come straight from a source. The expected coherence between two microphones is then
 gamma = S / (S + I), and their phases have the weight
 
@@ -14,7 +14,13 @@ The GCC is sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* 
 evidence count more, and sums over frames give the GCC of a window or an event. Where noise dominates, P is the mean
 power of the microphones, so that a noisy microphone counts less than its phase alone would. Where there is little
 noise, P is each microphone's own power, and only phases count: otherwise the louder of two sources would mask the
-other. Nothing here knows geometry or another array.
+other.
+
+Windows in which the noise happens to be above its mean have a little weight, and there are many of them. If the phases
+of the noise are random, their sum stays small; those of a fan add up, and outweigh the sound. The cross-spectrum of the
+noise, N_ik, is therefore learned in the quiet frames before a sound. As far as it is coherent, c = 0 to 1, only power
+above r N with r = 1 + c can be direct, and 2 c N_ik is subtracted from conj(X_i) X_k where magnitudes count: about the
+noise that there is in windows which have weight. Nothing here knows geometry or another array.
 """
 
 from __future__ import annotations
@@ -59,6 +65,14 @@ _WARM_UP_S: Final = 0.1
 
 _NOISE_S: Final = 1.0
 """Time, in seconds, over which the noise is averaged; after so long without quiet the least power is taken as noise."""
+
+_COHERENT: Final = 4.0
+"""Weight of the noise's coherence between the microphones, the root of its mean square above that of chance. A fan in a
+room has 0.35 to 0.5 and is treated as wholly coherent, diffuse noise has 0.1 to 0.2, sensor noise none."""
+
+_INDEPENDENT: Final = 0.33
+"""Number of independent windows in one window of quiet, because they overlap: the square of the coherence of n of them
+is 1/n by chance."""
 
 _LOUD: Final = np.float32(3.0)
 """Power relative to the noise above which a window is no noise even in a quiet frame: an onset begins there."""
@@ -130,6 +144,8 @@ class OnsetFrontEnd:
         self._sampling = sampling
         self._band_hz = spec.band_hz
         self._pairs = microphone_pairs(len(spec.microphones_m))
+        itself = np.arange(len(spec.microphones_m))
+        self._learned = np.concatenate([self._pairs, np.stack([itself, itself], axis=1)])
         self._envelope = uses_envelope(spec.band_hz)
         factor = decimation(sample_rate_hz, spec.band_hz)
         self._rate_hz = sample_rate_hz / factor  # of what is correlated
@@ -150,17 +166,20 @@ class OnsetFrontEnd:
         self._parameters = OnsetParameters(
             least=np.float32(_LEAST_POWER / factor * np.square(self._window).sum()),
             decay=np.float32(np.exp(-hop_s / PAST_S)),
+            reach=np.float32(1.0),
             loud=_LOUD,
             strongest=_STRONGEST,
             warm_up=round(_WARM_UP_S / hop_s),
             noise_hops=round(_NOISE_S / hop_s),
         )
         self._tail: Float32Array = np.zeros((len(spec.microphones_m), 0), dtype=np.float32)
+        self._coherent: tuple[int, float] | None = None  # quiet windows, and how coherent the noise was after them
         bins = self._band.stop - self._band.start
         self._state = OnsetState(
             windows=np.zeros(2, dtype=np.int64),
             noise=np.zeros(bins, dtype=np.float32),
             past=np.zeros(bins, dtype=np.float32),
+            cross=np.zeros((len(self._learned), bins), dtype=np.complex64),
         )
 
     @property
@@ -174,6 +193,7 @@ class OnsetFrontEnd:
         """Start over after a gap: the next frame does not continue the last one."""
         self._tail = self._tail[:, :0]
         self._state.windows[:] = 0
+        self._coherent = None
         if self._decimator is not None:
             self._decimator.reset()
 
@@ -198,14 +218,35 @@ class OnsetFrontEnd:
         kernels.cut_windows(joined, self._hop, self._window, windows)
         spectra = np.asarray(scipy.fft.rfft(windows, axis=2), dtype=np.complex64)
         weights, noises = np.empty((2, hops, len(self._state.noise)), dtype=np.float32)
-        kernels.onset_weights(spectra, self._band.start, quiet, self._parameters, self._state, weights, noises)
-        cross = self._cross(Spectra(spectra, self._n_fft), weights, noises)
+        state, coherent = self._state, self._coherent_share()
+        parameters = self._parameters._replace(reach=np.float32(1.0 + coherent))
+        background = np.float32(2.0 * coherent) * state.cross if coherent > 0.0 and not self._wide else None
+        kernels.onset_weights(spectra, self._band.start, self._learned, quiet, parameters, state, weights, noises)
+        cross = self._cross(Spectra(spectra, self._n_fft), weights, noises, background)
         noise_power = self._shared_cells * float(np.vdot(weights, weights))
         return OnsetGCC(self._sampling.sample(cross, envelope=self._envelope), cross.levels, noise_power)
 
-    def _cross(self, spectra: Spectra, weights: Float32Array, noises: Float32Array) -> CrossSpectra:
+    def _coherent_share(self) -> float:
+        """Return how coherent the noise is between the microphones, 0 to 1; 0 before it is known."""
+        windows = int(self._state.windows[1])
+        if windows <= self._parameters.warm_up:
+            return 0.0
+        if self._coherent is None or self._coherent[0] != windows:
+            cross, own = np.split(self._state.cross, [len(self._pairs)])
+            powers = own.real[self._pairs].prod(axis=1)
+            squares = cross.real**2 + cross.imag**2
+            square = np.divide(squares, powers, out=np.zeros_like(powers), where=powers > 0.0).mean()
+            excess = float(square) - 1.0 / (_INDEPENDENT * min(windows, self._parameters.noise_hops))
+            self._coherent = windows, min(1.0, _COHERENT * max(0.0, excess) ** 0.5)
+        return self._coherent[1]
+
+    def _cross(
+        self, spectra: Spectra, weights: Float32Array, noises: Float32Array, background: ComplexArray | None = None
+    ) -> CrossSpectra:
         noisy = None if self._wide else _NOISY * noises
-        return CrossSpectra(spectra, self._pairs, self._rate_hz, self._band_hz, weights, noise=noisy)
+        return CrossSpectra(
+            spectra, self._pairs, self._rate_hz, self._band_hz, weights, noise=noisy, background=background
+        )
 
     def push_segments(self, segments: Iterable[Float32Array]) -> OnsetGCC:
         """Return the sum over segments (K, n) whose context is unknown: each is taken to begin after silence."""

@@ -12,7 +12,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray, RealArray, UInt8Array, UInt16Array
+from livessl.core.types import (
+    BoolArray,
+    ComplexArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    RealArray,
+    UInt8Array,
+    UInt16Array,
+)
 
 BLOCKS: Final = 256
 """Most blocks into which a lag axis is divided for the bounds of the search."""
@@ -41,6 +50,8 @@ class OnsetParameters(NamedTuple):
     """Power below which nothing is measured."""
     decay: np.float32
     """Decay of the past's power from one window to the next."""
+    reach: np.float32
+    """Power, relative to the noise, that noise reaches by chance; only power above it can be direct."""
     loud: np.float32
     """Power, relative to the noise, above which a quiet window holds sound."""
     strongest: np.float32
@@ -60,6 +71,8 @@ class OnsetState(NamedTuple):
     """Power of the noise in each bin of the band: (B,)."""
     past: Float32Array
     """Decaying power of what was before: (B,)."""
+    cross: ComplexArray
+    """Cross-spectra of the noise, conj(X_i) X_k, of all pairs, and then the power at each microphone: (P + K, B)."""
 
 
 class SmoothRows(NamedTuple):

@@ -55,13 +55,19 @@ def cut_windows(samples, hop, window, windows):  # type: ignore[no-untyped-def]
 
 @_compiled
 def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
-    spectra, low, pairs, weights, noise, whitened, levels
+    spectra, low, pairs, weights, noise, background, whitened, levels
 ):
-    """Sum whitened cross spectra over frames, and each microphone's own."""
+    """Sum whitened cross spectra over frames, and each microphone's own, without the background's part."""
     microphones, bins = spectra.shape[1], whitened.shape[1]
     real, imaginary = np.empty((microphones, bins), np.float32), np.empty((microphones, bins), np.float32)
     power = np.empty((microphones, bins), np.float32)
     mean, share = np.empty(bins, np.float32), np.empty(bins, np.float32)
+    subtracts = len(background) > 0
+    factors = np.empty((microphones, bins), np.float32)
+    gains = np.zeros((len(pairs) if subtracts else 0, bins), np.float32)
+    below = np.zeros((microphones, bins), np.float32)
+    if subtracts:
+        below[:] = background[len(pairs) :].real
     own, summed = np.zeros((microphones, bins), np.float32), np.zeros((2, len(pairs), bins), np.float32)
     together = np.zeros(bins + 2, np.float32)
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -82,32 +88,41 @@ def cross_spectra(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
             share[b] = min(noise[t, b], mean[b]) / mean[b] if mean[b] > zero else zero
         for m in range(microphones):
             u, v, square, floor = real[m], imaginary[m], power[m], SILENT_POWER * power[m].max()
+            of_noise, kept = below[m], factors[m]
             for b in range(bins):
                 over = square[b] + share[b] * (mean[b] - square[b])
                 factor = one / np.sqrt(over) if square[b] > floor else zero
                 u[b] *= factor
                 v[b] *= factor
-                own[m, b] += weight[b] * (u[b] * u[b] + v[b] * v[b])
+                kept[b] = factor
+                own[m, b] += weight[b] * (factor * factor * max(square[b] - of_noise[b], zero))
         for p in range(len(pairs)):
             u_i, v_i, u_k, v_k = real[pairs[p, 0]], imaginary[pairs[p, 0]], real[pairs[p, 1]], imaginary[pairs[p, 1]]
             of_real, of_imaginary = summed[0, p], summed[1, p]
             for b in range(bins):
                 of_real[b] += weight[b] * (u_i[b] * u_k[b] + v_i[b] * v_k[b])
                 of_imaginary[b] += weight[b] * (u_i[b] * v_k[b] - v_i[b] * u_k[b])
+            if subtracts:
+                gain, f_i, f_k = gains[p], factors[pairs[p, 0]], factors[pairs[p, 1]]
+                for b in range(bins):
+                    gain[b] += weight[b] * f_i[b] * f_k[b]
     for p in range(len(pairs)):
         for b in range(bins):
             whitened[p, b] = complex(summed[0, p, b], summed[1, p, b])
+            if subtracts:
+                whitened[p, b] -= gains[p, b] * background[p, b]
     for m in range(microphones):
         levels[m] = own[m].sum()
 
 
 @_compiled
-def onset_weights(  # type: ignore[no-untyped-def]
-    spectra, low, quiet, parameters, state, weights, noises
+def onset_weights(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
+    spectra, low, pairs, quiet, parameters, state, weights, noises
 ):
     """Weigh the next windows by how direct their sound is."""
-    windows, noise, past = state
-    least, warm_up, noise_hops = parameters.least, parameters.warm_up, parameters.noise_hops
+    windows, noise, past, cross = state
+    least, reach = parameters.least, parameters.reach
+    warm_up, noise_hops = parameters.warm_up, parameters.noise_hops
     microphones, bins = spectra.shape[1], len(noise)
     one, zero, two, every = np.float32(1.0), np.float32(0.0), np.float32(2.0), np.float32(noise_hops)
     power = np.empty(bins + 2, np.float32)
@@ -126,7 +141,7 @@ def onset_weights(  # type: ignore[no-untyped-def]
             noise[:], past[:] = smooth, smooth
         if windows[1] >= warm_up or windows[0] >= noise_hops:
             for b in range(bins):
-                interference = max(max(noise[b], past[b]), least)
+                interference = max(max(reach * noise[b], past[b]), least)
                 direct = max(smooth[b] - interference, zero)
                 weight[b] = min(direct * direct / (interference * (interference + two * direct)), parameters.strongest)
         else:
@@ -136,6 +151,13 @@ def onset_weights(  # type: ignore[no-untyped-def]
         windows[1] += quiet
         share = one / np.float32(min(windows[1], noise_hops)) if quiet else one / every
         settled = quiet and windows[1] > warm_up
+        if quiet:
+            for p in range(len(pairs)):
+                one_m, other_m = spectra[t, pairs[p, 0], low : low + bins], spectra[t, pairs[p, 1], low : low + bins]
+                for b in range(bins):
+                    now = min(smooth[b], parameters.loud * max(noise[b], least)) if settled else smooth[b]
+                    scale = now / smooth[b] if smooth[b] > zero else zero
+                    cross[p, b] += (scale * np.conj(one_m[b]) * other_m[b] - cross[p, b]) * share
         for b in range(bins):
             now = smooth[b]
             past[b] = max(past[b] * parameters.decay, now)

@@ -47,10 +47,13 @@ def cross_spectra(
     pairs: IntArray,
     weights: Float32Array,
     noise: Float32Array,
+    background: ComplexArray,
     whitened: ComplexArray,
     levels: FloatArray,
 ) -> None:
     """Sum whitened cross spectra over frames, sum_t w conj(U_i) U_k, and each microphone's own, sum_t,f w |U_m|^2.
+
+    The background's part, whitened alike, is subtracted; of a microphone's own power at most all is.
 
     Each microphone is whitened by its own magnitude, U = X/|X|, or, the more noise there is, by the mean power P of
     all: U = X/sqrt((1 - k)|X|^2 + kP), k = min(1, noise/P).
@@ -67,6 +70,8 @@ def cross_spectra(
         Weights of each frame's bins in the band.
     noise : (T, B) float32
         Power up to which only the mean counts; zeros leave phases alone.
+    background : (P + K, B) complex64
+        Cross-spectra conj(X_i) X_k of the background, and then the power at each microphone; (0, B) subtracts nothing.
     whitened : (P, B) complex64
         Output: the cross spectra.
     levels : (K,) float64
@@ -80,14 +85,20 @@ def cross_spectra(
         mean = _smoothed(power.mean(axis=0)[None])
         share = np.divide(np.minimum(below, mean), mean, out=np.zeros_like(mean), where=mean > 0.0)
         power = power + share * (mean - power)
-        unit = np.divide(spectrum, np.sqrt(power), out=np.zeros_like(spectrum), where=has_phase)
-        levels += np.square(np.abs(unit)) @ weight
+        factor = np.divide(1.0, np.sqrt(power), out=np.zeros_like(power), where=has_phase)
+        unit = spectrum * factor
         whitened += (np.conj(unit) * weight)[first] * unit[second]
+        own = np.square(np.abs(unit))
+        if len(background):
+            whitened -= weight * factor[first] * factor[second] * background[: len(pairs)]
+            own = np.maximum(own - np.square(factor) * background[len(pairs) :].real, 0.0)
+        levels += own @ weight
 
 
 def onset_weights(
     spectra: ComplexArray,
     low: int,
+    pairs: IntArray,
     quiet: bool,
     parameters: OnsetParameters,
     state: OnsetState,
@@ -102,6 +113,8 @@ def onset_weights(
         Spectra of T windows and K microphones.
     low : int
         First bin of the band.
+    pairs : (P + K, 2) int64
+        Microphones (i, k) of each row of `state.cross`.
     quiet : bool
         Whether there is no sound in the windows, so that the noise is learned from them.
     parameters : OnsetParameters
@@ -112,15 +125,15 @@ def onset_weights(
     noises : (T, B) float32
         Output: power of the noise as it was known before each window.
     """
-    windows, noise, past = state
+    windows, noise, past, cross = state
     inside = spectra[:, :, low : low + len(noise)]
     powers = _smoothed((inside.real**2 + inside.imag**2).mean(axis=1))
     weights[:] = 0.0
-    for power, weight, before in zip(powers, weights, noises, strict=True):
+    for spectrum, power, weight, before in zip(inside, powers, weights, noises, strict=True):
         if windows[0] == 0:
             noise[:], past[:] = power, power
         if windows[1] >= parameters.warm_up or windows[0] >= parameters.noise_hops:
-            interference = np.maximum(np.maximum(noise, past), parameters.least)
+            interference = np.maximum(np.maximum(parameters.reach * noise, past), parameters.least)
             direct = np.maximum(power - interference, 0.0)
             weight[:] = np.minimum(direct**2 / (interference * (interference + 2.0 * direct)), parameters.strongest)
         before[:] = noise
@@ -129,9 +142,13 @@ def onset_weights(
         if not quiet:
             noise += (np.minimum(power, noise) - noise) / np.float32(parameters.noise_hops)
             continue
+        kept = power
         if windows[1] > parameters.warm_up:
-            power = np.minimum(power, parameters.loud * np.maximum(noise, parameters.least))
-        noise += (power - noise) / np.float32(min(int(windows[1]), parameters.noise_hops))
+            kept = np.minimum(power, parameters.loud * np.maximum(noise, parameters.least))
+        share = np.float32(1.0) / np.float32(min(int(windows[1]), parameters.noise_hops))
+        noise += (kept - noise) * share
+        scale = np.divide(kept, power, out=np.zeros_like(power), where=power > 0.0)
+        cross += (scale * np.conj(spectrum[pairs[:, 0]]) * spectrum[pairs[:, 1]] - cross) * share
 
 
 def _smoothed(powers: Float32Array) -> Float32Array:

@@ -12,6 +12,10 @@ highest place exceeds what noise reaches in a share `FALSE_ALARMS` of all sounds
 common place lies on that array's line of sight, and an array has to exceed only what noise reaches along a line, a = 0.
 An array that shows less would move the position to where its noise happens to fit, and would seem to confirm it.
 
+Where at least two other arrays determine the common place, and are together far above what noise reaches anywhere, an
+array cannot move it any more. It then has to exceed only what noise reaches at a point. Pairs of microphones in a
+reverberant room rarely stand out one by one; those that do are often those that a reflection dominates.
+
 An array that detected a sound by itself received something. If its onsets are faint (`FAINT`), it contributes although
 nothing stands out: with the others it may still tell the distance. If they are strong, they must stand out: a strong
 sound that comes from nowhere is wind, a touch, or a crackle of the electronics.
@@ -19,6 +23,7 @@ sound that comes from nowhere is wind, a touch, or a crackle of the electronics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Final
@@ -33,6 +38,17 @@ from livessl.core.types import ArraySpec, Evidence
 
 FALSE_ALARMS: Final = 1e-3
 """Share of sounds in which an array that records nothing but noise is taken to contribute."""
+
+FIXED: Final = 7.0
+"""Height of several arrays together, in standard deviations in noise, from which their place is no noise. Each of two
+arrays of 1 m has some 6000 independent directions, and noise of both reaches 7.0 in `FALSE_ALARMS` of all sounds."""
+
+AT_A_POINT: Final = 1.64
+"""Height of an array, in standard deviations, that its noise exceeds in 5 % of all sounds at a place that others
+fix."""
+
+_COORDINATES: Final = 3
+"""Coordinates that arrays have to determine for their place to be fixed."""
 
 FAINT: Final = 1.0
 """Greatest ratio of `OnsetGCC.noise_power` to its weight at which onsets are faint. With four microphones noise alone
@@ -100,6 +116,7 @@ def contributing(
         Speed of sound, m/s.
     """
     heights = [height(part, array_power(part, term)) for part, term in zip(evidence, terms, strict=True)]
+    specs = [part.spec for part in evidence]
     leads = [above > threshold(part.spec, c_m_s) for part, above in zip(evidence, heights, strict=True)]
 
     def contributes(index: int) -> bool:
@@ -108,11 +125,31 @@ def contributing(
             return True
         if part.is_presumed:
             return bool(np.any(part.gcc.values))
+        if heights[index] > AT_A_POINT and is_fixed(specs, heights, index):
+            return True
         if any(leads) and heights[index] > threshold(part.spec, c_m_s, on_line=True):
             return True
         return height(part, highest_power(part)) > threshold(part.spec, c_m_s)
 
     return tuple(part for index, part in enumerate(evidence) if contributes(index))
+
+
+def is_fixed(specs: Sequence[ArraySpec], heights: Sequence[float], without: int) -> bool:
+    """Return whether the arrays fix their common place without one of them.
+
+    Of its coordinates a pair of microphones determines one, another array two: the direction.
+
+    Parameters
+    ----------
+    specs : sequence of ArraySpec
+    heights : sequence of float
+        Height of each array at the common place, in standard deviations.
+    without : int
+        Index of the array that is left out.
+    """
+    others = [k for k in range(len(specs)) if k != without]
+    known = sum(min(2, len(specs[k].microphones_m) - 1) for k in others if heights[k] > AT_A_POINT)
+    return known >= _COORDINATES and sum(heights[k] for k in others) > FIXED * math.sqrt(len(others))
 
 
 @lru_cache(maxsize=128)

@@ -183,7 +183,7 @@ class Outbox:
         return int(rows[0][0]) if rows else None
 
     def forget_judged(self, site: str) -> None:
-        """Forget how far the events of a site are judged: nobody judges them any more."""
+        """Forget how far the events of a site are judged, because no rule is on events any more."""
         with self._kept() as db:
             db.execute("DELETE FROM judged WHERE site = ?", (site,))
 

@@ -44,7 +44,7 @@ class ZoneShape(BaseModel):
 
 
 class ZoneChange(BaseModel):
-    """What a track does in a zone."""
+    """A change of a track in a zone."""
 
     kind: Literal["zone"]
     change: Change
@@ -86,6 +86,6 @@ class Deleted(_Versioned):
 
 
 class Changes(_Versioned):
-    """What tracks did in zones, newest first."""
+    """Changes of tracks in zones, newest first."""
 
     changes: list[ZoneChange]

@@ -116,7 +116,7 @@ export class ZoneEditor {
   }
 
   #press(event) {
-    const metres = this.draft === null ? null : this.plan.under(event.offsetX, event.offsetY);
+    const metres = this.draft === null ? null : this.plan.metresAt(event.offsetX, event.offsetY);
     if (!metres) return;
     const away = this.draft.map(([x, y]) => {
       const [u, v] = this.plan.at([x, y, 0]);
@@ -133,7 +133,7 @@ export class ZoneEditor {
 
   #drag(event) {
     if (this.draft === null || this.held === null) return;
-    const metres = this.plan.under(event.offsetX, event.offsetY);
+    const metres = this.plan.metresAt(event.offsetX, event.offsetY);
     if (metres) this.#set(this.draft.map((corner, index) => (index === this.held ? metres.map(onRaster) : corner)));
   }
 

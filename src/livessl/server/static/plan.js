@@ -27,7 +27,7 @@ export class Plan {
     this.axisNames = VIEWS[view].names;
     this.size = null;
     canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
-      const metres = this.under(offsetX, offsetY);
+      const metres = this.metresAt(offsetX, offsetY);
       const words = metres?.map((value, index) => `${this.axisNames[index]} ${number(value)}`);
       write(pointer, words?.join("  ") ?? "");
     });
@@ -98,15 +98,10 @@ export class Plan {
     return called?.position && called.status !== "direction-only" ? called : null;
   }
 
-  /** Metres under a pixel, or null outside the room. */
-  under(px, py) {
-    if (this.size === null || px < this.left || px > this.right || py < this.top || py > this.bottom) return null;
-    return [(px - this.left) / this.scale, (this.bottom - py) / this.scale];
-  }
-
   /** Metres at a pixel of the canvas, or null outside the room. */
   metresAt(px, py) {
-    return this.under(px, py);
+    if (this.size === null || px < this.left || px > this.right || py < this.top || py > this.bottom) return null;
+    return [(px - this.left) / this.scale, (this.bottom - py) / this.scale];
   }
 
   // What the layers draw with.

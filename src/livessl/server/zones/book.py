@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 class ZoneRefusedError(RunError):
-    """A zone cannot be changed: somebody else owns it, or needs it."""
+    """A zone cannot be changed: the site file owns it, or a rule needs it."""
 
 
 class ZonesFileError(RunError):

@@ -1,4 +1,4 @@
-"""Who is in which zone: tracks enter, leave and loiter, with hysteresis, so that none flickers at an edge."""
+"""Presence of tracks in zones: they enter, leave and loiter, with hysteresis, so that none flickers at an edge."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NS_PER_S: Final = 1_000_000_000
 
 
 class Change(StrEnum):
-    """What a track does: it enters a zone, leaves it, or has been there for the zone's `loiter_s`."""
+    """Changes of a track: it enters a zone, leaves it, or has been there for the zone's `loiter_s`."""
 
     ENTER = "enter"
     LEAVE = "leave"
