@@ -7,8 +7,10 @@ import logging
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from itertools import count
 from pathlib import Path
 from threading import Event as Flag
+from threading import Thread
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -235,3 +237,25 @@ def test_password_is_not_shown(caplog: pytest.LogCaptureFixture) -> None:
         store.find(Query())
     store.close()
     assert "geheim" not in caplog.text + str(caught.value)
+
+
+def test_who_writes_all_the_time_keeps_out_nobody(tmp_path: Path) -> None:
+    """A thread that stores event after event must not keep an operator's change waiting."""
+    store, done = Store(tmp_path / "events.db"), Flag()
+
+    def write() -> None:
+        for k in count():
+            store.add(event(k % 100), k)
+            if done.is_set():
+                return
+
+    writers = [Thread(target=write) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    for k in range(5):
+        store.enable("lab", f"array-{k}", False)
+    done.set()
+    for writer in writers:
+        writer.join()
+    assert len(store.disabled("lab")) == 5
+    store.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -72,6 +73,7 @@ class Database:
         self.cure = CURE_OF_SERVER if self.is_remote else CURE
         """What to do if the database cannot be written."""
         self._preparing = threading.Lock()
+        self._turns = _Turns()
         self._is_prepared = False
         self._problem = ""
         if isinstance(place, str):
@@ -139,7 +141,7 @@ class Database:
         """
         self._check()
         try:
-            with self._writing.begin() as connection:
+            with self._turns, self._writing.begin() as connection:
                 yield connection
         except (DataError, IntegrityError) as error:
             raise RejectedError(f"server.events_db: cannot {what}: {told(error)}") from error
@@ -191,6 +193,31 @@ class Database:
         """Release the database."""
         self._reading.dispose()
         self._writing.dispose()
+
+
+class _Turns:
+    """A lock that goes to whoever has waited longest: one that writes all the time must not keep out the others."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_taken = False
+        self._waiting: deque[threading.Event] = deque()
+
+    def __enter__(self) -> None:
+        turn = threading.Event()
+        with self._lock:
+            if not self._is_taken:
+                self._is_taken = True
+                return
+            self._waiting.append(turn)
+        turn.wait()
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            if self._waiting:
+                self._waiting.popleft().set()  # the lock stays taken
+            else:
+                self._is_taken = False
 
 
 def told(error: Exception) -> str:
