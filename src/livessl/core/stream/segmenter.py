@@ -70,7 +70,6 @@ class Segmenter:
         if self._frame_index is not None and cut.frame_index != self._frame_index + 1:
             self._pre_roll.clear()  # frames before a gap are no pre-roll of a sound after it
             self._recent.clear()
-            self._background.skip()
             self._quiet_frames = self._hang_over + 1
         self._frame_index = cut.frame_index
         samples = self._selected(cut)

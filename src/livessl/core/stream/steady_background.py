@@ -4,9 +4,8 @@ A mains hum, a fan's tone or rumble can be far above everything else in the band
 all the rest hardly raises the level. The background is therefore tracked in every bin of the frames' spectra, as the
 least power of a few seconds. Bins whose background stands far above the others' are *loud*; in them only what exceeds
 their usual power by far counts. Bins outside the band may be loud as well and leak into it, which a Hann window
-prevents. That window hides what is short and lies at the edge of a frame. While something is loud, the power is
-therefore the mean of two windows: that of the frame, and one half a frame earlier. Without loud bins the level is the
-plain power in the band.
+prevents. That window weakens what is short and lies at the edge of a frame. Without loud bins the level is the plain
+power in the band.
 """
 
 from __future__ import annotations
@@ -69,8 +68,6 @@ class SteadyBackground:
         bins = min(self._count // 2 + 1, round(BEYOND * self._band.stop))
         self._bins = slice(0, bins)
         self._zero = np.zeros(bins)
-        self._half = self._count // 2
-        self._before: Float32Array | None = None  # the last half of the frame before
         self._latest: deque[FloatArray] = deque(maxlen=_SMOOTHING)
         self._blocks: deque[FloatArray] = deque(maxlen=max(1, round(window_s / FRAME_S / _BLOCK) - 1))
         self._of_blocks: FloatArray | None = None  # the least of all of them
@@ -83,7 +80,7 @@ class SteadyBackground:
         self._maximum: FloatArray = np.zeros(bins)
 
     def spectrum(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
-        """Return the power of the next frame in each bin, mean over the channels, full scale squared: (F,).
+        """Return the power of a frame in each bin, mean over the channels, full scale squared: (F,).
 
         Parameters
         ----------
@@ -92,27 +89,12 @@ class SteadyBackground:
             Its spectra without a window, from which those with one follow: the window is a constant and one cosine.
         """
         if samples.shape[1] == self._count:
-            power = self._power(_windowed(plain, self._bins.stop, self._count))
+            spectra = _windowed(plain, self._bins.stop, self._count)
         else:
-            power = self._power(self._spectra(samples[:, : self._count]))
-        if self._before is not None and self._loud.any():
-            across = np.concatenate([self._before, samples[:, : self._count - self._half]], axis=1)
-            power = 0.5 * (power + self._power(self._spectra(across)))
-        self._before = samples[:, -self._half :]
-        return power
-
-    def skip(self) -> None:
-        """Note that frames are missing before the next one."""
-        self._before = None
-
-    def _spectra(self, samples: Float32Array) -> ComplexArray:
-        """Return the spectra with a window of at most `_count` samples: (K, F)."""
-        windowed = samples * self._window[: samples.shape[1]]
-        return np.asarray(scipy.fft.rfft(windowed, self._count, axis=1)[:, self._bins])
-
-    def _power(self, spectra: ComplexArray) -> FloatArray:
+            frame = samples[:, : self._count]
+            spectra = scipy.fft.rfft(frame * self._window[: frame.shape[1]], self._count, axis=1)[:, self._bins]
         power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=0, dtype=np.float64)
-        return np.asarray(power * (self._scale / len(spectra)))
+        return np.asarray(power * (self._scale / len(samples)))
 
     def learn(self, spectrum: FloatArray) -> bool:
         """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
