@@ -17,8 +17,9 @@ from livessl.core.commission.findings import OF_SET_UP
 from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 from livessl.recordings.assign import AssignedRecording
+from livessl.site.build.inputs import with_inputs
 from livessl.site.build.layout import layout_findings
-from livessl.site.build.set_up import find_set_up_faults, with_inputs
+from livessl.site.build.set_up import find_set_up_faults
 from livessl.site.models import Site
 
 

@@ -19,11 +19,8 @@ from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import paced_blocks
 from livessl.recordings.session import Piece, piece, write_session
-from livessl.recordings.sound_file import Format, SoundWriter
+from livessl.recordings.sound_file import FLAC_MAX_CHANNELS, Format, SoundWriter
 from livessl.site.models import Site
-
-FLAC_MAX_CHANNELS: Final = 8
-"""Most channels of a FLAC file, by its format."""
 
 
 class RecordingError(RunError):

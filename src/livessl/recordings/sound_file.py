@@ -19,6 +19,9 @@ from livessl.core.types import Float32Array
 from livessl.errors import DeviceError
 from livessl.recordings.headers import STREAMINFO_END, Repair, apply_repair, find_repair, flac_header
 
+FLAC_MAX_CHANNELS: Final = 8
+"""Most channels of a FLAC file, by its format."""
+
 Format = Literal["flac", "wav"]
 
 _WRITTEN: Final = {"flac": ("FLAC", "PCM_24"), "wav": ("RF64", "FLOAT")}

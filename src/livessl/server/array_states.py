@@ -22,8 +22,8 @@ from livessl.server.overload import Overload
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
+from livessl.site.build.inputs import with_inputs
 from livessl.site.build.pipeline import activity_parameters
-from livessl.site.build.set_up import with_inputs
 from livessl.site.models import Site
 
 REPORT_NS: Final = 500_000_000

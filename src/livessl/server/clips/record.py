@@ -12,8 +12,7 @@ import numpy as np
 from livessl.clock import utc_text
 from livessl.core.enhance.enhance import Enhancement, plan
 from livessl.core.types import Event, Float32Array, FloatArray
-from livessl.recordings.recorder import FLAC_MAX_CHANNELS
-from livessl.recordings.sound_file import Format, SoundWriter
+from livessl.recordings.sound_file import FLAC_MAX_CHANNELS, Format, SoundWriter
 from livessl.server.clips.cut import Cut
 
 ENHANCED: Final = "enhanced.flac"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from livessl.core.commission.finding import Finding
 from livessl.core.commission.findings import channel_findings, find_faults, set_up_findings, sharp_delays
 from livessl.core.types import FloatArray, Observation
 from livessl.site.build.grid import search_grid
+from livessl.site.build.inputs import with_inputs
 from livessl.site.models import Site
 
 
@@ -40,22 +40,3 @@ def verify_set_up(site: Site, sounds: Sequence[Sequence[Observation]], places_m:
         return with_inputs(site, of_channels)
     diagnosis = verify({name: microphones[name] for name in delays}, delays, places_m, site.c_m_s)
     return with_inputs(site, [*of_channels, *set_up_findings(diagnosis)])
-
-
-def with_inputs(site: Site, findings: Sequence[Finding]) -> list[Finding]:
-    """Add the input of the device to each finding about a channel, where the site file says which one it is."""
-    return [replace(one, input=_input(site, one)) for one in findings]
-
-
-def _input(site: Site, finding: Finding) -> int | None:
-    if finding.array is None or finding.channel is None:
-        return None
-    channel = finding.channel
-    for array in site.members(finding.array):
-        count = len(site.array(array).microphones_m)
-        if channel <= count:
-            node = site.node_of(array)
-            inputs = site.nodes[node].arrays[array] if node is not None else []
-            return inputs[channel - 1] if len(inputs) >= channel else None
-        channel -= count
-    return None
