@@ -1,6 +1,6 @@
 """The sections at the end of a mark, as bytes: levels of its channels, and the state of its node's machine.
 
-A section is a tag, a length and as many bytes. A figure that is not known is sent as NaN.
+A section is a tag, the length of its body in bytes, and the body. A figure that is not known is sent as NaN.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_DB: Final = 1000.0
 """Largest magnitude of a level or ratio, in decibels: far beyond any that finite samples can have."""
 
 MAX_MEAN: Final = 1e7
-"""Largest magnitude of a mean, full scale 1: above the largest sample."""
+"""Largest magnitude of a channel's mean that is accepted; full scale is 1, which samples may exceed, but not so far."""
 
 MAX_HUM_HZ: Final = 1e6
 
@@ -63,7 +63,7 @@ class Sections:
 
 
 def encode_sections(sections: Sections) -> bytes:
-    """Return sections as bytes; none for what is not given."""
+    """Encode the sections; an absent value gives none."""
     levels, host = sections.levels, sections.host
     parts = []
     if levels:
@@ -81,7 +81,7 @@ def decode_sections(data: memoryview) -> Sections:
     Raises
     ------
     SectionError
-        If a section is cut, or holds a value that no node sends.
+        If a section is truncated, or holds a value that no node sends.
     """
     levels: tuple[ChannelLevel, ...] = ()
     drift_error_ppm: float | None = None
@@ -175,7 +175,7 @@ def _decode_host(body: memoryview) -> HostState:
     names = bytes(body[_STATE.size :])
     if synchronized >= len(_SYNCHRONIZED) or len(names) != sum(lengths):
         raise SectionError(
-            f"expected a machine's state with {sum(lengths)} bytes of names and a known clock, "
+            f"expected a machine's state with {sum(lengths)} bytes of names and a clock's state of 0, 1 or 2, "
             f"got {len(names)} bytes and {synchronized}"
         )
     service, reference, machine = (

@@ -11,8 +11,8 @@ PRIORITY: Final = 10
 """Real-time priority, above all ordinary programs and below the kernel's interrupt threads, which have 50."""
 
 LONGEST_S: Final = 1
-"""Processor time in seconds that a thread may take without a wait. The kernel ends a process that takes more, so a
-library that loops cannot take the machine."""
+"""Longest processor time, in seconds, of a real-time thread without a blocking call (RLIMIT_RTTIME). The kernel ends a
+process that takes more, so a library that loops cannot take the machine."""
 
 _LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
 """Flags of mlockall. Pages are locked when they are first used, so locking takes no memory."""

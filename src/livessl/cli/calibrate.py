@@ -1,4 +1,4 @@
-"""`livessl calibrate`: clap at places that you know; it says how right the site is, and measures the arrays' poses."""
+"""`livessl calibrate`: checks a site with claps at places that you know, and measures the arrays' poses."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def add_arguments(parser: Any) -> None:
         sub = actions.add_parser(
             name,
             help=text,
-            description=f"{text[0].upper()}{text[1:]}. With a running server it asks for each clap: give its site file "
-            "by --site, or its address by --url. With a recording of the claps, give --session or --wav.",
+            description=f"{text[0].upper()}{text[1:]}. With a running server, the command prompts for each clap: give "
+            "its site file by --site, or its address by --url. With a recording of the claps, give --session or --wav.",
             epilog=f"example: livessl calibrate {example}",
         )
         sub.set_defaults(act=act)
         add_recordings(sub)
-        add_server(sub, "it asks for each clap and waits for it")
+        add_server(sub, "the command prompts for each clap and waits for it")
         sub.add_argument(
             "--wait",
             type=argument.above_zero,
@@ -80,7 +80,7 @@ def add_arguments(parser: Any) -> None:
         "measure where the arrays are, by claps at places that you know",
         "poses --site site.yaml --at 2,3,1.2 --at 6,8,1.2 … --write",
     )
-    _add_places(sub, "place of a clap in metres; repeat for each. With a running server, places are proposed without")
+    _add_places(sub, "place of a clap in metres; repeat for each. Without it, places are proposed if a server runs")
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -93,7 +93,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "refine",
         _refine,
-        "measure where the arrays are, by sounds at unknown places, with one array known",
+        "measure where the arrays are from sounds at unknown places; one array's pose must be right",
         "refine --site site.yaml --known north --write",
     )
     sub.add_argument(
@@ -101,7 +101,7 @@ def add_arguments(parser: Any) -> None:
         action="append",
         default=[],
         metavar="ARRAY",
-        help="array that is where the site file says; repeatable (default: the first)",
+        help="array whose pose in the site file is right; repeatable (default: the first)",
     )
     sub.add_argument(
         "--position-std",
@@ -109,7 +109,7 @@ def add_arguments(parser: Any) -> None:
         default=POSITION_STD_M,
         metavar="M",
         help="how exactly the site file's positions are known, standard deviation in metres "
-        f"(default {POSITION_STD_M:g}, a tape)",
+        f"(default {POSITION_STD_M:g}, as measured by tape)",
     )
     sub.add_argument(
         "--sounds",

@@ -1,4 +1,7 @@
-"""Claps, poses and the speed of sound as `livessl calibrate` prints them: as lines, or as JSON objects."""
+"""Claps, poses and the speed of sound as `livessl calibrate` prints them: as lines, or as JSON objects.
+
+The words of findings are in `livessl.core.commission.findings`.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 class Refused:
     """The refusals of one caller for one reason.
 
-    `door` is `nodes` or `http`, `who` the address, `last_ns` the site time of the last refusal.
+    `door` is the interface, `nodes` or `http`; `who` the caller's address, `last_ns` the site time of the last refusal.
     """
 
     door: str
@@ -30,7 +30,7 @@ class Refused:
 
 
 class Refusals:
-    """Everyone who was refused since the start. Every thread may call it.
+    """All refusals since the start. Every thread may call it.
 
     Parameters
     ----------

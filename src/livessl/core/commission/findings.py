@@ -234,7 +234,7 @@ def _words(alternative: Alternative) -> tuple[str, str]:
         return what, "exchange the plugs, or give the channels in this order in the site file (nodes.NAME.arrays)"
     if alternative.fault == "mirrored":
         return (
-            "the arrays are wired the other way round",
+            "in all arrays the channels have the same wrong order, so that the room appears mirrored",
             f"plug in the microphones in the order {', '.join(str(channel) for channel in alternative.order)}, "
             "or give the channels so in the site file (nodes.NAME.arrays)",
         )

@@ -1,4 +1,7 @@
-"""One array's frames become one recording around an event: joined, with gaps filled by zeros and listed."""
+"""One array's frames become one recording around an event: joined, with gaps filled by zeros and listed.
+
+`record` writes it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Connections to the database of the history: SQLite in memory or in a file, or PostgreSQL, with its tables made."""
+"""Connections to the database of the history: SQLite in memory or in a file, or PostgreSQL, with its tables made.
+
+`records` has the statements.
+"""
 
 from __future__ import annotations
 
