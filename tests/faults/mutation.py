@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 
 from livessl import wire
-from livessl.core.types import Frame, Mark
+from livessl.core.types import ChannelLevel, Frame, HostState, Mark
 from livessl.server.ingest import Ingest
 from small_site import site_of
 
@@ -23,8 +23,17 @@ def originals() -> list[bytes]:
         hello,
         wire.Ack("run-1", {"north": 1000}, 900),
         wire.Bye("a", "run-1"),
+        wire.Welcome("run-1", (wire.SECTIONS,)),
     ]
     return [wire.encode(message) for message in messages]
+
+
+def with_sections() -> bytes:
+    """A mark that ends with sections of every kind."""
+    level = ChannelLevel(-20.0, -40.0, 3, 0.001, 50.0, -50.0, -70.0, 12.0)
+    host = HostState(True, "chrony", "ntp.example", 0.001, 2, 0.5, False, "lab-pc")
+    mark = Mark("north", 7, 1002, 1e-6, 1e-6, (1e-6,) * 4, levels=(level,) * 4, drift_error_ppm=2.0, host=host)
+    return wire.encode(mark)
 
 
 def mutated(rng: random.Random, pool: list[bytes]) -> bytes:
@@ -55,7 +64,7 @@ def campaign(count: int, seed: int) -> Counter[str]:
     Anything but a refusal in words is an exception that ends it. What still decodes must be a message that encodes.
     """
     rng = random.Random(seed)
-    pool = originals()
+    pool = [*originals(), with_sections(), with_sections()]
     site = site_of()
     ingest = Ingest(site)
     outcomes: Counter[str] = Counter()

@@ -11,7 +11,7 @@ from livessl.core.types import Frame
 
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_but_messages_and_refusals(seed: int) -> None:
-    found = fuzz(10_000, seed)
+    found = fuzz(20_000, seed)
     assert found.outcomes["refused"] > 5000
     assert {"Frame", "Mark", "Hello", "Ack", "Bye"} <= found.outcomes.keys()
     assert lines_missed(found) == []
