@@ -151,6 +151,14 @@ def test_paths_without_a_route_are_guarded() -> None:
     assert needed_role("GET", "/staticky") is Role.VIEWER
     assert needed_role("POST", "/static/app.js") is Role.OPERATOR
     assert needed_role("POST", "/api/v1/access") is Role.ADMIN
+    assert needed_role("GET", "/api/v1/access\n") is Role.ADMIN  # the router ignores a last newline, too
+    assert needed_role("GET", "/api/v1/listen\n") is Role.OPERATOR
+    assert needed_role("GET", "/api/v1/events/a/clips/b\n.flac") is Role.OPERATOR
+
+
+@pytest.mark.parametrize("path", ["access", "access%0A"])
+def test_newline_in_a_path_opens_nothing(secured: Secured, path: str) -> None:
+    assert secured.ask(f"/api/v1/{path}", Role.OPERATOR).status_code == 403
 
 
 @pytest.mark.parametrize("role", list(Role))

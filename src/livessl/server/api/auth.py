@@ -39,7 +39,7 @@ RELOAD_S: Final = 1.0
 CLOSE_S: Final = 1.0
 """Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
 
-_SOUND: Final = re.compile(r"/api/v1/(events/[^/]*/clips/.+|listen)")
+_SOUND: Final = re.compile(r"/api/v1/(events/[^/]*/clips/.+|listen)", re.DOTALL)
 """Addresses of recordings and of live sound: sound is for operators, whoever may see where it was."""
 
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -196,8 +196,10 @@ def _until(revoked: asyncio.Event, receive: Receive) -> Receive:
 def needed_role(method: str, path: str) -> Role | None:
     """Lowest role that a request needs; None for the pages without data and for health, which anyone may read.
 
-    Every path is covered: a route that is added later is guarded from the start.
+    Every path is covered: a route that is added later is guarded from the start. A last newline is ignored, as the
+    pattern of a route ignores it.
     """
+    path = path.removesuffix("\n")
     if method in _READING and (path in ("/", "/docs", "/history", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
     if path == ACCESS:
