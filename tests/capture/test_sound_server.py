@@ -141,4 +141,5 @@ def test_card_that_is_pulled_out_is_opened_again(card: VirtualCard) -> None:
     assert gone["index"] > first["index"]
     card.plug_in()
     back = next(state for state in states if state["sound"])
-    assert back == {"index": gone["index"], "sound": True, "overflow": True, "problem": None}
+    assert back["index"] >= gone["index"]  # what was received before the end may be read after it
+    assert (back["overflow"], back["problem"]) == (True, None)
