@@ -213,6 +213,15 @@ def test_frames_of_the_longest_event_are_kept_until_its_clip_is_cut(tmp_path: Pa
     assert desk.clips.counts.written == 1
 
 
+def test_clips_that_were_deleted_and_not_erased_are_erased_with_the_next_old_ones(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    left = tmp_path / "clips" / ".partial-going-small-1"
+    left.mkdir()
+    (left / "a.flac").write_bytes(b"sound")
+    desk.work()
+    assert not left.exists()
+
+
 def test_clip_that_fails_for_whatever_reason_is_counted_and_the_next_one_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

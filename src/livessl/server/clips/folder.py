@@ -88,7 +88,9 @@ class ClipFolder:
                 self._load(folder)
             except OSError as error:
                 _log.warning(
-                    "%s: cannot be read or deleted: %s; correct its permissions or delete it", folder, error.strerror
+                    "%s: cannot be read or deleted: %s; correct its permissions or delete it",
+                    folder,
+                    error.strerror or error,
                 )
             except (KeyError, TypeError, ValueError) as error:
                 _log.warning(
@@ -102,10 +104,11 @@ class ClipFolder:
             if not (folder / ABOUT).exists() or not _SAFE.fullmatch(folder.name):
                 _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
                 return
-            about = _parsed((folder / ABOUT).read_bytes())
-            if about is not None:
-                self._note(folder.name, about)
-                return
+            with self._lock:  # an operator may delete it meanwhile
+                about = _parsed((folder / ABOUT).read_bytes())
+                if about is not None:
+                    self._note(folder.name, about)
+                    return
             _log.warning("%s: %s is empty or damaged; the folder is deleted", folder, ABOUT)
             going = self._path / f"{PARTIAL}going-{folder.name}"
             self._finish(going)
