@@ -101,7 +101,8 @@ def assemble(
 
         latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
         overload = Overload(clock)
-        set_up_watch = SetUpWatch(site, overload)
+        # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
+        set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
         alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
         undo.callback(alerts.stop)

@@ -160,7 +160,11 @@ class Engine:
         self._maps.clear()
 
     def _switch(self, run: Run) -> None:
-        """Begin another run, and replace the acknowledged final indices: those of the previous run do not apply."""
+        """Begin another run, and replace the acknowledged final indices: those of the previous run do not apply.
+
+        Its tracks end while the mode is still that of the previous run, which may have died without an end.
+        """
+        self._publisher.end_tracks()
         self._begin(run)
         self._receiver.ingest.note_final(run.fusion.settled_of)
 

@@ -21,7 +21,7 @@ class HeardSound:
     Parameters
     ----------
     number : int
-        Number of the sound, from 1; later sounds have higher ones while the server runs.
+        Number of the sound; later sounds have higher ones.
     event : Event
         Its final event, without what it was located from.
     observations : tuple of Observation
@@ -36,19 +36,25 @@ class HeardSounds:
     """Keeps the last sounds. The fusion thread calls `take` and `forget`; every thread may read.
 
     Delays are measured when they are read, so that the fusion thread spends no time on it.
+
+    Parameters
+    ----------
+    first : int
+        The number after which the numbers of the sounds begin.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 0) -> None:
         self._lock = threading.Lock()
         self._observing = threading.Lock()
         self._new: deque[tuple[int, Event]] = deque(maxlen=KEPT)
         self._sounds: deque[HeardSound] = deque(maxlen=KEPT)
-        self._last = 0
+        self._last = first
+        self._observed = first  # number of the last sound whose delays were measured
         self._run = 0  # number of times that all sounds were forgotten
 
     @property
     def last(self) -> int:
-        """Number of the last sound; 0 before the first."""
+        """Number of the last sound; before the first, the number after which they begin."""
         return self._last
 
     def take(self, event: Event) -> None:
@@ -66,9 +72,13 @@ class HeardSounds:
 
     def after(self, number: int) -> list[HeardSound]:
         """Return the sounds with a higher number, the oldest first."""
+        return self.read(number)[0]
+
+    def read(self, number: int) -> tuple[list[HeardSound], int]:
+        """Return the sounds with a higher number, the oldest first, and the number after which to ask for the next."""
         self._observe()
         with self._lock:
-            return [sound for sound in self._sounds if sound.number > number]
+            return [sound for sound in self._sounds if sound.number > number], self._observed
 
     def numbered(self, numbers: list[int]) -> list[HeardSound]:
         """Return the sounds of these numbers in this order.
@@ -88,13 +98,15 @@ class HeardSounds:
         """Measure the delays of the sounds that are new."""
         with self._observing:
             with self._lock:
-                new, run = list(self._new), self._run
+                new, run, last = list(self._new), self._run, self._last
                 self._new.clear()
-            if not new:
-                return
+                if not new:
+                    self._observed = last
+                    return
             observed = [
                 HeardSound(number, replace(event, received=()), observe(event.received)) for number, event in new
             ]
             with self._lock:
+                self._observed = last
                 if run == self._run:
                     self._sounds.extend(observed)

@@ -58,13 +58,15 @@ class SetUpWatch:
     site : Site
     overload : Overload
         Nothing is examined while sound arrives faster than it is located.
+    first_sound : int
+        The number after which the numbers of the sounds begin.
     """
 
-    def __init__(self, site: Site, overload: Overload) -> None:
+    def __init__(self, site: Site, overload: Overload, first_sound: int = 0) -> None:
         self._site = site
         self._overload = overload
         self._lock = threading.Lock()
-        self.heard = HeardSounds()
+        self.heard = HeardSounds(first_sound)
         """The last sounds, for whoever calibrates."""
         self._examined = 0  # number of the last sound that was examined
         self._sounds: Sequence[Sequence[Observation]] = ()

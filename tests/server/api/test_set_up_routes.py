@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +13,7 @@ from scene_server import capture_scene, get
 
 from known_sounds import events, finish, places_m
 from livessl.server.app import Server
+from livessl.site.build import set_up
 from small_site import running_server, scene, site_of, wait_until
 
 
@@ -68,6 +70,34 @@ def test_a_clap_far_from_its_place_is_not_explained_by_one_sound(client: httpx.C
     found = verify(client, [number])
     assert found["verdict"] != "ok"
     assert found["claps"][0]["error_m"] > 0.3
+
+
+def test_numbers_of_sounds_are_higher_than_before_a_restart(server: Server) -> None:
+    assert server.parts.set_up_watch.heard.last > 1_700_000_000_000  # milliseconds since the epoch
+
+
+def test_a_verification_beside_another_one_does_not_wait(
+    client: httpx.Client, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached, release = threading.Event(), threading.Event()
+
+    def slow(*_: Any) -> list[Any]:
+        reached.set()
+        assert release.wait(60)
+        return []
+
+    monkeypatch.setattr(set_up, "verify_set_up", slow)
+    number = finish(server, events()[0])
+    first = threading.Thread(target=verify, args=(client, [number]))
+    first.start()
+    try:
+        assert reached.wait(60)
+        told = "another verification is running; try again in some seconds"
+        assert verify(client, [number], 409)["detail"] == told
+    finally:
+        release.set()
+        first.join(60)
+    verify(client, [number])
 
 
 def test_a_sound_that_is_not_kept_is_told(client: httpx.Client) -> None:

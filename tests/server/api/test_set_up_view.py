@@ -95,6 +95,23 @@ def test_a_click_on_the_plan_chooses_the_place(browser: Browser, server: Server)
         expect(page.get_by_role("button", name="Clap here")).to_be_visible()
 
 
+def test_verification_beside_another_one_is_told_and_the_next_clap_counts_both(
+    browser: Browser, server: Server
+) -> None:
+    told = "another verification is running; try again in some seconds"
+    with faultless_page(browser) as page:
+        opened(page, server)
+        page.route("**/set-up/verify", lambda route: route.fulfill(status=409, json={"detail": told}), times=1)
+        for axis, metres in zip("xyz", places_m()[0], strict=True):
+            page.locator(f"#clap-{axis}").fill(f"{metres:.2f}")
+        with page.expect_response(lambda response: "/sounds?after=" in response.url, timeout=MS):
+            page.get_by_role("button", name="Clap here").click()
+        finish(server, events()[0])
+        expect(page.get_by_test_id("clap-say")).to_have_text(told, timeout=MS)
+        clap(page, server, 1, events()[1])
+        expect(page.get_by_test_id("clap-1")).to_be_visible()
+
+
 def test_inputs_show_their_levels_and_the_live_view_comes_back(browser: Browser, server: Server) -> None:
     with faultless_page(browser) as page:
         opened(page, server)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from livessl.server.clips.folder import PARTIAL, ClipFolder, ClipsError
 
 SOUND = b"what somebody said"
+real_rmtree = shutil.rmtree
 
 
 def write(start_ns: int, content: bytes = SOUND) -> Any:
@@ -109,6 +111,103 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     assert (again.count, again.kept, again.nbytes) == (2, 1, 2 * len(SOUND))
     assert (tmp_path / "foreign").is_dir()
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
+
+
+def broken(*names: str) -> Any:
+    """Stands in for `shutil.rmtree`: some folders cannot be deleted."""
+
+    def rmtree(path: Path) -> None:
+        if path.name in names:
+            raise PermissionError(13, "Permission denied")
+        real_rmtree(path)
+
+    return rmtree
+
+
+def test_start_goes_on_after_folders_that_cannot_be_read_or_erased(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-9", write(5))
+    (tmp_path / f"{PARTIAL}going-lab-1").mkdir()
+    for name, about in [("lab-2", b"{}"), ("lab-3", b'{"start_ns": null, "files": [], "keep": false}')]:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "clip.json").write_bytes(about)
+    monkeypatch.setattr(shutil, "rmtree", broken(f"{PARTIAL}going-lab-1"))
+    again = ClipFolder(tmp_path)
+    again.load()
+    assert again.count == 1
+    assert "going-lab-1: cannot be read or deleted: Permission denied; correct its permissions or" in caplog.text
+    assert caplog.text.count("expected a complete clip.json") == 2
+
+
+def test_start_deletes_clips_whose_file_about_them_is_empty_or_damaged(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    for name, about in [("lab-1", b""), ("lab-2", b'{"keep": tr'), ("lab-3", b"[]")]:
+        folder.put(name, write(5))
+        (tmp_path / name / "clip.json").write_bytes(about)
+    (tmp_path / "foreign").mkdir()
+    ClipFolder(tmp_path).load()
+    assert [each.name for each in tmp_path.iterdir()] == ["foreign"]
+
+
+def test_file_about_a_clip_is_on_the_disk_before_the_clip_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, bool]] = []
+
+    def fsync(number: int) -> None:
+        synced.append((Path(f"/proc/self/fd/{number}").readlink().name, (tmp_path / "lab-1").exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    ClipFolder(tmp_path).put("lab-1", write(5))
+    assert synced == [("clip.json", False)]
+
+
+def test_sound_that_cannot_be_overwritten_is_deleted_nevertheless(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+
+    def full(number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert folder.delete("lab-1")
+    assert list(tmp_path.iterdir()) == []
+    assert "deleted without being overwritten: No space left on device" in caplog.text
+
+
+def test_clip_that_could_not_be_erased_is_erased_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ClipFolder(tmp_path)
+    for name in ("lab-1", "lab-2"):
+        folder.put(name, write(5))
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", broken(f"{PARTIAL}going-lab-1"))
+        with pytest.raises(PermissionError):
+            folder.expire(10, 1000)
+        assert [each.name for each in tmp_path.iterdir()] == [f"{PARTIAL}going-lab-1"]  # the other one is gone
+        with pytest.raises(PermissionError):
+            folder.erase_left()
+    folder.erase_left()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clip_that_is_kept_while_old_ones_are_deleted_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ClipFolder(tmp_path)
+    for number in (1, 2):
+        folder.put(f"lab-{number}", write(number))
+    erase = folder._finish
+
+    def kept_meanwhile(going: Path) -> None:
+        folder.keep("lab-2", True)
+        erase(going)
+
+    monkeypatch.setattr(folder, "_finish", kept_meanwhile)
+    assert folder.expire(10, 1000) == 1
+    assert (folder.count, folder.kept) == (1, 1)
+    assert folder.about("lab-2") is not None
 
 
 @given(

@@ -204,6 +204,45 @@ def test_frames_are_released_once_their_results_are_final(tmp_path: Path) -> Non
     assert desk.clips.counts.without_sound == 1
 
 
+def test_frames_of_the_longest_event_are_kept_until_its_clip_is_cut(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, {"fusion.max_event_s": 60})
+    desk.clips.take(heard(range(-8, 16)), None)
+    desk.clips.take([], START + 1200)  # one minute of an event is final at once
+    desk.finish(event())
+    desk.work()
+    assert desk.clips.counts.written == 1
+
+
+def test_clips_that_were_deleted_and_not_erased_are_erased_with_the_next_old_ones(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    left = tmp_path / "clips" / ".partial-going-small-1"
+    left.mkdir()
+    (left / "a.flac").write_bytes(b"sound")
+    desk.work()
+    assert not left.exists()
+
+
+def test_clip_that_fails_for_whatever_reason_is_counted_and_the_next_one_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(tmp_path)
+
+    def fail(*_: Any) -> Any:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    desk.clips.take(heard(range(-8, 16)), None)
+    with monkeypatch.context() as patch:
+        patch.setattr(service, "write_clip", fail)
+        desk.finish(event())
+        desk.work()
+    assert (desk.clips.counts.failed, desk.clips.waiting) == (1, 0)
+    [problem] = desk.clips.problems
+    assert "the clip of 'small-0' was not made: LinAlgError: Singular matrix; report" in problem
+    desk.finish(event())
+    desk.work()
+    assert (desk.clips.counts.written, desk.clips.problems) == (1, [])
+
+
 def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

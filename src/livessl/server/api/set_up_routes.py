@@ -19,7 +19,10 @@ from livessl.server.api.routes import as_json
 from livessl.server.heard_sounds import HeardSound
 from livessl.server.parts import Parts
 
-_GONE = "One of the sounds is not kept: the last 64 are."
+_TEXTS = {
+    404: "One of the sounds is not kept: the last 64 are.",
+    409: "Another verification is running: it takes up to seconds of one core.",
+}
 
 
 def set_up_routes(parts: Parts) -> APIRouter:
@@ -31,15 +34,15 @@ def set_up_routes(parts: Parts) -> APIRouter:
         after: Annotated[int, Query(ge=0, le=2**53, description="only sounds of a higher number")] = 0,
     ) -> Response:
         """The last 64 sounds with the delays that each array observed, the oldest first: what calibration uses."""
-        sounds = heard.after(after)
+        sounds, last = heard.read(after)
         now_utc = utc_text(parts.site_time.now_ns())
         found = [_sound(sound) for sound in sounds]
-        return as_json({"v": API_VERSION, "now_utc": now_utc, "last": heard.last, "sounds": found})
+        return as_json({"v": API_VERSION, "now_utc": now_utc, "last": last, "sounds": found})
 
     @router.post(
         "/api/v1/set-up/verify",
         response_model=set_up_schema.Verified,
-        responses=errors(400, 404, 411, 413, texts={404: _GONE}),
+        responses=errors(400, 404, 409, 411, 413, texts=_TEXTS),
     )
     def post_verify(request: set_up_schema.VerifyRequest) -> Response:
         """Compare sounds with the places where they were made, and explain the errors; changes nothing. For operators.
@@ -53,8 +56,12 @@ def set_up_routes(parts: Parts) -> APIRouter:
         except LookupError as error:
             raise HTTPException(404, f"sound {error} is not kept any more; make it again") from error
         places_m = np.array([clap.place_m for clap in request.claps], dtype=np.float64)
-        with one_at_a_time:  # it takes up to seconds of one core
+        if not one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
+            raise HTTPException(409, "another verification is running; try again in some seconds")
+        try:
             findings = verify_set_up(parts.site, [sound.observations for sound in sounds], places_m)
+        finally:
+            one_at_a_time.release()
         claps = [_clap(sound, place_m) for sound, place_m in zip(sounds, places_m, strict=True)]
         return as_json(
             {

@@ -64,7 +64,9 @@ class HeardSounds(BaseModel):
 
     v: Version
     now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
-    last: int = Field(ge=0, description="Number of the newest sound; 0 before the first.", examples=[17])
+    last: int = Field(
+        ge=0, description="Number of the newest sound; sounds that come later have higher ones.", examples=[17]
+    )
     sounds: list[HeardSound]
 
 

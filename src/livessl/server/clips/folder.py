@@ -63,6 +63,7 @@ class ClipFolder:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.RLock()
+        self._erasing = threading.Lock()  # is never held while waiting for the other lock
         self._entries: dict[str, _Entry] = {}
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -76,16 +77,43 @@ class ClipFolder:
             ) from error
 
     def load(self) -> None:
-        """Read what is there, and delete what a killed server has left unfinished."""
-        for folder in sorted(self._path.iterdir()):
-            if folder.name.startswith(PARTIAL):
-                _erase(folder)
-            elif folder.is_dir():
-                about = self.about(folder.name)
-                if about is None:
-                    _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
-                else:
+        """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged."""
+        try:
+            folders = sorted(self._path.iterdir())
+        except OSError as error:
+            _log.error("%s: cannot be read: %s; correct its permissions and restart the server", self._path, error)
+            return
+        for folder in folders:
+            try:
+                self._load(folder)
+            except OSError as error:
+                _log.warning(
+                    "%s: cannot be read or deleted: %s; correct its permissions or delete it",
+                    folder,
+                    error.strerror or error,
+                )
+            except (KeyError, TypeError, ValueError) as error:
+                _log.warning(
+                    "%s: expected a complete %s, got an unknown one (%r); delete the folder", folder, ABOUT, error
+                )
+
+    def _load(self, folder: Path) -> None:
+        if folder.name.startswith(PARTIAL):
+            self._finish(folder)
+        elif folder.is_dir():
+            if not (folder / ABOUT).exists() or not _SAFE.fullmatch(folder.name):
+                _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
+                return
+            with self._lock:  # an operator may delete it meanwhile
+                about = _parsed((folder / ABOUT).read_bytes())
+                if about is not None:
                     self._note(folder.name, about)
+                    return
+            _log.warning("%s: %s is empty or damaged; the folder is deleted", folder, ABOUT)
+            going = self._path / f"{PARTIAL}going-{folder.name}"
+            self._finish(going)
+            folder.rename(going)
+            self._finish(going)
 
     @property
     def nbytes(self) -> int:
@@ -115,10 +143,9 @@ class ClipFolder:
         if not _SAFE.fullmatch(event_id):
             return None
         try:
-            about = orjson.loads((self._path / event_id / ABOUT).read_bytes())
-        except (OSError, orjson.JSONDecodeError):
+            return _parsed((self._path / event_id / ABOUT).read_bytes())
+        except OSError:
             return None
-        return about if isinstance(about, dict) else None
 
     def file(self, event_id: str, name: str) -> Path | None:
         """Return the path of one of a clip's recordings; None if there is none of that name."""
@@ -154,8 +181,8 @@ class ClipFolder:
             about = {**write(partial), "keep": False}
             with self._lock:
                 earlier = self.about(event_id)
-                about["keep"] = earlier is not None and earlier["keep"]
-                (partial / ABOUT).write_bytes(orjson.dumps(about))
+                about["keep"] = earlier is not None and bool(earlier.get("keep"))
+                _write_through(partial / ABOUT, orjson.dumps(about))
                 going = self._set_aside(event_id)
                 partial.rename(self._path / event_id)
                 self._note(event_id, about)
@@ -164,7 +191,7 @@ class ClipFolder:
                 _erase(partial)
             raise
         if going is not None:
-            _erase(going)
+            self._finish(going)
         return about
 
     def keep(self, event_id: str, keep: bool) -> bool:
@@ -181,7 +208,7 @@ class ClipFolder:
                 return False
             path = self._path / event_id / ABOUT
             fresh = path.with_name(f"{PARTIAL}{ABOUT}")
-            fresh.write_bytes(orjson.dumps({**about, "keep": keep}))
+            _write_through(fresh, orjson.dumps({**about, "keep": keep}))
             fresh.replace(path)
             self._note(event_id, {**about, "keep": keep})
             return True
@@ -196,8 +223,25 @@ class ClipFolder:
         """
         going = self._set_aside(event_id)
         if going is not None:
-            _erase(going)
+            self._finish(going)
         return going is not None
+
+    def erase_left(self) -> None:
+        """Try again to erase the clips that could not be erased when they were deleted.
+
+        Raises
+        ------
+        OSError
+            If one of them cannot be erased; the others are.
+        """
+        failed: OSError | None = None
+        for going in self._path.glob(f"{PARTIAL}going-*"):
+            try:
+                self._finish(going)
+            except OSError as error:
+                failed = error
+        if failed is not None:
+            raise failed
 
     def expire(self, before_ns: int | None, most_bytes: int) -> int:
         """Delete clips of events that began before a time, and the oldest ones beyond a number of bytes.
@@ -207,29 +251,46 @@ class ClipFolder:
         Raises
         ------
         OSError
-            If a file cannot be deleted.
+            If a file cannot be deleted; the other clips are.
         """
         with self._lock:
             excess = self.nbytes - most_bytes
             oldest_first = sorted(self._entries.items(), key=lambda item: item[1].start_ns)
-        gone = 0
+        gone, failed = 0, None
         for event_id, entry in oldest_first:
             is_old = before_ns is not None and entry.start_ns < before_ns
             if not entry.keep and (is_old or excess > 0):
-                excess -= entry.nbytes
-                gone += self.delete(event_id)
+                try:
+                    going = self._set_aside(event_id, entry)
+                    if going is None:  # it was kept, replaced or deleted meanwhile
+                        continue
+                    excess -= entry.nbytes
+                    gone += 1
+                    self._finish(going)
+                except OSError as error:
+                    failed = error
+        if failed is not None:
+            raise failed
         return gone
 
-    def _set_aside(self, event_id: str) -> Path | None:
-        """Make a clip disappear at once by renaming its folder; return the folder, which is yet to be erased."""
+    def _set_aside(self, event_id: str, expected: _Entry | None = None) -> Path | None:
+        """Make a clip disappear at once by renaming its folder; return the folder, which is yet to be erased.
+
+        None if there is no clip, or not the expected one.
+        """
         with self._lock:
-            if self.about(event_id) is None:
+            if self.about(event_id) is None or (expected is not None and self._entries.get(event_id) != expected):
                 return None
             going = self._path / f"{PARTIAL}going-{event_id}"
-            _erase(going)
+            self._finish(going)
             (self._path / event_id).rename(going)
             self._entries.pop(event_id, None)
             return going
+
+    def _finish(self, going: Path) -> None:
+        """Erase a folder that was set aside; two threads may do so at once."""
+        with self._erasing:
+            _erase(going)
 
     def _note(self, event_id: str, about: Mapping[str, Any]) -> None:
         nbytes = sum(int(each["bytes"]) for each in about["files"])
@@ -237,15 +298,47 @@ class ClipFolder:
             self._entries[event_id] = _Entry(int(about["start_ns"]), nbytes, bool(about["keep"]))
 
 
+def _parsed(data: bytes) -> About | None:
+    """Return the content of the file about a clip; None if it is empty or damaged."""
+    try:
+        about = orjson.loads(data)
+    except orjson.JSONDecodeError:
+        return None
+    return about if isinstance(about, dict) else None
+
+
+def _write_through(path: Path, data: bytes) -> None:
+    """Write a file to the disk itself, so that its content is there before a rename, even if the power fails."""
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def _erase(folder: Path) -> None:
-    """Overwrite a folder's files with zeros and delete it; on some disks and file systems copies remain."""
+    """Overwrite a folder's files with zeros and delete it; on some disks and file systems copies remain.
+
+    A file that cannot be overwritten is deleted nevertheless.
+    """
     if not folder.exists():
         return
-    for path in (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()):
-        left = path.stat().st_size
-        with path.open("r+b") as file:
-            while left > 0:
-                left -= file.write(_ZEROS[:left])
-            file.flush()
-            os.fsync(file.fileno())
+    for path in folder.rglob("*"):
+        try:
+            if path.is_file() and not path.is_symlink():
+                _overwrite(path)
+        except OSError as error:
+            _log.warning(
+                "%s: deleted without being overwritten: %s; its sound may remain on the disk, check the disk",
+                path,
+                error.strerror or error,
+            )
     shutil.rmtree(folder) if folder.is_dir() else folder.unlink()
+
+
+def _overwrite(path: Path) -> None:
+    left = path.stat().st_size
+    with path.open("r+b") as file:
+        while left > 0:
+            left -= file.write(_ZEROS[:left])
+        file.flush()
+        os.fsync(file.fileno())

@@ -31,8 +31,8 @@ SETTLE_NS: Final = 1_000_000_000
 """Time, in nanoseconds, that frames after an event may take to arrive: twice the deadline of a frame index."""
 
 SPARE_NS: Final = 20_000_000_000
-"""Time, in nanoseconds, before the oldest sound without a final result from which frames are kept: the longest event,
-and the time in which its clip is cut."""
+"""Time, in nanoseconds, in which the clip of a final event is cut: frames are kept so much longer than the longest
+event and what is kept before and after it."""
 
 POLL_S: Final = 0.2
 """Interval, in seconds, at which the thread looks for events whose frames have all come."""
@@ -109,6 +109,7 @@ class Clips:
         self.folder = ClipFolder(site.file(config.folder))
         """The clips that are stored."""
         self._ring = FrameRing()
+        self._spare_ns = SPARE_NS + round(1e9 * (site.fusion.max_event_s + config.pre_s + config.post_s))
         self._specs = {spec.name: spec for spec in site.processed}
         self._lock = threading.Lock()
         self._waiting: deque[_Job] = deque()
@@ -133,8 +134,7 @@ class Clips:
             Frame index before which all results are final.
         """
         if not self._site_time.is_replay:
-            spare_ns = SPARE_NS + round(1e9 * (self._config.pre_s + self._config.post_s))
-            self._ring.take(messages, None if settled is None else settled * FRAME_NS - spare_ns)
+            self._ring.take(messages, None if settled is None else settled * FRAME_NS - self._spare_ns)
 
     def take_final(self, event: Event, clock_offsets: ClockOffsets) -> None:
         """Take in a final event; only one with a position gets a clip."""
@@ -225,16 +225,25 @@ class Clips:
         return True
 
     def _write(self, job: _Job) -> None:
-        event, cuts = job.event, self._cuts(job)
-        if not cuts:
-            self.counts.without_sound += 1
-            return
-        recipe = Recipe(event, tuple(cuts), self._config.enhanced, self._site.c_m_s)
+        event = job.event
         try:
+            cuts = self._cuts(job)
+            if not cuts:
+                self.counts.without_sound += 1
+                return
+            recipe = Recipe(event, tuple(cuts), self._config.enhanced, self._site.c_m_s)
             self.folder.put(event.id, lambda partial: write_clip(recipe, partial))
         except OSError as error:
             self.counts.failed += 1
             self._report(f"the clip of {event.id!r} was not stored: {error.strerror or error}; free some space")
+            return
+        except Exception as error:  # noqa: BLE001 - whatever one event has about it, the next one gets its clip
+            self.counts.failed += 1
+            _log.debug("the clip of %r failed", event.id, exc_info=error)
+            self._report(
+                f"the clip of {event.id!r} was not made: {type(error).__name__}: {error}; report this as a bug, and "
+                "set the clips' enhanced to false if it occurs again"
+            )
             return
         self.counts.written += 1
         self.counts.incomplete += any(lacks(each, event) for each in cuts)
@@ -257,6 +266,10 @@ class Clips:
         limits = (self._config.max_age_days, self._site.store.retention_days)
         days = min((limit for limit in limits if limit is not None), default=None)
         before_ns = None if days is None else self._clock.now_ns() - round(days * DAY_NS)
+        try:
+            self.folder.erase_left()
+        except OSError as error:
+            self._report(f"deleted clips were not erased: {error.strerror or error}; correct that")
         try:
             self.counts.deleted += self.folder.expire(before_ns, self._config.max_bytes)
         except OSError as error:

@@ -3,6 +3,8 @@
 const STORAGE_KEY = "livessl-token";
 /** Longest wait for an answer, in milliseconds. */
 const TIMEOUT_MS = 8000;
+/** Longest wait, in milliseconds, for an answer that the server has to compute. */
+const LONG_TIMEOUT_MS = 60000;
 
 let tokenNeeded = () => {};
 
@@ -33,8 +35,13 @@ export const put = (url, value) =>
 export const remove = (url) => request(url, { method: "DELETE" });
 
 /** Send `value` as JSON, for an answer. */
-export const post = (url, value) =>
-  request(url, { method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+export const post = (url, value, options = {}) =>
+  request(url, {
+    method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" }, ...options,
+  });
+
+/** Send `value` as JSON, for an answer that may take long. */
+export const postLong = (url, value) => post(url, value, { signal: AbortSignal.timeout(LONG_TIMEOUT_MS) });
 
 /** Read a resource whose answer may take long. */
 export const getStream = (url) => request(url, { signal: null });

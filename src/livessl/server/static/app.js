@@ -1,6 +1,6 @@
 // The page's start: connects the messages of the server to the model, and the model to the panels and plans.
 
-import { get, onTokenNeeded, post, put, useToken } from "./access.js";
+import { get, getStream, onTokenNeeded, postLong, put, useToken } from "./access.js";
 import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
 import { Clips } from "./clips.js";
@@ -180,8 +180,13 @@ async function getJson(path) {
   return response.json();
 }
 
+/** Send `value` for an answer that may take long; the error's `told` is what the server says is in its way. */
 async function postJson(path, value) {
-  const response = await post(new URL(path, API), value);
+  const response = await postLong(new URL(path, API), value);
+  if (response.status === 409) {
+    const { detail } = await response.json();
+    throw Object.assign(new Error(detail), { told: detail });
+  }
   if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
   return response.json();
 }
@@ -215,7 +220,7 @@ function loadSite() {
 /** Load the picture under the floor plan; as data in its address, for an element's request would have no token. */
 function loadFloorPlan({ bounds_m: bounds }) {
   retrying(async () => {
-    const response = await get(new URL("floor-plan", API));
+    const response = await getStream(new URL("floor-plan", API));
     if (!response.ok) throw new Error(`floor-plan: the server answered ${response.status}`);
     const reader = new FileReader();
     reader.readAsDataURL(await response.blob());

@@ -1,6 +1,6 @@
 // The recordings of an event, at the end of its details: to listen to, to save, to keep for ever and to delete.
 
-import { get, put, remove } from "./access.js";
+import { get, getStream, put, remove } from "./access.js";
 import { el } from "./dom.js";
 import { number } from "./format.js";
 
@@ -113,7 +113,7 @@ export class Clips {
 
   /** A recording as an address of this page: an element cannot send an access token with a request. */
   async #address(id, file) {
-    const response = await check(await get(new URL(`${this.#url(id)}/${encodeURIComponent(file.name)}`)));
+    const response = await check(await getStream(new URL(`${this.#url(id)}/${encodeURIComponent(file.name)}`)));
     const address = URL.createObjectURL(await response.blob());
     this.held.push(address);
     while (this.held.length > MOST_HELD) URL.revokeObjectURL(this.held.shift());

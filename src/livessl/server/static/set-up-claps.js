@@ -110,7 +110,7 @@ export class ClapTest {
         if (performance.now() - began > LONG_MS) this.#say("No sound yet. Clap louder, and look at the levels.");
       }
     } catch (error) {
-      if (wait === this.waits) this.#end(`The server did not answer (${error.message}). Try again.`);
+      if (wait === this.waits) this.#end(error.told ?? `The server did not answer (${error.message}). Try again.`);
     }
   }
 
