@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from threading import Event as Flag
 from typing import Any
 
 import httpx
@@ -17,7 +19,7 @@ from livessl.errors import ConfigError
 from livessl.server import retention
 from livessl.server.store import Query, Store
 from messages import event_message
-from small_site import running_server, scene_recordings, site_of, wait_until, write_site
+from small_site import HANG_S, running_server, scene_recordings, site_of, wait_until, write_site
 
 CLOCK = SystemClock()
 DAY_NS = 86_400_000_000_000
@@ -124,6 +126,28 @@ def test_running_server_deletes_old_events(tmp_path: Path, monkeypatch: pytest.M
         late.add(event(3), now_ns - 4 * DAY_NS)
         late.close()
         wait_until(lambda: kept(server.url) == ["small-2"], "another that comes later")
+
+
+def test_deletion_is_told_to_end_when_it_is_cancelled() -> None:
+    """The thread that deletes would otherwise go on, and the server's end would wait for it."""
+    begun, ended = Flag(), Flag()
+
+    class Endless(Store):
+        def expire(self, before_ns: int, end: Flag | None = None) -> int:
+            assert end is not None
+            begun.set()
+            if end.wait(HANG_S):
+                ended.set()
+            return 0
+
+    async def cancel() -> None:
+        task = asyncio.create_task(retention.delete_old_events(Endless(), CLOCK, 1e6))
+        await asyncio.to_thread(begun.wait, HANG_S)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(cancel())
+    assert ended.is_set()
 
 
 def test_files_beyond_retention_are_warned_about() -> None:

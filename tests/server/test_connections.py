@@ -61,6 +61,14 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
         yield server
 
 
+def test_the_last_connection_is_answered(limited: Server) -> None:
+    with ExitStack() as stack:
+        for _ in range(MOST - 1):
+            stack.enter_context(opened(limited))
+        wait_until(lambda: len(limited.uvicorn.server_state.connections) == MOST - 1, "the other connections")
+        assert health(limited) == 200
+
+
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nX-A: "])
 def test_idle_connections_are_limited_and_make_room_when_they_close(
     limited: Server, sent: bytes, caplog: pytest.LogCaptureFixture

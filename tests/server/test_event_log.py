@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -160,6 +162,18 @@ def test_full_disk_delays_what_is_stored_and_not_what_is_published(caplog: pytes
     desk.log.retry()
     assert (desk.log.is_saved, desk.log.unsaved, desk.log.unkept) == (True, 0, 0)
     assert desk.stored == desk.published
+
+
+def test_early_event_that_waits_for_the_disk_holds_no_more_than_its_message() -> None:
+    desk, early = Desk(), event(10, 19)
+    assert early.estimate is not None
+    position = weakref.ref(early.estimate.position_m)
+    desk.store.full = True
+    desk.log.add_early(event(30, 39), MESSAGES)  # the log keeps the first error, whose traceback has its event
+    desk.log.add_early(early, MESSAGES)
+    del early
+    gc.collect()
+    assert (desk.log.unsaved, position()) == (2, None)
 
 
 def test_events_beyond_the_limit_are_given_up_and_counted() -> None:

@@ -6,7 +6,7 @@ import json
 import logging
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import count
 from pathlib import Path
 from threading import Event as Flag
@@ -16,6 +16,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from sqlalchemy import text
 
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject
@@ -237,6 +238,75 @@ def test_password_is_not_shown(caplog: pytest.LogCaptureFixture) -> None:
         store.find(Query())
     store.close()
     assert "geheim" not in caplog.text + str(caught.value)
+
+
+def test_database_that_cannot_be_migrated_is_refused_with_the_reason(tmp_path: Path) -> None:
+    Store(tmp_path / "events.db").close()
+    with closing(sqlite3.connect(tmp_path / "events.db")) as db, db:
+        db.execute("UPDATE alembic_version SET version_num = '0000'")
+    refusing = database.Database(tmp_path / "events.db")
+    for refused in (refusing.prepare, lambda: refusing.reading().__enter__()):
+        with pytest.raises(StoreError, match=r"cannot migrate the database: .*'0000'.*; update livessl, or name"):
+            refused()
+    assert "cannot migrate" in str(refusing.problem)
+    refusing.close()
+
+
+def test_search_that_takes_too_long_is_ended(place: Path | str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "STATEMENT_S", 0.5)
+    store = Store(place)
+    forever = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n"
+    with (
+        pytest.raises(StoreError, match=r"a search was ended after 0.5 s; narrow the span"),
+        store._database.reading() as connection,
+    ):
+        connection.execute(text(forever))
+    store.add(event(1), 0)
+    assert store.get("small-1") == event(1)
+    store.close()
+
+
+def test_reader_does_not_wait_long_for_other_readers(place: Path | str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "READER_S", 0.1)
+    store = Store(place)
+    with ExitStack() as others:
+        for _ in range(database.READERS):
+            others.enter_context(store._database.reading())
+        with pytest.raises(StoreError, match=r"all 4 connections for reading are taken .*; wait for them, or narrow"):
+            store.get("small-1")
+    assert store.get("small-1") is None
+    store.close()
+
+
+def test_reader_sees_one_state(opened: Callable[[], Store]) -> None:
+    store, count_all = opened(), text("SELECT count(*) FROM events")
+    with store._database.reading() as connection:
+        assert connection.execute(count_all).scalar() == 0
+        store.add(event(1), 0)
+        assert connection.execute(count_all).scalar() == 0
+
+
+def test_what_waits_for_the_database_is_not_lost_by_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A count that fails holds up nothing."""
+
+    def fail(_: Store) -> None:
+        raise StoreError("cannot count")
+
+    monkeypatch.setattr(Store, "_count_all", fail)
+    store, done = Store(tmp_path / "events.db"), list[int]()
+
+    def work() -> None:
+        done.append(1)
+        if len(done) == 1:
+            raise StoreError("not yet")
+
+    store.when_ready(work)
+    with pytest.raises(StoreError, match="not yet"):
+        store.prepare()
+    for _ in range(2):
+        store.prepare()
+    assert (len(done), store.count()) == (2, None)
+    store.close()
 
 
 def test_who_writes_all_the_time_keeps_out_nobody(tmp_path: Path) -> None:

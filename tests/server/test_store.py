@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import pytest
@@ -312,6 +312,20 @@ def test_disabled_arrays_are_remembered(opened: Callable[[], Store]) -> None:
     store.enable("lab", "south", True)
     store.enable("elsewhere", "west", False)
     assert opened().disabled("lab") == {"north"}
+
+
+def test_deletion_ends_when_the_server_does(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 3)
+    fill(store, 10)
+    end = Event()
+    monkeypatch.setattr(store, "_counted", lambda _: end.set())  # after the first batch
+    assert store.expire(START_NS + 7 * NS, end) == 3
+    assert store.expire(START_NS + 7 * NS, end) == 0
+
+
+def test_nothing_is_older_than_any_time_that_can_be_stored(store: Store) -> None:
+    fill(store, 2)
+    assert store.expire(-(10**20)) == 0
 
 
 def test_expired_events_are_gone_in_batches(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol, Self
 
+import orjson
+
 from livessl.clock import Clock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Event
@@ -170,7 +172,7 @@ class EventLog:
     def add_early(self, event: Event, messages: Messages) -> None:
         """Publish an event that cannot wait for an array that is late or away."""
         message = messages.event(event, self._stages(event))
-        self._write(lambda: self._store.add(message, event.start_ns, early=True), 1)
+        self._write(partial(self._store.add, message, event.start_ns, early=True), 1)  # holds no sound of the event
         if not self._is_replay:
             self._remember(EarlyEvent.of(event, message))
         if self._watcher is not None and not self._is_replay:
@@ -208,8 +210,12 @@ class EventLog:
         replaced = [early.id for early, successor in successors if successor is not None]
         done = {event.id for event in results.events} | {early.id for early in before}
         self._early = [early for early in self._early if early.id not in done]
-        site, until = self._site, results.until
-        self._write(lambda: self._store.finalize(site, rows, replaced, until, clocks), len(rows), is_final=True)
+        until, kept = results.until, orjson.dumps(clocks)  # as bytes: thousands may wait for a database
+
+        def store() -> None:
+            self._store.finalize(self._site, rows, replaced, until, orjson.loads(kept))
+
+        self._write(store, len(rows), is_final=True)
         if self._watcher is not None:
             self._watcher.take_final(rows, results.until)
         for message in news:

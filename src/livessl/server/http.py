@@ -155,7 +155,7 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
             ssl_certfile=certificate,
             ssl_ciphers=CIPHERS,
             ssl_keyfile=None if key is None else site.file(key),
-            limit_concurrency=MAX_CONNECTIONS,
+            limit_concurrency=MAX_CONNECTIONS + 1,  # it counts the asking connection, which the listener has admitted
             ws_max_size=MAX_INCOMING_BYTES,
             proxy_headers=False,  # the application reads them, by the site's rules
             ws_per_message_deflate=False,  # small messages hardly shrink, and each would cost time and memory

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from typing import Final
 
 from livessl.clock import Clock
@@ -19,11 +20,15 @@ _log = logging.getLogger(__name__)
 
 async def delete_old_events(store: Store, clock: Clock, retention_days: float | None) -> None:
     """Delete events older than `retention_days` every `EXPIRE_S`, until cancelled; return at once if it is None."""
-    while retention_days is not None:
-        before_ns = clock.now_ns() - round(retention_days * DAY_NS)
-        try:
-            if gone := await asyncio.to_thread(store.expire, before_ns):
-                _log.info("%d events older than %g days were deleted", gone, retention_days)
-        except StoreError as error:
-            _log.error("%s", error)
-        await asyncio.sleep(EXPIRE_S)
+    end = threading.Event()
+    try:
+        while retention_days is not None:
+            before_ns = clock.now_ns() - round(retention_days * DAY_NS)
+            try:
+                if gone := await asyncio.to_thread(store.expire, before_ns, end):
+                    _log.info("%d events older than %g days were deleted", gone, retention_days)
+            except StoreError as error:
+                _log.error("%s", error)
+            await asyncio.sleep(EXPIRE_S)
+    finally:
+        end.set()  # cancelling does not end the thread, and the server would wait for it

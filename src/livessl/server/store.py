@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -79,7 +81,7 @@ class Store:
         self._bounded = place is None
         self._count: int | None = None
         self._counting = threading.Lock()
-        self._when_ready: list[Callable[[], None]] = []
+        self._when_ready: deque[Callable[[], None]] = deque()
         self._database = Database(place)
         self.backlog = Backlog(self.prepare)
         """Events that wait to be stored."""
@@ -108,15 +110,13 @@ class Store:
         return self._database.cure
 
     def prepare(self) -> None:
-        """Make or migrate the tables, unless that is done."""
-        if not self._database.prepare():
-            return
-        with self._database.reading() as connection:
-            count = int(connection.execute(select(func.count()).select_from(events)).scalar_one())
-        with self._counting:
-            self._count = count
-        for work in self._when_ready:
-            work()
+        """Make or migrate the tables, unless that is done, and do what waits for them."""
+        if self._database.prepare():
+            with suppress(StoreError):  # only the metrics want the number: nothing must wait for it
+                self._count_all()
+        while self._when_ready:
+            self._when_ready[0]()
+            self._when_ready.popleft()  # not before it is done: an error leaves it for the next time
 
     def when_ready(self, work: Callable[[], None]) -> None:
         """Have something done as soon as a database that cannot be used now can be used, on any thread."""
@@ -201,18 +201,22 @@ class Store:
             rows = connection.execute(query.where(events.c.id.in_(records.early_ids(connection)))).all()
         return [(time_ns, orjson.loads(body)) for time_ns, body in rows]
 
-    def expire(self, before_ns: int) -> int:
-        """Delete the events that began before a time, and overwrite them in an SQLite file; return their number."""
-        gone, pause = 0, threading.Event()
-        while True:
+    def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
+        """Delete the events that began before a time, and overwrite them in an SQLite file; return their number.
+
+        `end` ends it early, between two transactions; the next call does the rest.
+        """
+        gone, end = 0, threading.Event() if end is None else end
+        before_ns = max(before_ns, 0)  # a database has no number for a time long before 1970
+        while not end.is_set():
             with self._database.writing("delete old events") as connection:
                 some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
             self._counted(-some)
             gone += some
             if some < EXPIRED_AT_ONCE:
+                self._database.erase()
                 break
-            pause.wait(PAUSE_S)
-        self._database.erase()
+            end.wait(PAUSE_S)
         return gone
 
     def get(self, event_id: str) -> JsonObject | None:
@@ -255,7 +259,7 @@ class Store:
             return count_by_cell(connection, query, cells)
 
     def count(self) -> int | None:
-        """Return the number of events; None as long as the database could not be read."""
+        """Return the number of events; None if they could not be counted when the database was opened."""
         with self._counting:
             return self._count
 
@@ -263,6 +267,12 @@ class Store:
         """Write what waits, and release the database."""
         self.backlog.stop()
         self._database.close()
+
+    def _count_all(self) -> None:
+        with self._database.reading() as connection:
+            count = int(connection.execute(select(func.count()).select_from(events)).scalar_one())
+        with self._counting:
+            self._count = count
 
     def _counted(self, change: int) -> None:
         with self._counting:

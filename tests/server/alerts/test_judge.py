@@ -28,7 +28,7 @@ from alert_desk import (
 )
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.stream.final_pass import FinalResults
-from livessl.core.types import Event, Track, TrackState
+from livessl.core.types import FRAME_NS, Event, Track, TrackState
 from livessl.server.alerts import backlog, history
 from livessl.server.alerts.outbox import DeliveryState, OutboxError
 from livessl.server.api.encode import JsonObject, Messages
@@ -136,6 +136,35 @@ def test_events_that_became_final_before_a_crash_alert_after_it(tmp_path: Path) 
         wait_until(lambda: len(alerted(desk)) == 4, "what is new")
         assert alerted(desk) == [key_of(sound(number)) for number in (1, 2, 5, 6)]
     assert alerted_ids(desk) == ["small-2", "small-5", "small-6"]
+
+
+def test_new_events_alert_while_the_past_cannot_be_read(tmp_path: Path) -> None:
+    """The database comes late; then what was missed is judged, and what has alerted does not alert again."""
+    first = Desk(site(tmp_path))
+    first.alerts.start()
+    wait_until(lambda: first.alerts.outbox.judged_until_ns("small") is not None, "the first start")
+    first.alerts.stop()
+    first.alerts._thread = None
+    first.finish(sound(1))
+    first.store.close()
+    lost = {"arrays": {"lasts_s": 0}, "hold_off_s": 0}
+    desk = Desk(site(tmp_path, door=DOOR, arrays=lost))
+    try:
+        before_ns = desk.alerts.outbox.judged_until_ns("small")
+        with patch.object(desk.store, "finalized", side_effect=StoreError("away")):
+            desk.alerts.start()
+            desk.finish(sound(2))
+            wait_until(lambda: len(desk.published) == 1, "the new event's alert")
+            desk.arrays.states["south"] = "lost"
+            wait_until(lambda: len(desk.published) == 2, "the array's alert")
+            assert desk.alerts.outbox.judged_until_ns("small") == before_ns
+            assert [problem.split(":")[0] for problem in desk.alerts.problems] == ["alerts.rules"]
+        wait_until(lambda: len(desk.published) == 3, "the missed event's alert")
+        wait_until(lambda: not desk.alerts.problems, "the end of the problem")
+        assert desk.alerts.outbox.judged_until_ns("small") == after(sound(2)) * FRAME_NS
+        assert [(alert["event"] or {}).get("id") for alert in desk.published] == ["small-2", None, "small-1"]
+    finally:
+        desk.close()
 
 
 def test_history_from_before_there_were_alerts_does_not_alert(tmp_path: Path) -> None:

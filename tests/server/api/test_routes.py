@@ -26,6 +26,7 @@ from livessl.clock import utc_ns, utc_text
 from livessl.server.api import history_routes
 from livessl.server.api.app import STATIC
 from livessl.server.app import Server
+from livessl.server.event_log import EventLog
 from livessl.server.store import Store
 from livessl.site.tokens import add_token
 from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
@@ -354,6 +355,12 @@ def test_events_are_published_while_the_database_is_locked(tmp_path: Path) -> No
             other.rollback()
             wait_until(lambda: len(get(client, "events")["events"]) == 2, "both events, now that the file is free")
             assert "\nlivessl_events_unkept_total 0.0\n" in client.get("/metrics").text
+
+
+def test_events_that_are_being_stored_are_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(EventLog, "unsaved", property(lambda _: 3))
+    with running_server(site_of()) as server, httpx.Client(base_url=server.url) as client:
+        assert not any("wait to be stored" in reason for reason in get(client, "health")["reasons"])
 
 
 def test_search_without_a_database_says_what_to_do(tmp_path: Path) -> None:

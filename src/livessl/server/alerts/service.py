@@ -119,7 +119,9 @@ class Alerts:
             raise
         self._backlog = Backlog(site.site, store)
         self._expired_ns = 0
-        self._is_failing = False
+        self._is_failing = self._lacks_store = False
+        self._is_caught_up = not self._judges_events
+        self._live_ns: tuple[int, int] | None = None  # site time that was judged before the past could be read
         self._news, self._end = asyncio.Event(), asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -159,6 +161,8 @@ class Alerts:
         found = []
         if self._is_failing:
             found.append(f"alerts.outbox: cannot be used, so that alerts wait: {len(self._backlog)} batches of events")
+        if self._lacks_store:
+            found.append("alerts.rules: past events are not judged until server.events_db can be read; new ones are")
         for (action, state), count in self.counts().items():
             if state == DeliveryState.DEAD:
                 what = "1 alert was" if count == 1 else f"{count} alerts were"
@@ -243,43 +247,64 @@ class Alerts:
 
     async def _judge_all(self) -> None:
         """Judge what comes, and first what came before a restart, until cancelled."""
-        caught_up = False
         while True:
             self._news.clear()
             wait_s = POLL_S
             try:
-                if not caught_up:
-                    self._catch_up()
-                    caught_up = True
                 self._turn()
                 self._is_failing = False
-            except (OutboxError, StoreError, sqlite3.Error) as error:
+            except (OutboxError, sqlite3.Error) as error:
                 if not self._is_failing:
                     _log.error("%s", error)
-                self._is_failing, wait_s = True, REST_S
+                self._is_failing = True
+            if self._is_failing or self._lacks_store:
+                wait_s = REST_S
             with suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
                     await self._news.wait()
-            if self._is_failing:
+            if wait_s == REST_S:
                 await asyncio.sleep(REST_S)
 
     def _catch_up(self) -> None:
         """Judge the events that became final before a restart and were not judged; at first, skip all of the past."""
-        if not self._judges_events:
-            return
         final_ns = final_until_ns(self._store, self._site.site)
         judged_ns = self.outbox.judged_until_ns(self._site.site)
-        if judged_ns is None:
-            self._judge.skip(final_ns)
-        elif final_ns > judged_ns:
-            for page, until_ns in past_pages(self._store, judged_ns, final_ns):
-                self._judge_batch(Batch(page, until_ns))
+        live_ns, live_until_ns = (final_ns, 0) if self._live_ns is None else self._live_ns
+        if judged_ns is not None and (before_ns := min(final_ns, live_ns)) > judged_ns:
+            for page, until_ns in past_pages(self._store, judged_ns, before_ns):
+                self._announce(self._judge.judge_events(page, until_ns))
+        done_ns = max(final_ns if judged_ns is None else judged_ns, live_until_ns)
+        if judged_ns is None or done_ns > judged_ns:
+            self._judge.skip(done_ns)
 
     def _judge_batch(self, batch: Batch) -> None:
-        self._announce(self._judge.judge_events(batch.events, batch.until_ns, early=batch.until_ns is None))
+        """Judge events that came; while the past waits, the time before which all are judged stays where it is."""
+        until_ns = batch.until_ns if self._is_caught_up else None
+        self._announce(self._judge.judge_events(batch.events, until_ns, early=batch.until_ns is None))
+        if batch.until_ns is not None and not self._is_caught_up:
+            first_ns = min((time_ns for _, time_ns in batch.events), default=batch.until_ns)
+            since_ns, newest_ns = (first_ns, 0) if self._live_ns is None else self._live_ns
+            self._live_ns = min(since_ns, first_ns), max(newest_ns, batch.until_ns)
+
+    def _judge_waiting(self) -> None:
+        """Judge the events that wait; those of the past, and those that were missed, only if the store can be read."""
+        failure: StoreError | None = None
+        try:
+            if not self._is_caught_up:
+                self._catch_up()
+                self._is_caught_up = True
+        except StoreError as error:
+            failure = error
+        try:
+            self._backlog.work_off(self._judge_batch)
+        except StoreError as error:
+            failure = error
+        if failure is not None and not self._lacks_store:
+            _log.error("%s", failure)
+        self._lacks_store = failure is not None
 
     def _turn(self) -> None:
-        self._backlog.work_off(self._judge_batch)
+        self._judge_waiting()
         self._backlog.work_off_changes(lambda changes: self._announce(self._judge.judge_changes(changes)))
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
@@ -290,7 +315,7 @@ class Alerts:
         days = self._site.store.retention_days
         if days is not None and now_ns - self._expired_ns >= EXPIRE_NS:
             self._expired_ns = now_ns
-            self.outbox.expire(now_ns - round(days * DAY_NS))
+            self.outbox.expire(max(now_ns - round(days * DAY_NS), 0))
 
     def _announce(self, alerts: Sequence[JsonObject]) -> None:
         """Log and publish new alerts, and have them delivered."""

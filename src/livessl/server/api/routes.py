@@ -158,7 +158,8 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
     states = {a["state"] for a in arrays if a["enabled"]}  # an operator disables an array on purpose
     status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
-    unkept, unsaved = parts.event_log.unkept, parts.event_log.unsaved
+    unkept = parts.event_log.unkept
+    unsaved = parts.event_log.unsaved if parts.store.backlog.is_failing else 0  # others are being written
     if unkept:
         reasons.append(f"server.events_db: {unkept} events were not stored; {parts.store.cure}")
     if unsaved:

@@ -12,10 +12,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from time import monotonic
 from typing import Any, Final
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.pool import QueuePool
 
 from livessl.errors import ConfigError, Fault, RunError
@@ -31,7 +33,16 @@ CONNECT_S: Final = 3
 """Longest wait, in seconds, for a connection to PostgreSQL."""
 
 STATEMENT_S: Final = 30
-"""Longest time, in seconds, that PostgreSQL may take for one statement of a search or an insertion."""
+"""Longest time, in seconds, of a search, and of any statement in PostgreSQL."""
+
+READER_S: Final = 3
+"""Longest wait, in seconds, of a reader while all connections for reading are taken."""
+
+STEPS: Final = 100_000
+"""SQLite looks at the time of a search whenever it has done so many steps: every few milliseconds."""
+
+QUERY_CANCELED: Final = "57014"
+"""PostgreSQL's code of a statement that has taken too long."""
 
 MIGRATION_LOCK: Final = 0x11_7E_55_1
 """Number of the PostgreSQL lock that is held during migrations, so that of two servers one waits."""
@@ -42,6 +53,9 @@ READERS: Final = 4
 UNLOCK: Final = "close the program that locks the file"
 CURE: Final = f"free space on its disk, or {UNLOCK}"
 """Cures of an SQLite file that cannot be written."""
+
+NARROW: Final = "narrow the span of time that is searched"
+"""Cure of searches that take too long."""
 
 CURE_OF_SERVER: Final = "see that PostgreSQL runs, has space, and admits this user"
 """Cure of a PostgreSQL database that cannot be used."""
@@ -121,6 +135,9 @@ class Database:
                         metadata.create_all(connection)
                     else:
                         _migrate(connection)
+            except StoreError as error:
+                self._problem = str(error)
+                raise
             except (SQLAlchemyError, KeyError, TypeError, ValueError) as error:  # the last ones: of a damaged old event
                 cure = CURE_OF_SERVER if self.is_remote else "name a file in a writable folder"
                 self._problem = f"server.events_db: cannot use {self.name}: {told(error)}; {cure}"
@@ -164,7 +181,13 @@ class Database:
         try:
             with self._reading.connect() as connection:
                 yield connection
+        except PoolTimeoutError as error:
+            what = f"server.events_db: all {READERS} connections for reading are taken by other searches"
+            raise StoreError(f"{what}; wait for them, or {NARROW}") from error
         except SQLAlchemyError as error:
+            if _took_too_long(error):
+                what = f"server.events_db: a search was ended after {STATEMENT_S:g} s"
+                raise StoreError(f"{what}; {NARROW}") from error
             cure = CURE_OF_SERVER if self.is_remote else UNLOCK
             raise StoreError(f"server.events_db: cannot read: {told(error)}; {cure}") from error
 
@@ -229,15 +252,34 @@ def told(error: Exception) -> str:
     return " ".join(str(cause).split())
 
 
+def _took_too_long(error: SQLAlchemyError) -> bool:
+    cause = error.orig if isinstance(error, DBAPIError) else None
+    return (
+        getattr(cause, "sqlite_errorcode", None) == sqlite3.SQLITE_INTERRUPT
+        or getattr(cause, "sqlstate", None) == QUERY_CANCELED
+    )
+
+
 def upgrade(connection: Connection) -> None:
-    """Apply all migrations that the database lacks, in the transaction of the connection."""
+    """Apply all migrations that the database lacks, in the transaction of the connection.
+
+    Raises
+    ------
+    StoreError
+        If the database has a revision that no livessl has made.
+    """
     from alembic import command  # most starts do not need it, and it takes a while to load
     from alembic.config import Config
+    from alembic.util import CommandError
 
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
     config.attributes["connection"] = connection
-    command.upgrade(config, "head")
+    try:
+        command.upgrade(config, "head")
+    except CommandError as error:
+        what = f"server.events_db: cannot migrate the database: {told(error)}"
+        raise StoreError(f"{what}; update livessl, or name another database") from error
 
 
 def _migrate(connection: Connection) -> None:
@@ -270,15 +312,25 @@ def _sqlite(name: str, connections: int, *, writes: bool) -> Engine:
         poolclass=QueuePool,
         pool_size=connections,
         max_overflow=0,
+        pool_timeout=30 if writes else READER_S,
         pool_reset_on_return="rollback",
     )
     _on_connect(engine, _set_up_for_writing if writes else _set_up_for_reading)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
+        if not writes:
+            _end_in_time(connection)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     return engine
+
+
+def _end_in_time(connection: Connection) -> None:
+    """Have SQLite interrupt what the connection still does after `STATEMENT_S`."""
+    driver: Any = connection.connection.dbapi_connection
+    end_s = monotonic() + STATEMENT_S
+    driver.set_progress_handler(lambda: monotonic() > end_s, STEPS)
 
 
 def _on_connect(engine: Engine, set_up: Callable[[Any], None]) -> None:
@@ -301,9 +353,12 @@ def _postgresql(url: str, *, readers: int) -> Engine:
         what = "PostgreSQL needs the package psycopg; pip install 'livessl[postgres]'"
         raise ConfigError([Fault("server.events_db", what)])
     made = make_url(url).set(drivername="postgresql+psycopg")
+    of_readers: dict[str, Any] = {}
     options = f"-c statement_timeout={STATEMENT_S * 1000} -c idle_in_transaction_session_timeout={STATEMENT_S * 1000}"
     if readers:
         options += " -c default_transaction_read_only=on"
+        # without it each statement of a reader would see another state
+        of_readers = {"isolation_level": "REPEATABLE READ", "pool_timeout": READER_S}
     arguments: dict[str, Any] = {
         "connect_timeout": CONNECT_S,
         "application_name": "livessl",
@@ -316,5 +371,6 @@ def _postgresql(url: str, *, readers: int) -> Engine:
         pool_size=readers or 1,
         max_overflow=0,
         pool_pre_ping=True,
+        **of_readers,
         connect_args={**given, "options": f"{options} {made.query.get('options', '')}".strip()},
     )
