@@ -453,10 +453,13 @@ def test_unknown_section_is_skipped(tag: int, body: bytes, is_last: bool) -> Non
         (struct.pack("<BH", 2, 5) + bytes(5), "a machine's state of at least 29 bytes, got 5"),
         (struct.pack("<BHf", 3, 4, 1.0), "an error of the drift of 8 bytes, got 4"),
         (struct.pack("<BHd", 3, 8, -1.0), "an error of the drift from 0 to 1e+12 ppm, got -1.0"),
-        (struct.pack("<BHBdQd?BBB", 2, 29, 3, 0, 0, 0, False, 0, 0, 0), "a known clock, got 0 bytes and 3"),
+        (
+            struct.pack("<BHBdQd?BBB", 2, 29, 3, 0, 0, 0, False, 0, 0, 0),
+            "a clock's state of 0, 1 or 2, got 0 bytes and 3",
+        ),
         (
             struct.pack("<BHBdQd?BBB", 2, 29, 0, 0, 0, 0, False, 1, 0, 0),
-            "1 bytes of names and a known clock, got 0 bytes",
+            "1 bytes of names and a clock's state of 0, 1 or 2, got 0 bytes",
         ),
         (
             struct.pack("<BHBdQd?BBB", 2, 29, 0, math.inf, 0, 0, False, 0, 0, 0),
@@ -468,6 +471,13 @@ def test_section_of_a_wrong_value_is_refused(tail: bytes, expected: str) -> None
     said = refusal(encode(mark()) + tail)
     assert said.startswith("mark of array 'north': expected ")
     assert expected in said
+
+
+def test_sections_without_end_are_refused_at_once() -> None:
+    """A mark of a hundred thousand empty sections costs nothing."""
+    empty = struct.pack("<BH", 200, 0)
+    assert "expected sections of 16384 bytes at most, got 300000" in refusal(encode(mark()) + 100_000 * empty)
+    assert decode(encode(mark()) + 5000 * empty) == mark()
 
 
 @pytest.mark.parametrize("reads", [None, "mark-sections", [7], [""], ["n"] * 65])

@@ -18,7 +18,7 @@ from livessl.core.commission.observe import observe, receive
 from livessl.core.geometry import Grid, circle
 from livessl.core.locate.estimator import Sound, create
 from livessl.core.locate.map_estimator import MapEstimator
-from livessl.core.types import ArraySpec, Float32Array, FloatArray
+from livessl.core.types import MAX_MICROPHONES, ArraySpec, Float32Array, FloatArray
 from livessl.recordings.assign import AssignedRecording
 
 BEFORE_S: Final = 0.3
@@ -45,7 +45,7 @@ def arrival_times(
     Parameters
     ----------
     parts : sequence of AssignedRecording
-        Recordings of arrays that one clock samples.
+        Recordings of arrays that one clock samples; only the first `MAX_MICROPHONES` are compared.
     microphones : mapping of array to (K, 3) float64
         Measured roughly, metres.
     starts_s : sequence of float
@@ -57,6 +57,7 @@ def arrival_times(
     band_hz : (float, float)
         Band that is compared.
     """
+    parts = parts[:MAX_MICROPHONES]  # each is like a microphone of one array
     names = tuple(part.array for part in parts)
     rate_hz = parts[0].recording.sample_rate_hz
     spec = ArraySpec(_NAME, circle(0.5 * REACH_M, len(names)), band_hz)

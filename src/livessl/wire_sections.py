@@ -30,6 +30,9 @@ MAX_PPM: Final = 1e12
 MAX_TEXT_BYTES: Final = 255
 """Longest name of a service, a reference clock or a machine, in bytes; longer ones are cut."""
 
+MAX_SECTIONS_BYTES: Final = 16 * 1024
+"""Most bytes of all sections of a mark: over eight times as many as are known, so that newer nodes may send more."""
+
 _LEVELS: Final = 1
 _HOST: Final = 2
 _DRIFT: Final = 3
@@ -81,8 +84,10 @@ def decode_sections(data: memoryview) -> Sections:
     Raises
     ------
     SectionError
-        If a section is truncated, or holds a value that no node sends.
+        If the sections are too long, or one is truncated or holds a value that no node sends.
     """
+    if len(data) > MAX_SECTIONS_BYTES:
+        raise SectionError(f"expected sections of {MAX_SECTIONS_BYTES} bytes at most, got {len(data)}")
     levels: tuple[ChannelLevel, ...] = ()
     drift_error_ppm: float | None = None
     host: HostState | None = None

@@ -45,6 +45,8 @@ def test_chrony_that_follows_a_server_gives_it_and_the_largest_error() -> None:
 
 def test_chrony_without_a_server_is_not_synchronized() -> None:
     assert from_chrony(ALONE) == HostClock(False, "chrony")
+    was = FOLLOWS.replace("Normal", "Not synchronised")  # it keeps the stratum of the server that it has lost
+    assert from_chrony(was) == from_chrony(was.replace("ised", "ized")) == HostClock(False, "chrony")
 
 
 @pytest.mark.parametrize("text", ["", "506 Cannot talk to daemon\n", FOLLOWS.replace("0.012000", "?"), "1,2,3\n"])

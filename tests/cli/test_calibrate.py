@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,54 @@ def test_the_site_file_says_where_its_calibration_is_written_and_put_back(
     assert set(yaml.safe_load(written.read_text())["arrays"]) == {"north"}
     assert run("calibrate", "refine", "--site", site, "--undo").code == 2
     assert run("calibrate", "refine", "--undo").code == 2
+
+
+def test_a_calibration_is_put_back_although_its_site_file_does_not_load(run: Run, tmp_path: Path) -> None:
+    site = write_site(tmp_path, {"calibration": "measured.yaml"})
+    written, kept = tmp_path / "measured.yaml", tmp_path / "measured.yaml.before"
+    written.write_text("arrays: {south: {microphones_m: [[99, 0, 0], [1, 1, 1]]}}\n")
+    assert run("check", site).code == 2
+    kept.write_text("arrays: {}\n")
+    assert run("calibrate", "poses", "--site", site, "--undo").code == 0
+    assert (written.read_text(), kept.exists()) == ("arrays: {}\n", False)
+    site.write_text("[")
+    broken = run("calibrate", "poses", "--site", site, "--undo")
+    assert (broken.code, "give the calibration file as --write FILE" in broken.err) == (2, True)
+    site.write_text("room: {}")
+    nameless = run("calibrate", "poses", "--site", site, "--undo")
+    assert (nameless.code, "expected site or calibration in" in nameless.err) == (2, True)
+
+
+def test_a_failed_write_leaves_the_calibration_there(
+    run: Run, claps: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    written, kept = tmp_path / "lab.yaml", tmp_path / "lab.yaml.before"
+    written.write_text("arrays: {}\n")
+    kept.write_text("arrays: 1\n")
+    session = ["--session", claps.directory, *places(claps)]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        done = run("calibrate", "poses", *session, "--write", written)
+    assert (done.code, "No space left" in done.err) == (2, True)
+    assert (written.read_text(), kept.read_text()) == ("arrays: {}\n", "arrays: 1\n")
+    written.unlink()
+    assert run("calibrate", "poses", *session, "--write", written).code == 0
+    assert not kept.exists(), "a kept file that is not the one before"
+
+
+def test_poses_outside_the_room_are_not_written(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    site, written = write_site(tmp_path), tmp_path / "lab.yaml"
+    written.write_text("arrays: {}\n")
+    truth = [json.loads(line) for line in (claps.directory / "truth.jsonl").read_text().splitlines()]
+    lower = [f"--at={x},{y},{z - 2.0}" for x, y, z in (source["position_m"] for source in truth)]
+    done = run("calibrate", "poses", "--site", site, "--session", claps.directory, *lower, "--write", written)
+    assert done.code == 1
+    assert "within the room of 4 x 5 x 3 m, got microphone" in done.err
+    assert written.read_text() == "arrays: {}\n"
+    assert [path.name for path in tmp_path.glob("lab*")] == ["lab.yaml"]
 
 
 def test_eight_sounds_are_too_few_to_refine(run: Run, claps: Recorded) -> None:

@@ -149,6 +149,40 @@ def test_sounds_that_the_server_keeps_refine_a_turned_array(
     assert (stranger.code, "expected an array of the site (north, south), got 'attic'" in stranger.err) == (2, True)
 
 
+def of_one_array(event: Event, name: str) -> Event:
+    return replace(event, received=tuple(one for one in event.received if one.evidence.spec.name == name))
+
+
+def test_claps_that_different_arrays_received_only_ask_for_more(server: Server, clapper: Clapper, run: Run) -> None:
+    prompts = clapper([of_one_array(event, ("north", "south")[k % 2]) for k, event in enumerate(events())])
+    done = run("calibrate", "poses", "--url", server.url, *at(), "--place-std", "0.005", "--json")
+    assert {one["array"] for one in done.objects if one["kind"] == "pose"} == {"north", "south"}
+    assert sum(prompt.startswith("clap") for prompt in prompts) == COUNT
+    assert sum("no array has received 4 of the claps clearly yet" in prompt for prompt in prompts) == 3
+
+
+def test_sounds_that_one_array_received_do_not_count_for_refining(
+    server: Server, clapper: Clapper, run: Run, tmp_path: Path
+) -> None:
+    sounds = events(count=14)
+    server.parts.set_up_watch.forget()
+    finish(server, of_one_array(sounds[0], "north"))
+    prompts = clapper(sounds)
+    options = ["--site", write_site(tmp_path), "--url", server.url, "--sounds", "10", "--known", "north"]
+    run("calibrate", "refine", *options, "--json")
+    assert [prompt.partition(" place ")[2] for prompt in prompts] == [f"({n} of 10)" for n in range(10)]
+
+
+def test_a_server_that_joins_arrays_needs_its_site_file_to_write(run: Run, tmp_path: Path) -> None:
+    with running_server(site_of({"joint": {"both": ["north", "south"]}, "fusion.min_arrays": 1})) as joining:
+        options = ["--url", joining.url, "--at=1,1,1"]
+        done = run("calibrate", "poses", *options, "--write", tmp_path / "lab.yaml", "--wait", "0.3")
+        refined = run("calibrate", "refine", "--url", joining.url)
+    assert done.code == 2
+    assert "--write: the server joins arrays; give its site file as --site" in done.err
+    assert (refined.code, "expected two arrays or more, got 1" in refined.err) == (2, True)
+
+
 def test_a_clap_that_does_not_come_is_told(server: Server, run: Run) -> None:
     done = run("calibrate", "verify", "--url", server.url, *at(1), "--wait", "0.3")
     assert done.code == 1

@@ -24,6 +24,9 @@ _ERROR: Final = 5
 _CHRONY_FIELDS: Final = 14
 """Number of fields that `chronyc -c tracking` prints."""
 
+_CHRONY_UNSYNC: Final = ("Not synchronised", "Not synchronized")
+"""Last field of a clock that follows no other, as different versions spell it."""
+
 Command = Callable[[tuple[str, ...]], str | None]
 """Runs a program and returns what it prints; None if it is not installed or fails."""
 
@@ -123,7 +126,7 @@ def from_chrony(tracking: str) -> HostClock | None:
         stratum = int(fields[2])
     except ValueError:
         return None
-    synchronized = stratum > 0 and fields[13] != "Not synchronized"
+    synchronized = stratum > 0 and fields[13] not in _CHRONY_UNSYNC
     error_s = abs(offset_s) + delay_s / 2.0 + dispersion_s
     reference = fields[1] or fields[0]
     return HostClock(synchronized, "chrony", reference if synchronized else "", error_s if synchronized else None)

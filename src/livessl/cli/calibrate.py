@@ -153,6 +153,8 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
 
     if arguments.site is None:
         sounds = ServerSounds(arguments.url, arguments.token_file, arguments.wait)
+        if getattr(arguments, "write", None) is not None and sounds.has_joint_arrays():
+            raise UseError("--write: the server joins arrays; give its site file as --site")
         return sounds.site(), sounds
     site = read_site(arguments)
     print_warnings(site)
@@ -260,6 +262,8 @@ def _refine(arguments: argparse.Namespace) -> int:
     parts: Sequence[AssignedRecording] = ()
     if _is_live(arguments):
         site, server = _server(arguments)
+        if len(site.processed) < 2:
+            raise UseError(f"calibrate refine: expected two arrays or more, got {len(site.processed)}")
         sounds = _kept_and_new(server, arguments.sounds)
     else:
         site, sounds, parts = _recorded(arguments)
@@ -275,13 +279,15 @@ def _refine(arguments: argparse.Namespace) -> int:
 
 
 def _kept_and_new(server: ServerSounds, count: int) -> list[HeardSound]:
-    """Return the sounds that the server keeps and, if they are too few, new ones as they come in."""
-    from livessl.cli.guided import ask_for, is_clear
+    """Return the sounds that the server keeps and, if they are too few, new ones; two arrays received each of them."""
+    from livessl.cli.guided import accepts_shared, ask_for, is_shared
 
-    sounds = [sound for sound in server.kept() if is_clear(sound)]
+    sounds = [sound for sound in server.kept() if is_shared(sound)]
     while len(sounds) < count:
         prompt = f"clap anywhere, each time at another place ({len(sounds)} of {count})"
-        sounds.append(server.next_sound(partial(ask_for, prompt), "a sound", is_clear))
+        sounds.append(
+            server.next_sound(partial(ask_for, prompt), "a sound that two arrays receive clearly", accepts_shared)
+        )
     return sounds
 
 

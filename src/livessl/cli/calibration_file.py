@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli.exits import OK
-from livessl.cli.options import read_site
 from livessl.cli.output import complain
 from livessl.clock import SystemClock, utc_text
-from livessl.errors import UseError
+from livessl.errors import RunError, UseError
 
 if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredPose, MeasuredSetUp
@@ -43,6 +43,8 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
 
     Raises
     ------
+    RunError
+        If a site with it could not be loaded: a microphone would be outside the room.
     UseError
         If it cannot be written.
     """
@@ -50,6 +52,7 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
 
     path = _path(arguments, site)
     arrays = {name: array for joint, pose in measured.poses.items() for name, array in _arrays(site, joint, pose)}
+    _check_room(site, arrays)
     content = {
         "measured_utc": utc_text(SystemClock().now_ns()),
         "method": action,
@@ -59,14 +62,45 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            path.replace(_kept(path))
-        path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
+        _replace(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None).encode())
     except OSError as error:
         raise UseError(f"--write: cannot write {path}: {error.strerror}") from error
     named = site.calibration is not None and site.file(site.calibration).resolve() == path.resolve()
     hint = "" if named else f"; name it in the site file as calibration: {_relative(path, arguments)}"
     complain(f"written to {path}{hint}", kind="note")
+
+
+def _check_room(site: Site, arrays: dict[str, dict[str, Any]]) -> None:
+    """Raise `RunError` if a microphone would be outside the room."""
+    for name, array in arrays.items():
+        for number, at_m in enumerate(array["microphones_m"], 1):
+            if not all(0.0 <= x <= size for x, size in zip(at_m, site.room.size_m, strict=True)):
+                size_m, where_m = ([f"{x:g}" for x in xyz] for xyz in (site.room.size_m, at_m))
+                raise RunError(
+                    f"--write: expected array {name!r} within the room of {' x '.join(size_m)} m, got microphone "
+                    f"{number} at ({', '.join(where_m)}); the site could not be loaded. Correct room.size_m, or "
+                    "measure again, with all places from the corner that is the origin"
+                )
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file and keep the one before; at each moment either the whole old file or the whole new one is there."""
+    new, kept = _written(path, content), _kept(path)
+    if path.exists():
+        _written(kept, path.read_bytes()).replace(kept)
+    else:
+        kept.unlink(missing_ok=True)
+    new.replace(path)
+
+
+def _written(path: Path, content: bytes) -> Path:
+    """Write what shall replace a file to the disk, beside it; return where."""
+    new = path.with_name(path.name + ".new")
+    with new.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    return new
 
 
 def _arrays(site: Site, name: str, pose: MeasuredPose) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -95,9 +129,10 @@ def undo(arguments: argparse.Namespace) -> int:
     UseError
         If there is none.
     """
-    if arguments.write is None and arguments.site is None:
+    if arguments.write in (None, BESIDE_THE_SITE) and arguments.site is None:
         raise UseError("--undo: expected --site FILE, or --write FILE, the calibration file to put back")
-    path = _path(arguments, None if arguments.site is None else read_site(arguments))
+    given: Path | None = arguments.write
+    path = given if given is not None and given != BESIDE_THE_SITE else _named(arguments.site)
     if not _kept(path).exists():
         raise UseError(
             f"--undo: expected {_kept(path)}, the file that --write has replaced; there is none. To do without "
@@ -109,6 +144,26 @@ def undo(arguments: argparse.Namespace) -> int:
         raise UseError(f"--undo: cannot replace {path}: {error.strerror}") from error
     complain(f"{path} is as it was before", kind="note")
     return OK
+
+
+def _named(site_file: Path) -> Path:
+    """Return the calibration file of a site file, which need not be valid: its calibration may be what is wrong."""
+    import yaml
+
+    from livessl.site.findings import read_yaml
+
+    try:
+        data = read_yaml(site_file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        what = f"cannot read {site_file} ({type(error).__name__})"
+        raise UseError(f"--undo: {what}; give the calibration file as --write FILE") from error
+    known = data if isinstance(data, dict) else {}
+    calibration, site = known.get("calibration"), known.get("site")
+    if isinstance(calibration, str):
+        return site_file.parent / calibration
+    if isinstance(site, str):
+        return site_file.parent / FOLDER / f"{site}.yaml"
+    raise UseError(f"--undo: expected site or calibration in {site_file}; give the calibration file as --write FILE")
 
 
 def _path(arguments: argparse.Namespace, site: Site | None) -> Path:

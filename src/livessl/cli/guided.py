@@ -13,7 +13,8 @@ from livessl.cli.calibration_words import progress_line
 from livessl.core.commission.findings import LEAST_SHARPNESS
 from livessl.core.commission.next_place import AIM_DEG, AIM_M, proposed_place
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp
-from livessl.core.types import FloatArray
+from livessl.core.types import FloatArray, Observation
+from livessl.errors import RunError
 from livessl.site.build.grid import search_grid
 
 if TYPE_CHECKING:
@@ -35,6 +36,22 @@ def ask_for(text: str) -> None:
 def is_clear(sound: HeardSound) -> bool:
     """Return whether an array received a sound clearly."""
     return any(one.sharpness >= LEAST_SHARPNESS for one in sound.observations)
+
+
+def is_shared(sound: HeardSound) -> bool:
+    """Return whether two arrays or more received a sound clearly, each with two channels or more."""
+
+    def tells(one: Observation) -> bool:
+        return one.sharpness >= LEAST_SHARPNESS and np.isfinite(one.delays_s).sum() > 1
+
+    return sum(map(tells, sound.observations)) > 1
+
+
+def accepts_shared(sound: HeardSound) -> bool:
+    """Return whether a sound is shared, and tell the user if it is not."""
+    if not is_shared(sound):
+        ask_for("  a sound that no two arrays received clearly; clap louder, or between them")
+    return is_shared(sound)
 
 
 def clap_at(sounds: ServerSounds, place_m: Sequence[float], what: str) -> Clap:
@@ -73,7 +90,11 @@ def claps_for_poses(
         show(claps[-1])
         if len(claps) < LEAST_PLACES:
             continue
-        measured = measured_poses(site, claps, place_std_m)
+        try:
+            measured = measured_poses(site, claps, place_std_m)
+        except RunError:
+            ask_for(f"  no array has received {LEAST_PLACES} of the claps clearly yet")
+            continue
         ask_for(f"  {progress_line(measured)}")
         if len(claps) >= LEAST_GUIDED and is_good(site, measured):
             ask_for("good enough")

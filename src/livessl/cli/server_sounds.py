@@ -64,6 +64,10 @@ class ServerSounds:
         }
         return parse_site(json.dumps(described))
 
+    def has_joint_arrays(self) -> bool:
+        """Return whether the server joins arrays, so that `site` does not say how its site file names them."""
+        return bool(ask(self._url, "site", self._token_file)["joint"])
+
     def kept(self) -> list[HeardSound]:
         """Return the sounds that the server still keeps, the oldest first."""
         return [sound for _, sound in self._after(0).sounds]

@@ -52,6 +52,14 @@ def test_a_person_can_reach_proposed_places() -> None:
     assert between_m.min() >= 0.75
 
 
+def test_a_line_can_become_known_well_enough() -> None:
+    rng = np.random.default_rng(4)
+    line_m = np.array([4.0, 5.0, 2.0]) + np.linspace(-0.3, 0.3, 4)[:, None] * np.array([0.8, 0.6, 0.0])
+    few, many = (expected_stds(line_m, sources(rng, count), C_M_S, STD_M)[1] for count in (5, 30))
+    assert many < few < 10.0
+    assert many < AIM_DEG
+
+
 def test_a_cupboard_has_no_place_to_propose() -> None:
     rng = np.random.default_rng(2)
     cupboard_m = np.array([[0.0, 0.9], [0.0, 0.9], [0.0, 2.0]])

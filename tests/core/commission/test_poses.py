@@ -101,3 +101,30 @@ def test_claps_tell_the_poses_of_all_arrays_and_the_speed_of_sound(seed: int) ->
         assert np.abs(pose.microphones_m - true[name]).max() < max(0.08, 3.0 * pose.position_std_m)
     assert abs(found.c_m_s - C_M_S) < max(2.0, 3.0 * found.c_std_m_s)
     assert found.c_std_m_s < 2.0
+
+
+def test_a_sound_that_one_array_missed_counts_the_delays_of_the_others() -> None:
+    rng = np.random.default_rng(3)
+    true = set_up(rng)
+    places_m = sources(rng, 1)
+    delays = {"north": delays_of(true, places_m, rng, std_s=100e-6)["north"]}
+    alone = adjust(true, delays, places_m, C_M_S, Freedom({}), place_std_m=0.01)
+    found = adjust(true, {**delays, "south": np.full((1, 4), np.nan)}, places_m, C_M_S, Freedom({}), place_std_m=0.01)
+    assert found.misfits_s == pytest.approx(alone.misfits_s, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_the_pose_of_a_line_is_determined_although_its_turn_about_itself_is_not(count: int) -> None:
+    rng = np.random.default_rng(5)
+    line_m = np.array([4.0, 2.5, 2.0]) + np.linspace(-0.2, 0.2, count)[:, None] * np.array([0.8, 0.6, 0.0])
+    places_m = sources(rng, 20)
+    filed = moved(line_m, np.array([0.2, -0.1, 0.1]), np.array([0.1, 0.2, 0.3]))
+    delays = delays_of({"line": line_m}, places_m, rng)
+    found = measure_poses({"line": filed}, delays, places_m, C_M_S, 0.01).poses["line"]
+    assert found.is_determined, (found.position_std_m, found.orientation_std_deg)
+    assert np.abs(found.microphones_m - line_m).max() < max(0.03, 3.0 * found.position_std_m)
+    axis = (line_m[1] - line_m[0]) / np.linalg.norm(line_m[1] - line_m[0])
+    assert abs(found.turn.as_rotvec() @ axis) < 0.1
+    claps_in_one_direction_m = line_m.mean(axis=0) + np.array([3.0, 2.0, 0.0]) * np.linspace(0.8, 1.2, 5)[:, None]
+    unknown = delays_of({"line": line_m}, claps_in_one_direction_m, rng)["line"]
+    assert not measure_pose(line_m, unknown, claps_in_one_direction_m, C_M_S, 0.01).is_determined

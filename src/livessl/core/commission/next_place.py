@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.commission.places import Microphones
-from livessl.core.commission.poses import MICROPHONE_STD_M
+from livessl.core.commission.poses import MICROPHONE_STD_M, without_spin
 from livessl.core.commission.resection import CLAP_STD_S
 from livessl.core.types import FloatArray
 
@@ -66,7 +66,7 @@ def proposed_place(
     off = np.zeros(len(candidates_m))
     for name, at_m in microphones.items():
         added = _information(at_m, candidates_m, c_m_s, place_std_m)
-        position_m, orientation_deg = _stds(known[name] + _rough() + added)
+        position_m, orientation_deg = _stds(known[name] + _rough() + added, at_m)
         off = np.maximum(off, np.maximum(position_m / AIM_M, orientation_deg / AIM_DEG))
     return np.asarray(candidates_m[np.argmin(off)])
 
@@ -76,7 +76,7 @@ def expected_stds(
 ) -> tuple[float, float]:
     """Predict the largest standard deviations, in metres and degrees, of a pose that is measured by claps (S, 3)."""
     information = _information(microphones_m, places_m, c_m_s, place_std_m).sum(axis=0)
-    position_m, orientation_deg = _stds((information + _rough())[None])
+    position_m, orientation_deg = _stds((information + _rough())[None], microphones_m)
     return float(position_m[0]), float(orientation_deg[0])
 
 
@@ -119,7 +119,8 @@ def _information(microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, 
     return np.asarray(slopes.swapaxes(1, 2) @ np.linalg.solve(covariance, slopes))
 
 
-def _stds(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _stds(information: FloatArray, microphones_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Largest standard deviations (G,) of positions in metres and of orientations in degrees."""
-    variance = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
+    covariance = without_spin(np.asarray(np.linalg.inv(information), dtype=np.float64), microphones_m)
+    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
     return np.sqrt(variance[:, :3].max(axis=1)), np.degrees(np.sqrt(variance[:, 3:].max(axis=1)))

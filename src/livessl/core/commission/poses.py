@@ -30,6 +30,9 @@ UNKNOWN_M: Final = 100.0
 UNKNOWN_DEG: Final = 360.0
 """Standard deviations, in metres and degrees, that stand for "unknown"."""
 
+LINE: Final = 0.01
+"""Width over length up to which an array is a line."""
+
 _TOLERANCE: Final = 1e-5
 """Relative change of cost and unknowns below which the adjustment ends."""
 
@@ -242,7 +245,7 @@ class _Problem:
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
         off = contradictions_s(self._moved(poses, unknowns), self._delays, places_m, speed_m_s)
-        count = sum(np.isfinite(one).sum(axis=1) - 1 for one in self._delays.values())
+        count = sum(np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
         found = {}
         for index, name in enumerate(self._free):
@@ -284,3 +287,22 @@ def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> F
     """Positions after a turn (a vector, radians) about their centre and a shift, metres."""
     centre_m = microphones_m.mean(axis=0)
     return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
+
+
+def line_axis(microphones_m: FloatArray) -> FloatArray | None:
+    """Direction (3,) of the line that microphones (K, 3) are on; None if they are on none. Two are always on one."""
+    _, extent_m, axes = np.linalg.svd(microphones_m - microphones_m.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[0]) if extent_m[1] <= LINE * extent_m[0] else None
+
+
+def without_spin(covariance: FloatArray, microphones_m: FloatArray) -> FloatArray:
+    """Covariance (..., 6, 6) of a pose if the turn of a line of microphones about itself is given; else as it is.
+
+    Such a turn moves no microphone, so that no sound determines it, and nothing depends on it.
+    """
+    axis = line_axis(microphones_m)
+    if axis is None:
+        return covariance
+    spin = np.concatenate([np.zeros(3), axis])
+    shared = covariance @ spin
+    return np.asarray(covariance - shared[..., :, None] * shared[..., None, :] / (shared @ spin)[..., None, None])

@@ -18,7 +18,9 @@ from livessl.core.commission.poses import (
     Freedom,
     Pose,
     adjust,
+    line_axis,
     moved,
+    without_spin,
 )
 from livessl.core.types import BoolArray, FloatArray
 
@@ -62,7 +64,7 @@ class MeasuredPose:
     misfit_before_s, misfit_s : float
         Misfit of the sounds with the filed pose and with the measured one, seconds.
     covariance : (6, 6) float64
-        Of the position (m) and the turn (radians).
+        Of the position (m) and the turn (radians). A line of microphones has no turn about itself.
     """
 
     microphones_m: FloatArray
@@ -206,8 +208,13 @@ def described_pose(
 ) -> MeasuredPose:
     """Describe a measured pose (K, 3) against the filed one, metres; misfits are in seconds."""
     centre_m, filed_centre_m = measured_m.mean(axis=0), filed_m.mean(axis=0)
-    turn, _ = Rotation.align_vectors(measured_m - centre_m, filed_m - filed_centre_m)
-    variance = np.diag(pose.covariance)
+    arms_m, filed_arms_m = measured_m - centre_m, filed_m - filed_centre_m
+    if line_axis(filed_m) is not None:  # its longest arm says all; more of them leave the turn about it open
+        longest = [int(np.linalg.norm(filed_arms_m, axis=1).argmax())]
+        arms_m, filed_arms_m = arms_m[longest], filed_arms_m[longest]
+    turn, _ = Rotation.align_vectors(arms_m, filed_arms_m)
+    covariance = without_spin(pose.covariance, measured_m)
+    variance = np.maximum(np.diag(covariance), 0.0)
     return MeasuredPose(
         measured_m,
         centre_m - filed_centre_m,
@@ -216,7 +223,7 @@ def described_pose(
         float(np.degrees(np.sqrt(variance[3:].max()))),
         misfit_before_s,
         misfit_s,
-        pose.covariance,
+        covariance,
     )
 
 
