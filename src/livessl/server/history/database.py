@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
@@ -20,6 +19,7 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, SQLAlchemyErro
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.pool import QueuePool
 
+from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault, RunError
 from livessl.server.history.tables import metadata
 
@@ -329,8 +329,9 @@ def _sqlite(name: str, connections: int, *, writes: bool) -> Engine:
 def _end_in_time(connection: Connection) -> None:
     """Have SQLite interrupt what the connection still does after `STATEMENT_S`."""
     driver: Any = connection.connection.dbapi_connection
-    end_s = monotonic() + STATEMENT_S
-    driver.set_progress_handler(lambda: monotonic() > end_s, STEPS)
+    clock = SystemClock()
+    end_ns = clock.monotonic_ns() + round(1e9 * STATEMENT_S)
+    driver.set_progress_handler(lambda: clock.monotonic_ns() > end_ns, STEPS)
 
 
 def _on_connect(engine: Engine, set_up: Callable[[Any], None]) -> None:
