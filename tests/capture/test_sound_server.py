@@ -97,19 +97,23 @@ def sine_parts(signal: NDArray[np.floating[Any]], frequency_hz: float) -> tuple[
 @pytest.mark.sound_card
 def test_each_channel_of_a_card_is_recorded_in_its_place(card: VirtualCard, tmp_path: Path) -> None:
     card.plug_in()
-    seconds = np.arange(20 * RATE_HZ)[:, None] / RATE_HZ
+    seconds = np.arange(60 * RATE_HZ)[:, None] / RATE_HZ
     card.play((AMPLITUDE * np.sin(2 * np.pi * np.array(TONES_HZ) * seconds)).astype(np.float32))
     path, count = tmp_path / "recorded.npz", 200
-    recorder = card.start(sys.executable, "-c", RECORDER, str(path), str(count))
-    assert recorder.wait(timeout=HANG_S) == 0
-    recorded = np.load(path)
+    for _ in range(3):  # on a machine that is busy sound is lost, and told as lost
+        recorder = card.start(sys.executable, "-c", RECORDER, str(path), str(count))
+        assert recorder.wait(timeout=HANG_S) == 0
+        recorded = np.load(path)
+        if not recorded["overflow"].any():
+            break
 
     assert recorded["samples"].shape == (4, count * BLOCK)
     assert not recorded["overflow"].any()
     assert_array_equal(recorded["first_index"], BLOCK * np.arange(count))
-    # Stamps serve to put frames on a frame index of 50 ms, so most must lie nearer than that to an even run.
-    even_ns = recorded["stamp_ns"][0] + recorded["first_index"] / RATE_HZ * 1e9
-    assert np.median(np.abs(recorded["stamp_ns"] - even_ns)) < FRAME_NS
+    # Stamps serve to put frames on a frame index of 50 ms, so most must lie nearer than that to an even run. The first
+    # ones are no measure of it: a sound server that has just started delivers them late or at once.
+    offset_ns = recorded["stamp_ns"] - recorded["first_index"] / RATE_HZ * 1e9
+    assert np.median(np.abs(offset_ns - np.median(offset_ns))) < FRAME_NS
 
     # The card keeps 16 bits: rounding leaves 2^-15 / sqrt(12) = 9e-6 RMS in each of player, mixer and monitor. One
     # sample lost shifts a 440 Hz tone by d = 0.058 rad from there on; a loss after a fraction f of the second leaves
