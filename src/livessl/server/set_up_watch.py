@@ -67,7 +67,7 @@ class SetUpWatch:
         self._overload = overload
         self._lock = threading.Lock()
         self.heard = HeardSounds(first_sound)
-        """The last sounds, for whoever calibrates."""
+        """The last sounds, for calibration."""
         self._examined = 0  # number of the last sound that was examined
         self._sounds: Sequence[Sequence[Observation]] = ()
         self._unjudged = 0  # sounds since findings were last looked for

@@ -106,7 +106,7 @@ class Store:
 
     @property
     def cure(self) -> str:
-        """What to do if the database cannot be written."""
+        """The cure of a database that cannot be written."""
         return self._database.cure
 
     def prepare(self) -> None:

@@ -1,4 +1,4 @@
-"""What waits to be written into the history: in order, bounded, and retried, so that no caller waits for a database."""
+"""Holds what waits to be written into the history, in order, bounded and retried: no caller waits for a database."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Backlog:
         self._put = self._done = 0
         self._tried_ns = 0
         self.is_failing = False
-        """Whether the last attempt to write has failed."""
+        """True if the last attempt to write has failed."""
         self.unsaved = 0
         """Events that wait to be written."""
         self.unkept = 0

@@ -88,7 +88,7 @@ class Database:
     def __init__(self, place: Path | str | None) -> None:
         self.is_remote = isinstance(place, str)
         self.cure = CURE_OF_SERVER if self.is_remote else CURE
-        """What to do if the database cannot be written."""
+        """The cure of a database that cannot be written."""
         self._preparing = threading.Lock()
         self._turns = _Turns()
         self._is_prepared = False
@@ -211,7 +211,7 @@ class Database:
             raise StoreError(f"server.events_db: its journal was not emptied of old events; {UNLOCK}")
 
     def _check(self) -> None:
-        """Raise the error of the last `prepare`, so that nobody waits for a server that is known to be away."""
+        """Raise the error of the last `prepare`, so that no caller waits for a server that is known to be away."""
         if not self._is_prepared:
             raise StoreError(self._problem)
 
@@ -222,7 +222,7 @@ class Database:
 
 
 class _Turns:
-    """A lock that goes to whoever has waited longest: one that writes all the time must not keep out the others."""
+    """A lock that goes to the thread that has waited longest: one that writes all the time keeps out no other."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

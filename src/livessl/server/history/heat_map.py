@@ -1,4 +1,4 @@
-"""How many events lie in each cell of a floor plan, counted by the database."""
+"""Counts the events in each cell of a floor plan, in the database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written into the history: statements on a connection whose transaction the caller ends."""
+"""The statements that write into the history, on a connection whose transaction the caller ends."""
 
 from __future__ import annotations
 

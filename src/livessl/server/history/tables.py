@@ -89,7 +89,7 @@ progress: Final = Table(
     Column("clocks", Text),
     PrimaryKeyConstraint("site"),
 )
-"""How far the final pass of each site has come."""
+"""The frame index up to which the results of each site are final, and its clocks."""
 
 disabled: Final = Table(
     "disabled",

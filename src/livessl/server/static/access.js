@@ -28,23 +28,19 @@ export function protocols() {
 export const get = (url) => request(url, {});
 
 /** Replace a resource by `value`, sent as JSON. */
-export const put = (url, value) =>
-  request(url, { method: "PUT", body: JSON.stringify(value), headers: { "Content-Type": "application/json" } });
+export const put = (url, value) => send("PUT", url, value);
 
 /** Delete a resource. */
 export const remove = (url) => request(url, { method: "DELETE" });
 
-/** Send `value` as JSON, for an answer. */
-export const post = (url, value, options = {}) =>
-  request(url, {
-    method: "POST", body: JSON.stringify(value), headers: { "Content-Type": "application/json" }, ...options,
-  });
-
 /** Send `value` as JSON, for an answer that may take long. */
-export const postLong = (url, value) => post(url, value, { signal: AbortSignal.timeout(LONG_TIMEOUT_MS) });
+export const postLong = (url, value) => send("POST", url, value, { signal: AbortSignal.timeout(LONG_TIMEOUT_MS) });
 
 /** Read a resource whose answer may take long. */
 export const getStream = (url) => request(url, { signal: null });
+
+const send = (method, url, value, options = {}) =>
+  request(url, { method, body: JSON.stringify(value), headers: { "Content-Type": "application/json" }, ...options });
 
 async function request(url, { headers: others, ...options }) {
   const token = sessionStorage.getItem(STORAGE_KEY);

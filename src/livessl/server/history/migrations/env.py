@@ -1,4 +1,4 @@
-"""What Alembic runs to apply migrations: on the connection, and in the transaction, of its caller."""
+"""Alembic runs this to apply migrations: on the connection, and in the transaction, of its caller."""
 
 from __future__ import annotations
 
