@@ -110,9 +110,10 @@ def test_a_running_server_takes_over_what_is_written_and_undone(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site = write_site(tmp_path, {"arrays.south.orientation_deg": {"yaw": 25.0}})
+    left = iter(events())
     with running_server(load_site(site)) as turned:
 
-        def ask_for(text: str, left: Iterator[Event] = iter(events())) -> None:
+        def ask_for(text: str) -> None:
             if text.startswith("clap"):
                 finish(turned, next(left))
 
