@@ -128,7 +128,13 @@ def test_a_follower_that_fails_leaves_the_poses_as_they_were(desk: Desk) -> None
     ("changes", "words"),
     [
         ({"arrays.west": {"microphones_m": [[1, 1, 1], [1.2, 1, 1]]}}, "expected the arrays north, south"),
-        ({"arrays.south": {"microphones_m": [[1, 1, 1], [1.2, 1, 1]]}, "nodes": {}}, "expected 4 microphones, got 2"),
+        (
+            {
+                "arrays.south": {"microphones_m": [[1, 1, 1], [1.2, 1, 1]]},
+                "nodes.lab-pc.arrays": {"north": [1, 2, 3, 4], "south": [5, 6]},
+            },
+            "expected 4 microphones, got 2",
+        ),
         ({"band_hz": [200, 3000]}, "its band"),
     ],
 )

@@ -124,7 +124,7 @@ function poseText({ array, shift_m: shift, turn_deg: turn, position_std_m: off, 
 
 function poseItem(pose) {
   const { array, before, after, shift_m: shift, turn_deg: turn, misfit_us: misfit, determined } = pose;
-  return el("li", { className: "pose", "data-testid": `pose-${array}`, "data-determined": determined ?? "" },
+  return el("li", { className: "pose", "data-testid": `pose-${array}`, "data-determined": String(determined) },
     el("p", { text: poseText(pose) }),
     el("p", { className: "pose-detail", text: `from ${place(before.position_m)} to ${place(after.position_m)} (${shift.map((d) => signed(d, 3)).join(", ")} m), about x, y, z by ${turn.map((d) => signed(d, 1)).join(", ")}°` }),
     misfit === null ? null : el("p", { className: "pose-detail", text: `unexplained of its delays: ${number(misfit[0], 0)} µs before, ${number(misfit[1], 0)} µs after` }),
@@ -132,7 +132,7 @@ function poseItem(pose) {
 }
 
 function clapRow({ place_m: at, before_m: before, after_m: after, agrees }, index) {
-  return el("tr", { "data-agrees": agrees ?? "" },
+  return el("tr", { "data-agrees": String(agrees) },
     ...[`${index + 1}`, place(at), distance(before), distance(after)].map((text) => el("td", { text })));
 }
 

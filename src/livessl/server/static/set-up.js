@@ -27,7 +27,7 @@ export class SetUp {
     this.overlay = new PoseOverlay(plan);
     this.poses = new PosesPanel({ load, send, redraw });
     this.mover = new ArrayMover({
-      plan, redraw, propose: async (request) => this.poses.show(await send("set-up/move", request)),
+      plan, redraw: () => this.place(), propose: async (request) => this.poses.show(await send("set-up/move", request)),
     });
     this.claps = new ClapTest({
       load, send, plan, redraw,
