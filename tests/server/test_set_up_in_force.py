@@ -69,8 +69,8 @@ def test_each_change_can_be_undone_once_and_the_first_one_too(desk: Desk, tmp_pa
     )
     desk.set_up.accept(desk.moved("south"), "typed")
 
-    first = Desk(tmp_path / "first") if (tmp_path / "first").mkdir() is None else None
-    assert first is not None
+    (tmp_path / "first").mkdir()
+    first = Desk(tmp_path / "first")
     first.set_up.accept(first.moved(), "typed")
     assert first.set_up.undo() == ["south"]
     assert first.set_up.describe()["arrays"] == []

@@ -118,7 +118,7 @@ def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> N
 
 
 def _same(array: dict[str, Any], microphones_m: Sequence[Sequence[float]]) -> bool:
-    return [list(at_m) for at_m in microphones_m] == array["microphones_m"]
+    return bool([list(at_m) for at_m in microphones_m] == array["microphones_m"])
 
 
 def undo(arguments: argparse.Namespace) -> Path:
