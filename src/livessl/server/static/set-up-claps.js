@@ -226,6 +226,7 @@ export class ClapTest {
     this.cancel();
     this.claps = [];
     this.guided = false;
+    for (const axis of ["x", "y"]) find(`clap-${axis}`).value = "";
     find("claps").replaceChildren();
     find("clap-findings").replaceChildren();
     find("clap-verdict").hidden = true;
