@@ -22,8 +22,8 @@ def add_arguments(parser: Any) -> None:
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="time stamp of the files' first sample, RFC 3339 (default: now; with several nodes the next multiple of "
-        "5 s, so that they agree)",
+        help="time stamp of the files' first sample, RFC 3339 (default: now, or the next multiple of 5 s if the "
+        "site has several nodes, so that all start together)",
     )
 
 

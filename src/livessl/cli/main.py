@@ -60,7 +60,7 @@ COMMANDS: Final = (
     ),
     Command(
         "bench",
-        "measure how fast this machine locates, or the load that a server on it carries",
+        "measure how fast this machine locates, or how much load its server can carry",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
@@ -70,7 +70,7 @@ COMMANDS: Final = (
     ),
     Command(
         "doctor",
-        "find what is wrong with a set-up, from recordings of some sounds",
+        "find what is wrong with a set-up, from recordings or a running server's sounds",
         "livessl doctor --session session/",
     ),
     Command(

@@ -22,6 +22,7 @@ from livessl.server.clips.service import Clips
 from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
+from livessl.server.event_retention import delete_old_events
 from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.latency import Latency
@@ -30,7 +31,6 @@ from livessl.server.overload import Overload
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
-from livessl.server.retention import delete_old_events
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
