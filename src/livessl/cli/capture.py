@@ -9,6 +9,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
+from livessl.garbage import collect_as_usual
 
 
 def add_arguments(parser: Any) -> None:
@@ -39,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     clock = SystemClock()
     name = run_id(arguments.node, clock)
     device = audio_device(arguments, config, clock)
+    collect_as_usual()
     if device is not None:
         with stop_on_signal() as stop:
             capture_device(site, arguments.node, device, clock, name, stop.is_set)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy
 
 from livessl.core.types import FloatArray
 
@@ -152,7 +152,7 @@ def _in_prism(mean_m: FloatArray, covariance_m2: FloatArray, prism: Prism) -> fl
         if x0 == x1:
             continue
         crosses = (at > min(x0, x1)) & (at < max(x0, x1))
-        side = ndtr((y0 + (at[crosses] - x0) * ((y1 - y0) / (x1 - x0)) - means[crosses]) / factor[2, 2])
+        side = scipy.special.ndtr((y0 + (at[crosses] - x0) * ((y1 - y0) / (x1 - x0)) - means[crosses]) / factor[2, 2])
         section[crosses] += side if x1 < x0 else -side
     total = float(height_weights @ (weights * section).sum(axis=1))
     return abs(total)  # negative if the corners run clockwise
@@ -164,8 +164,8 @@ def _nodes(low: FloatArray, high: FloatArray, rule: tuple[FloatArray, FloatArray
     # of two tails alike, the left one has the better resolution
     mirrored = (low + high) > 0.0
     low, high = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
-    begin, width = ndtr(low)[..., None], (ndtr(high) - ndtr(low))[..., None]
-    values = ndtri(np.clip(begin + nodes * width, _EDGE, 1.0 - _EDGE))
+    begin, width = scipy.special.ndtr(low)[..., None], (scipy.special.ndtr(high) - scipy.special.ndtr(low))[..., None]
+    values = scipy.special.ndtri(np.clip(begin + nodes * width, _EDGE, 1.0 - _EDGE))
     values = np.where(mirrored[..., None], -values, values)
     shape = (*low.shape[:-1], -1)
     return values.reshape(shape), (width * weights).reshape(shape)
