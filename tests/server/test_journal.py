@@ -240,6 +240,7 @@ def test_alert_that_a_killed_server_left_in_the_outbox_is_in_the_journal_after_t
     with running_desk(site) as desk:  # its store has no journal of alerts, as if the server had been killed before it
         desk.finish(sound(1))
         wait_until(lambda: desk.published, "the alert")
+    (tmp_path / "events.sqlite").unlink()  # the outbox is another file
     with running_server(site) as server:
         [entry] = all_of(server.parts.store, JournalQuery(EntryKind.ALERT))
     assert entry.key == desk.published[0]["key"]
