@@ -174,8 +174,8 @@ class Operator:
 def play_killed(recordings: Path, directory: Path, kills: int, seed: int, least_s: float = 0.3) -> Outcome:
     """Play recordings to a server that is killed again and again; let it finish, and return what arrived.
 
-    A life lasts at least `least_s` seconds after the server has answered, and then up to three seconds longer, for as
-    long as the recordings have sounds: kills beyond their end would find nothing to alert about.
+    A life lasts at least `least_s` seconds after the server has answered, and then up to three seconds longer, so that
+    most kills fall into the time in which there are sounds.
     """
     chance, end_s = random.Random(seed), duration_s(recordings)
     with ExitStack() as stack:
@@ -191,8 +191,9 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int, least_
             site.start_node(name)
         operator, killed = Operator(site), 0
         site.sleep_until(0.5)
-        while killed < kills and site.now_s() < end_s:
-            time.sleep(least_s + chance.uniform(0.0, min(3.0, 2.0 * (end_s - site.now_s()) / (kills - killed + 1))))
+        while killed < kills:
+            left_s = max(0.0, end_s - site.now_s())
+            time.sleep(least_s + chance.uniform(0.0, min(3.0, 2.0 * left_s / (kills - killed + 1))))
             operator.change(killed)
             time.sleep(chance.uniform(0.0, 0.05))
             site.kill_server()

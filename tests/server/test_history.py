@@ -255,8 +255,17 @@ def test_database_that_cannot_be_migrated_is_refused_with_the_reason(tmp_path: P
     refusing.close()
 
 
-def test_search_that_takes_too_long_is_ended(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_that_takes_too_long_is_ended(place: Path | str, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_long_search(place, monkeypatch)
+
+
+def test_search_in_memory_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_long_search(None, monkeypatch)
+
+
+def check_long_search(place: Path | str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "STATEMENT_S", 0.5)
+    store = Store(place)
     with (
         pytest.raises(StoreError, match=r"a search was ended after 0.5 s; narrow the span"),
         store._database.reading() as connection,
@@ -264,6 +273,7 @@ def test_search_that_takes_too_long_is_ended(store: Store, monkeypatch: pytest.M
         connection.execute(text(FOREVER))
     store.add(event(1), 0)
     assert store.get("small-1") == event(1)
+    store.close()
 
 
 def test_search_in_memory_limits_no_write_after_it(monkeypatch: pytest.MonkeyPatch) -> None:

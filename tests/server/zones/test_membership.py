@@ -34,7 +34,9 @@ def probability_in(position_m: FloatArray, covariance_m2: FloatArray, zone: Pris
 def star(radii: Sequence[float], centre: Sequence[float] = (0.0, 0.0)) -> FloatArray:
     """Corners at any distance around a point: a polygon that is convex or not."""
     angles = np.arange(len(radii)) * 2.0 * np.pi / len(radii) + 0.1
-    return np.asarray(centre) + np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring: FloatArray = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    corners: FloatArray = np.asarray(centre) + np.array(radii)[:, None] * ring
+    return corners
 
 
 def rotation(seed: int) -> np.ndarray:

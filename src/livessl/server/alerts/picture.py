@@ -53,8 +53,8 @@ class _Canvas:
     def centres_m(self) -> tuple[FloatArray, FloatArray]:
         """Return the coordinates of the pixels: x of the columns, and y of the rows, the highest first."""
         rows, columns = self.shape
-        x_m = (np.arange(columns) + 0.5) / self._px_per_m - MARGIN_M
-        y_m = (np.arange(rows)[::-1] + 0.5) / self._px_per_m - MARGIN_M
+        x_m = (np.arange(columns, dtype=np.float64) + 0.5) / self._px_per_m - MARGIN_M
+        y_m = (np.arange(rows, dtype=np.float64)[::-1] + 0.5) / self._px_per_m - MARGIN_M
         return x_m, y_m
 
     def line(self, points_m: FloatArray, colour: _Colour, width_px: int = 1, *, closed: bool = True) -> None:
