@@ -61,6 +61,7 @@ def make_recordings(
     lead_s: float = 2.0,
 ) -> None:
     """A WAV for each array: bursts of noise at random places of the small room, without reverberation."""
+    directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scene.yaml"
     path.write_text(yaml.safe_dump(small(changes)), encoding="utf-8")
     site = load_site(path)

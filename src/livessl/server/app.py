@@ -25,6 +25,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.event_retention import delete_old_events
 from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
+from livessl.server.journal import Journal, also
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -36,6 +37,7 @@ from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
@@ -49,6 +51,10 @@ releases it thousands of times a second; by Python's default it would wait 5 ms 
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
+
+RESTORED: Final = 100
+"""Newest alerts of the outbox that are put into the journal at the start: a server that was killed may have kept them
+in the outbox only."""
 
 _log = logging.getLogger(__name__)
 
@@ -94,6 +100,8 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
+        journal = Journal(store, clock)
+        journal.site(site)
         zone_book = ZoneBook(site, publish)
 
         def zones() -> ZoneMap:
@@ -103,9 +111,16 @@ def assemble(
         overload = Overload(clock)
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
+        publish_arrays, publish_alert = also(journal.arrays, publish), also(journal.alert, publish)
+        array_states = ArrayStates(
+            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
+        )
+        kept, listeners = site.server.clips, Listeners()
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips)
         undo.callback(alerts.stop)
+        for _, alert in reversed(alerts.outbox.recent(RESTORED)):
+            journal.alert(alert)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -113,9 +128,7 @@ def assemble(
             publish(change)
 
         presence = Presence(zones, publish_change)
-        tracks = Tracks(presence)
-        kept, listeners = site.server.clips, Listeners()
-        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
@@ -147,6 +160,7 @@ def assemble(
         sinks=sinks,
         fanout=fanout,
         zone_book=zone_book,
+        journal=journal,
         presence=presence,
         floor_plan=floor_plan,
     )

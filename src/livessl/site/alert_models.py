@@ -204,6 +204,7 @@ class AppriseConfig(Model):
     """One service of those that Apprise knows; its URL holds secrets and stands in a file of its own."""
 
     url: FileName
+    attach: tuple[Literal["picture", "clip"], ...] = ("picture", "clip")
 
 
 class AlertAction(Model):

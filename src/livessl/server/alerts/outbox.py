@@ -174,6 +174,11 @@ class Outbox:
         """Return whether there is an alert with one of these keys."""
         return any(self._rows("SELECT 1 FROM alerts WHERE key = ?", (key,)) for key in keys)
 
+    def get(self, key: str) -> JsonObject | None:
+        """Return the alert of a key; None if there is none, or none any more."""
+        rows = self._rows("SELECT json FROM alerts WHERE key = ?", (key,))
+        return dict(json.loads(rows[0][0])) if rows else None
+
     def states(self) -> dict[str, RuleState]:
         """Return the states of all rules that have one."""
         return {name: RuleState.restored(json.loads(text)) for name, text in self._rows("SELECT * FROM rules")}
