@@ -118,6 +118,16 @@ class SetUpWatch:
             self._steady = SteadyFindings()
             self._note(())
 
+    def take_over(self, site: Site) -> None:
+        """Examine the last sounds anew with the poses of this site: what was wrong may be mended; any thread."""
+        of_layout = layout_findings(site)
+        with self._lock:
+            self._site, self._of_layout = site, of_layout
+            self._run += 1
+            self._steady = SteadyFindings()
+            self._unjudged = len(self._sounds)
+            self._note(())
+
     def start(self) -> None:
         """Begin to examine."""
         self._thread = threading.Thread(target=self._work, name="set-up", daemon=True)
@@ -132,19 +142,21 @@ class SetUpWatch:
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
-            known, run = list(self._sounds), self._run
+            site, known, run = self._site, list(self._sounds), self._run
+            is_moved = self._unjudged > 0 and len(known) >= LEAST_SOUNDS
         new = self.heard.after(self._examined)
-        if not new:
+        if not (new or is_moved):
             return
         # imported late: scipy's optimizer takes memory, and no event needs it
         from livessl.site.build.set_up import find_set_up_faults
 
         sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
-        findings = find_set_up_faults(self._site, sounds) if len(sounds) >= LEAST_SOUNDS else None
+        findings = find_set_up_faults(site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
             if run != self._run:
                 return
-            self._sounds, self._examined = sounds, new[-1].number
+            self._sounds = sounds
+            self._examined = new[-1].number if new else self._examined
             self._unjudged += len(new)
             if findings is None:
                 self._note(())

@@ -27,6 +27,7 @@ from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.journal_routes import journal_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.set_up_routes import set_up_routes
@@ -90,6 +91,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         dead_letter_routes(parts),
         zone_routes(parts),
         set_up_routes(parts),
+        proposal_routes(parts),
         clip_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
