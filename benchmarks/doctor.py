@@ -8,7 +8,8 @@ The rooms and the faults are those of `doctor_rooms.py`; seeds from 1000 on are 
 the report. A fault counts as named if a finding has its code, its array and, where it has one, its channel. With
 `--live` the events go one by one to the examination of a running server, which is looked at after each.
 
-The examinations of two arrays use what they observed beside the third one. Rows are appended to `rows.jsonl` as they
+The examinations of two arrays use what they observed beside the third one, and those of plugs in other inputs what is
+observed with the plugs where they belong: a test shows that it is the same. Rows are appended to `rows.jsonl` as they
 come, and those that are there already are not made again, so that a campaign can be interrupted. Observations are kept
 in `--cache`, if given: then only conclusions are drawn again.
 """
@@ -26,11 +27,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from doctor_rooms import ARRAYS, FAULTS, RATE_HZ, Fault, Room, Target
+from doctor_rooms import ARRAYS, FAULTS, RATE_HZ, Fault, Room, Routes, Target
 from livessl import offline
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.commission.finding import Finding, Severity
-from livessl.core.types import Event
+from livessl.core.types import Event, Observation
 from livessl.examination import Gathered, conclude, gather
 from livessl.lab.evaluate.markdown import Table, as_markdown
 from livessl.lab.evaluate.statistics import wilson
@@ -70,10 +71,13 @@ class Rooms:
     def gathered(self, seed: int, fault: Fault, arrays: int) -> tuple[Site, Gathered]:
         """The site file, and what its examination rests on; what fewer arrays observed is that beside all others."""
         room = self.room(seed)
-        of_room = fault if fault.recorded is not None else FAULTS[0]
-        if of_room.name not in self._gathered:
-            self._gathered[of_room.name] = self._of_all(room, of_room)
-        return room.site_with(fault, arrays), _of_arrays(self._gathered[of_room.name], set(ARRAYS[:arrays]))
+        made = fault if fault.recorded is not None else FAULTS[0]
+        if made.name not in self._gathered:
+            self._gathered[made.name] = self._of_all(room, made)
+        gathered = self._gathered[made.name]
+        if fault.routed is not None:
+            gathered = _routed(gathered, fault.routed(room.target))
+        return room.site_with(fault, arrays), _of_arrays(gathered, set(ARRAYS[:arrays]))
 
     def _of_all(self, room: Room, fault: Fault) -> Gathered:
         path = None if self._cache is None else self._cache / f"{room.seed}-{fault.name.replace(' ', '_')}.pickle"
@@ -86,6 +90,30 @@ class Rooms:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickle.dumps(gathered))
         return gathered
+
+
+def _routed(gathered: Gathered, routes: Routes) -> Gathered:
+    """Return what is observed with the plugs in other inputs: the same, under other names and in another order."""
+    inputs = {array: (array, np.arange(4)) for array in ARRAYS} | routes
+    if any(one.array is not None for one in gathered.findings):
+        raise ValueError("expected a set-up without faults of channels; their numbers would be others")
+
+    def routed(sound: Sequence[Observation]) -> tuple[Observation, ...]:
+        own = {one.array: one for one in sound}
+        return tuple(
+            replace(
+                own[source],
+                array=array,
+                delays_s=own[source].delays_s[order],
+                inverted=own[source].inverted[order],
+                coherence=own[source].coherence[order],
+                powers=own[source].powers[order],
+            )
+            for array, (source, order) in inputs.items()
+            if source in own
+        )
+
+    return replace(gathered, sounds=tuple(routed(sound) for sound in gathered.sounds))
 
 
 def _of_arrays(gathered: Gathered, arrays: set[str]) -> Gathered:

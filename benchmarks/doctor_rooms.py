@@ -14,15 +14,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livessl.core.geometry import posed, tetrahedron
-from livessl.core.types import Event, Float32Array, FloatArray
+from livessl.core.types import Event, Float32Array, FloatArray, IntArray
 from livessl.simulation.of_site import scene_of
-from livessl.simulation.scene import render
+from livessl.simulation.scene import Scene, render
 from livessl.site.load import parse_site
 from livessl.site.models import Site
 
@@ -34,6 +35,8 @@ CLOCK_S: Final = 2.0
 
 Recordings = dict[str, Float32Array]
 Arrays = dict[str, FloatArray]
+Routes = dict[str, tuple[str, IntArray]]
+"""Where an array's channels come from: the array whose plugs are in its inputs, and their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +56,18 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: what it does to the recordings or to the site file, and what should be said.
+    """One fault: what it does to the recordings, the plugs or the site file, and what should be said.
 
-    `expected` holds the codes that name it; empty if nothing should be said. `of` is "array" or "channel" if the array,
-    or also the channel, has to be named. `settings` are settings of the site file that are wrong. `live` is False where
-    a server finds it without sounds, from what the nodes report.
+    `routed` says which plugs are in which inputs. `expected` holds the codes that name it; empty if nothing should be
+    said. `of` is "array" or "channel" if the array, or also the channel, has to be named. `settings` are settings of
+    the site file that are wrong. `live` is False where a server finds it without sounds, from what the nodes report.
     """
 
     name: str
     expected: tuple[str, ...]
     of: str | None = "channel"
     recorded: Callable[[Recordings, Target], None] | None = None
+    routed: Callable[[Target], Routes] | None = None
     filed: Callable[[Arrays, Target], None] | None = None
     settings: tuple[tuple[str, Any], ...] = ()
     live: bool = True
@@ -114,25 +118,24 @@ def _behind(recordings: Recordings, at: Target) -> None:
     recordings[at.array] = np.roll(recordings[at.array], late, axis=1)
 
 
-def _swap(recordings: Recordings, at: Target) -> None:
+def _swap(at: Target) -> Routes:
     order = np.arange(4)
     order[[at.channel, at.other]] = order[[at.other, at.channel]]
-    recordings[at.array] = recordings[at.array][order]
+    return {at.array: (at.array, order)}
 
 
-def _rotate(recordings: Recordings, at: Target) -> None:
+def _rotate(at: Target) -> Routes:
     order, three = np.arange(4), np.delete(np.arange(4), at.channel)
     order[three] = np.roll(three, 1)
-    recordings[at.array] = recordings[at.array][order]
+    return {at.array: (at.array, order)}
 
 
-def _mirror(recordings: Recordings, _at: Target) -> None:
-    for array, samples in recordings.items():
-        recordings[array] = samples[[0, 1, 3, 2]]
+def _mirror(_at: Target) -> Routes:
+    return {array: (array, np.array([0, 1, 3, 2])) for array in ARRAYS}
 
 
-def _exchange(recordings: Recordings, _at: Target) -> None:
-    recordings["north"], recordings["south"] = recordings["south"], recordings["north"]
+def _exchange(_at: Target) -> Routes:
+    return {"north": ("south", np.arange(4)), "south": ("north", np.arange(4))}
 
 
 def _turn(angle_deg: float) -> Callable[..., None]:
@@ -171,10 +174,10 @@ FAULTS: Final = (
     Fault("inverted", ("inverted",), recorded=_channel(lambda x, _: -x)),
     Fault("one signal on two channels", ("duplicate",), "array", recorded=_duplicate),
     Fault("two samples late", ("late_channel",), recorded=_channel(_late)),
-    Fault("two channels swapped", ("swapped",), "array", recorded=_swap),
-    Fault("three channels exchanged", ("swapped", "turned"), "array", recorded=_rotate),
-    Fault("all wired the other way round", ("mirrored",), None, recorded=_mirror),
-    Fault("inputs of two arrays exchanged", ("exchanged",), None, recorded=_exchange),
+    Fault("two channels swapped", ("swapped",), "array", routed=_swap),
+    Fault("three channels exchanged", ("swapped", "turned"), "array", routed=_rotate),
+    Fault("all wired the other way round", ("mirrored",), None, routed=_mirror),
+    Fault("inputs of two arrays exchanged", ("exchanged",), None, routed=_exchange),
     Fault("microphone 5 cm off", ("geometry",), filed=_displace),
     Fault("turned by 5 degrees", ("turned",), "array", filed=_turn(5.0)),
     Fault("turned by 8 degrees", ("turned",), "array", filed=_turn(8.0)),
@@ -207,8 +210,12 @@ class Room:
             at_m = (x_m, y_m + along_m, z_m) if name == "west" else (x_m + along_m, y_m, z_m)
             self._filed[name] = posed(tetrahedron(0.5), at_m, yaw_deg=float(yaw_deg))
         self._recordings: Recordings | None = None
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Ten sounds at random places."""
         site = self.site_with(FAULTS[0], len(ARRAYS))
-        self.scene = scene_of(site, rt60_s=self.rt60_s, count=SOUNDS, sample_rate_hz=RATE_HZ, seed=seed)
+        return scene_of(site, rt60_s=self.rt60_s, count=SOUNDS, sample_rate_hz=RATE_HZ, seed=self.seed)
 
     @property
     def target(self) -> Target:
@@ -242,6 +249,10 @@ class Room:
         recordings = {name: self._recordings[name].copy() for name in ARRAYS[:arrays]}
         if fault.recorded is not None:
             fault.recorded(recordings, self.target)
+        if fault.routed is not None:
+            routes = fault.routed(self.target).items()
+            routed = {array: recordings[source][order] for array, (source, order) in routes if array in recordings}
+            recordings |= routed
         return recordings
 
     def _built(self, name: str) -> FloatArray:

@@ -24,11 +24,14 @@ from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
 
 MIN_GAIN: Final = 4.0
-"""Least gain in the criterion of sounds at unknown places, for each array beyond the first, for which a set-up is said
-to be other than filed."""
+GAIN_PER_ARRAY: Final = 2.0
+"""Least gain in the deviance of sounds at unknown places from which a set-up is said to be other than filed, and what
+is added to it for each array beyond the first, because more arrays have more alternatives."""
 
-MIN_LEAD: Final = 3.0
-"""Least lead in the same measure over the best alternative about another array or channel."""
+MIN_LEAD: Final = 6.0
+MIN_LEAD_OF_GAIN: Final = 0.12
+"""Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
+the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
@@ -54,7 +57,7 @@ class Diagnosis:
     sounds : int
         Number of sounds.
     misfit_s : float
-        Misfit with the set-up as filed, seconds.
+        Misfit with the set-up as filed, seconds: nearly so, for sounds at unknown places.
     best : Alternative or None
         The alternative to believe; None if the set-up as filed is as good, or no alternative stands out.
     rivals : tuple of Alternative
@@ -148,17 +151,15 @@ def _by_criterion(trial: Trial) -> Diagnosis:
 
 def _by_judge(judge: Judge) -> Diagnosis:
     """Compare alternatives with the freedom of a careful set-up."""
-    least = MIN_GAIN * (judge.arrays - 1)
+    least = MIN_GAIN + GAIN_PER_ARRAY * (judge.arrays - 1)
     misfit_s = judge.misfit_s
-    if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
+    if judge.exact_misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
         return Diagnosis(judge.sounds, misfit_s, None, (), contradicts=False)
     rivals = judge.judged()
     gained = judge.filed - rivals[0].criterion
     contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
-    if contradicts:
-        worst = rivals[0].criterion + MIN_LEAD
-        rivals = [judge.with_misfit(one) if one.criterion <= worst else one for one in rivals]
-    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, MIN_LEAD)
+    least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
+    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead)
 
 
 def _decided(

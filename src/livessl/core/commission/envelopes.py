@@ -40,32 +40,41 @@ class EnvelopeMeter:
         self._rate_hz = sample_rate_hz
         self._pieces: list[Float32Array] = []
         self._count = 0  # of the pieces so far
-        self._at = 0  # index of the first sample of `_rest`
-        self._rest: Float32Array | None = None
+        self._waiting: list[Float32Array] = []
+        self._at = self._next = 0  # indices of the first sample that waits, and of the one that comes next
 
     def push(self, index: int, samples: Float32Array) -> None:
         """Take in samples (K, n), of which the first has this index; indices that are left out are a gap."""
-        if self._rest is None or index != self._at + self._rest.shape[1]:
+        if index != self._next:
+            self._measure()
             self._skip_to(index)
-            self._rest = samples[:, max(0, self._edge(self._count) - index) :]
-            self._at = max(index, self._edge(self._count))
-        else:
-            self._rest = np.concatenate([self._rest, samples], axis=1)
+            skipped = self._edge(self._count) - index
+            samples, index = samples[:, skipped:], index + min(skipped, samples.shape[1])
+            self._at, self._waiting = index, []
+        self._waiting.append(samples)
+        self._next = index + samples.shape[1]
+        if self._next - self._at >= self._rate_hz:  # a second at a time: blocks are short
+            self._measure()
+
+    def _measure(self) -> None:
+        """Measure all complete pieces of the samples that wait."""
         # a piece begins at the sample next to a multiple of the hop, so that they keep time at every sampling rate
         last = self._count
-        while self._edge(last + 1) + 1 <= self._at + self._rest.shape[1]:
+        while self._edge(last + 1) + 1 <= self._next:
             last += 1
-        if last == self._count:
+        if last == self._count or not self._waiting:
             return
+        samples = np.concatenate(self._waiting, axis=1)
         edges = np.array([self._edge(piece) - self._at for piece in range(self._count, last + 1)])
-        steps = np.diff(self._rest[:, : edges[-1] + 1], axis=1)  # no rumble and no constant
+        steps = np.diff(samples[:, : edges[-1] + 1], axis=1)  # no rumble and no constant
         energy = np.add.reduceat(steps * steps, edges[:-1], axis=1)
         # the median: one channel may be dead, or noisy
         self._pieces.append(np.median(energy / np.diff(edges), axis=0).astype(np.float32))
-        self._rest, self._at, self._count = self._rest[:, edges[-1] :], self._at + int(edges[-1]), last
+        self._waiting, self._at, self._count = [samples[:, edges[-1] :]], self._at + int(edges[-1]), last
 
     def rises(self) -> FloatArray:
         """By how much the power of each piece exceeds the decay of all before it, in nepers of power, (n,)."""
+        self._measure()
         if not self._pieces:
             return np.zeros(0)
         power = np.concatenate(self._pieces).astype(np.float64)

@@ -29,6 +29,11 @@ KEPT: Final = 0.8
 _STEPS: Final = 25
 """Steps of the refinement, which ends after a handful."""
 
+LEAST_DAMPING: Final = 1e-9
+LEAST_SLOPE: Final = 1e-16
+"""Least damping, and what is added to the normal equations of a place in square seconds per square metre, so that they
+can be solved for a sound that two channels received, or one. Slopes are some 1e-3 s/m."""
+
 _FIRST_DAMPING: Final = 1e-3
 _LEAST_M: Final = 1e-6
 """Step, in metres, below which the refinement ends."""
@@ -143,7 +148,7 @@ class PlaceSearch:
             normal = np.einsum("sri,srj->sij", slope, slope)
             right = np.einsum("sri,sr->si", slope, off)
             scale = np.einsum("sii->s", normal) / 3.0
-            normal = normal + (damping * scale + 1e-30)[:, None, None] * np.eye(3)
+            normal = normal + (damping * scale + LEAST_SLOPE)[:, None, None] * np.eye(3)
             moved_m = np.clip(
                 positions_m - np.linalg.solve(normal, right[..., None])[..., 0],
                 self.bounds_m[:, 0],
@@ -156,7 +161,7 @@ class PlaceSearch:
             done = np.linalg.norm(moved_m - positions_m, axis=1).max() < _LEAST_M
             positions_m[better], off[better], slope[better] = moved_m[better], tried[better], tried_slope[better]
             cost = np.where(better, tried_cost, cost)
-            damping = np.where(better, damping / 5.0, damping * 8.0)
+            damping = np.where(better, np.maximum(damping / 5.0, LEAST_DAMPING), damping * 8.0)
             if done:
                 break
         return Places(positions_m, np.sqrt(cost / degrees_of_freedom(delays)))

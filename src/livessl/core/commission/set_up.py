@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.commission.places import Delays, Microphones, degrees_of_freedom
+from livessl.core.commission.places import LEAST_DAMPING, LEAST_SLOPE, Delays, Microphones
 from livessl.core.types import BoolArray, FloatArray
 
 POSITION_STD_M: Final = 0.02
@@ -133,7 +133,7 @@ class Stacked:
             turned = slope.swapaxes(-1, -2)
             normal = turned @ slope
             scale = np.trace(normal, axis1=-2, axis2=-1) / 3.0
-            normal = normal + (damping * scale + 1e-30)[..., None, None] * np.eye(3)
+            normal = normal + (damping * scale + LEAST_SLOPE)[..., None, None] * np.eye(3)
             step_m = np.linalg.solve(normal, turned @ off[..., None])[..., 0]
             tried_m = np.clip(places_m - step_m, self.bounds_m[:, 0], self.bounds_m[:, 1])
             done = np.linalg.norm(tried_m - places_m, axis=-1).max() < _ENOUGH_M
@@ -142,16 +142,10 @@ class Stacked:
             better = tried_cost < cost
             places_m[better], off[better], slope[better] = tried_m[better], tried[better], tried_slope[better]
             cost = np.where(better, tried_cost, cost)
-            damping = np.where(better, damping / 5.0, damping * 8.0)
+            damping = np.where(better, np.maximum(damping / 5.0, LEAST_DAMPING), damping * 8.0)
             if done:
                 break
         return places_m
-
-    def misfits_s(self, places_m: FloatArray) -> FloatArray:
-        """Root mean square of what remains of each sound's delays at places (H, S, 3), seconds: (H, S)."""
-        off, _ = self._off_and_slope(places_m, self.there, self.measured_s)
-        free = np.stack([degrees_of_freedom(one.delays) for one in self.set_ups])
-        return np.asarray(np.sqrt((off**2).sum(axis=-1) / free))
 
     def _off_and_slope(
         self, places_m: FloatArray, there: dict[str, BoolArray], measured_s: dict[str, FloatArray]

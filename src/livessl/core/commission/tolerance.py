@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from livessl.core.commission.places import Places
 from livessl.core.commission.set_up import SetUp, Stacked, away, centred_rows, centred_where
 from livessl.core.types import FloatArray
 
@@ -59,6 +60,8 @@ class Explained:
         Minus twice the logarithm of the likelihood and of the priors, up to a constant; lower is better.
     places_m : (S, 3) float64
         Where the sounds were, metres.
+    misfit_s : float
+        Root mean square of what remains of the delays, of the `KEPT` share of the sounds that fit best, seconds.
     shifts_m, turns_deg : mapping of array to (3,) float64
         By how much each array differs from the given set-up.
     displaced_m : mapping of array to (K, 3) float64
@@ -71,6 +74,7 @@ class Explained:
 
     deviance: float
     places_m: FloatArray
+    misfit_s: float
     shifts_m: Mapping[str, FloatArray]
     turns_deg: Mapping[str, FloatArray]
     displaced_m: Mapping[str, FloatArray]
@@ -144,15 +148,23 @@ class Fit:
 
     def results(self) -> list[Explained]:
         """Return the best fit of each set-up, its unknowns by name."""
-        places_m, unknowns = self._best
-        return list(self._results(places_m, unknowns * self._scale))
+        self._places_m, self._unknowns = self._best
+        self._off = self._residuals()
+        return list(self._results(self._misfits_s(), self._unknowns * self._scale))
 
-    def _results(self, places_m: FloatArray, off: FloatArray) -> Iterator[Explained]:
+    def _misfits_s(self) -> FloatArray:
+        """Root mean square of what remains of each sound's delays, per degree of freedom, seconds: (H, S)."""
+        squares = np.sum([(off**2).sum(axis=-1) for off in self._off.values()], axis=0)
+        free = np.maximum(np.sum(list(self._count.values()), axis=0) - 3, 1)
+        return np.asarray(DELAY_STD_S * np.sqrt(squares / free))
+
+    def _results(self, misfits_s: FloatArray, off: FloatArray) -> Iterator[Explained]:
         for row, deviance in enumerate(self.deviances):
             own = {name: off[row, columns] for name, columns in self._columns.items()}
             yield Explained(
                 float(deviance),
-                places_m[row],
+                self._places_m[row],
+                Places(self._places_m[row], misfits_s[row]).misfit_s,
                 {name: one[:3] for name, one in own.items()},
                 {name: np.degrees(one[3:_POSE]) for name, one in own.items()},
                 {name: one[_POSE:].reshape(-1, 3) for name, one in own.items()},
