@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
 from livessl.core.commission.places import PlaceSearch, contradictions_s, degrees_of_freedom
-from livessl.core.commission.set_up import SetUp, Stacked, careful
+from livessl.core.commission.set_up import SetUp, Stacked, careful, inverse
 from livessl.core.commission.tolerance import Explained, explained
 from livessl.core.types import FloatArray
 
@@ -128,3 +128,10 @@ def test_places_that_are_refined_together_are_those_that_are_refined_alone(seed:
         alone = search.refine(one.microphones, delays, starts_m)
         off_s = contradictions_s(one.microphones, delays, places_m, C_M_S)
         assert (off_s**2).sum(axis=1) == pytest.approx(alone.misfits_s**2 * degrees_of_freedom(delays), rel=0.1)
+
+
+@given(seed=seeds)
+def test_inverses_of_small_matrices_are_those_of_numpy(seed: int) -> None:
+    slopes = np.random.default_rng(seed).normal(0.0, 1e-3, (5, 4, 3, 7)) * np.logspace(0, -3, 3)[:, None]
+    matrices = slopes @ slopes.swapaxes(-1, -2)
+    assert inverse(matrices) @ matrices == pytest.approx(np.broadcast_to(np.eye(3), matrices.shape), abs=1e-5)

@@ -57,7 +57,7 @@ class Diagnosis:
     sounds : int
         Number of sounds.
     misfit_s : float
-        Misfit with the set-up as filed, seconds: nearly so, for sounds at unknown places.
+        Misfit with the set-up as filed, seconds.
     best : Alternative or None
         The alternative to believe; None if the set-up as filed is as good, or no alternative stands out.
     rivals : tuple of Alternative
@@ -153,11 +153,12 @@ def _by_judge(judge: Judge) -> Diagnosis:
     """Compare alternatives with the freedom of a careful set-up."""
     least = MIN_GAIN + GAIN_PER_ARRAY * (judge.arrays - 1)
     misfit_s = judge.misfit_s
-    if judge.exact_misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
+    if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
         return Diagnosis(judge.sounds, misfit_s, None, (), contradicts=False)
     rivals = judge.judged()
     gained = judge.filed - rivals[0].criterion
     contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
+    rivals[0] = judge.with_misfit(rivals[0])
     least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
     return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead)
 

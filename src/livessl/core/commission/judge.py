@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.hypotheses import Hypotheses, Hypothesis
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
-from livessl.core.commission.set_up import Stacked
+from livessl.core.commission.poses import moved
+from livessl.core.commission.set_up import SetUp, Stacked
 from livessl.core.commission.tolerance import Explained, explained
 from livessl.core.types import FloatArray
 
@@ -62,14 +63,8 @@ class Judge:
 
     @property
     def misfit_s(self) -> float:
-        """Misfit of the sounds in a set-up that is nearly as filed, seconds."""
-        return self._filed.misfit_s
-
-    @property
-    def exact_misfit_s(self) -> float:
         """Misfit of the sounds in the set-up exactly as filed, seconds."""
-        set_up = self._as_filed.set_up
-        return self._search.fit(set_up.microphones, set_up.delays, set_up.c_m_s).misfit_s
+        return self._misfit_s(self._as_filed.set_up)
 
     def may_gain(self, least: float) -> bool:
         """Return whether a set-up that is nearly as filed may explain the sounds better by so much."""
@@ -82,6 +77,13 @@ class Judge:
         found = zip(tried, self._fitted(tried), strict=True)
         judged = (_adjusted(one.alternative, fit) for one, fit in found if one.alternative is not None)
         return sorted(judged, key=lambda one: one.criterion)
+
+    def with_misfit(self, alternative: Alternative) -> Alternative:
+        """Return an alternative with the misfit of the sounds in it, which is exactly as filed otherwise."""
+        return replace(alternative, misfit_s=self._misfit_s(_applied(self._as_filed.set_up, alternative)))
+
+    def _misfit_s(self, set_up: SetUp) -> float:
+        return self._search.fit(set_up.microphones, set_up.delays, set_up.c_m_s).misfit_s
 
     def _fitted(self, tried: Sequence[Hypothesis]) -> list[Explained]:
         """Fit hypotheses, as many together as fit into a little memory."""
@@ -97,11 +99,33 @@ class Judge:
         return found
 
 
+def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
+    """Return the filed set-up as an alternative has it."""
+    microphones, delays, c_m_s = dict(filed.microphones), dict(filed.delays), filed.c_m_s
+    name, other = alternative.array, alternative.other
+    if alternative.order:
+        order = np.array(alternative.order) - 1
+        for array in delays if name is None else (name,):
+            delays[array] = delays[array][:, order]
+    elif name is None:
+        c_m_s = alternative.speed_m_s or c_m_s
+    elif other is not None:
+        delays[name], delays[other] = delays[other], delays[name]
+    elif alternative.channel is not None:
+        index = alternative.channel - 1
+        delays[name], microphones[name] = delays[name].copy(), microphones[name].copy()
+        delays[name][:, index] -= alternative.late_s
+        microphones[name][index] += alternative.shift_m
+    else:
+        turn = np.radians(alternative.turn_deg)
+        microphones[name] = moved(microphones[name], np.array(alternative.shift_m), turn)
+    return replace(filed, microphones=microphones, delays=delays, c_m_s=c_m_s)
+
+
 def _adjusted(alternative: Alternative, found: Explained) -> Alternative:
     """Return an alternative with its criterion, and with the change that was found for what it leaves free."""
     others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
-    criterion = found.deviance + COSTS.get(alternative.fault, others)
-    judged = replace(alternative, criterion=criterion, misfit_s=found.misfit_s)
+    judged = replace(alternative, criterion=found.deviance + COSTS.get(alternative.fault, others))
     name = alternative.array
     if alternative.fault == "turned" and name is not None:
         first, then = (Rotation.from_rotvec(np.radians(one)) for one in (alternative.turn_deg, found.turns_deg[name]))

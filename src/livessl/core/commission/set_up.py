@@ -134,7 +134,7 @@ class Stacked:
             normal = turned @ slope
             scale = np.trace(normal, axis1=-2, axis2=-1) / 3.0
             normal = normal + (damping * scale + LEAST_SLOPE)[..., None, None] * np.eye(3)
-            step_m = np.linalg.solve(normal, turned @ off[..., None])[..., 0]
+            step_m = (inverse(normal) @ (turned @ off[..., None]))[..., 0]
             tried_m = np.clip(places_m - step_m, self.bounds_m[:, 0], self.bounds_m[:, 1])
             done = np.linalg.norm(tried_m - places_m, axis=-1).max() < _ENOUGH_M
             tried, tried_slope = self._off_and_slope(tried_m, there, measured)
@@ -177,3 +177,11 @@ def centred_rows(values: FloatArray, there: BoolArray) -> FloatArray:
     count = np.maximum(there.sum(axis=-1), 1)[..., None, None]
     known = np.where(there[..., None], values, 0.0)
     return np.asarray(np.where(there[..., None], known - known.sum(axis=-2, keepdims=True) / count, 0.0))
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of matrices (..., 3, 3), by cofactors: LAPACK is slow with many small ones."""
+    a, b, c = (matrices[..., row, :] for row in range(3))
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    determinant = (a * cofactors[..., 0]).sum(axis=-1)
+    return np.asarray(cofactors / determinant[..., None, None])

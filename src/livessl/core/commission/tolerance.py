@@ -17,8 +17,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livessl.core.commission.places import Places
-from livessl.core.commission.set_up import SetUp, Stacked, away, centred_rows, centred_where
+from livessl.core.commission.set_up import SetUp, Stacked, away, centred_rows, centred_where, inverse
 from livessl.core.types import FloatArray
 
 DELAY_STD_S: Final = 6e-6
@@ -60,8 +59,6 @@ class Explained:
         Minus twice the logarithm of the likelihood and of the priors, up to a constant; lower is better.
     places_m : (S, 3) float64
         Where the sounds were, metres.
-    misfit_s : float
-        Root mean square of what remains of the delays, of the `KEPT` share of the sounds that fit best, seconds.
     shifts_m, turns_deg : mapping of array to (3,) float64
         By how much each array differs from the given set-up.
     displaced_m : mapping of array to (K, 3) float64
@@ -74,7 +71,6 @@ class Explained:
 
     deviance: float
     places_m: FloatArray
-    misfit_s: float
     shifts_m: Mapping[str, FloatArray]
     turns_deg: Mapping[str, FloatArray]
     displaced_m: Mapping[str, FloatArray]
@@ -148,23 +144,15 @@ class Fit:
 
     def results(self) -> list[Explained]:
         """Return the best fit of each set-up, its unknowns by name."""
-        self._places_m, self._unknowns = self._best
-        self._off = self._residuals()
-        return list(self._results(self._misfits_s(), self._unknowns * self._scale))
+        places_m, unknowns = self._best
+        return list(self._results(places_m, unknowns * self._scale))
 
-    def _misfits_s(self) -> FloatArray:
-        """Root mean square of what remains of each sound's delays, per degree of freedom, seconds: (H, S)."""
-        squares = np.sum([(off**2).sum(axis=-1) for off in self._off.values()], axis=0)
-        free = np.maximum(np.sum(list(self._count.values()), axis=0) - 3, 1)
-        return np.asarray(DELAY_STD_S * np.sqrt(squares / free))
-
-    def _results(self, misfits_s: FloatArray, off: FloatArray) -> Iterator[Explained]:
+    def _results(self, places_m: FloatArray, off: FloatArray) -> Iterator[Explained]:
         for row, deviance in enumerate(self.deviances):
             own = {name: off[row, columns] for name, columns in self._columns.items()}
             yield Explained(
                 float(deviance),
-                self._places_m[row],
-                Places(self._places_m[row], misfits_s[row]).misfit_s,
+                places_m[row],
                 {name: one[:3] for name, one in own.items()},
                 {name: np.degrees(one[3:_POSE]) for name, one in own.items()},
                 {name: one[_POSE:].reshape(-1, 3) for name, one in own.items()},
@@ -232,8 +220,8 @@ class Fit:
             flat = (of_unknowns * root[..., None]).reshape(rows, -1, len(used)).swapaxes(1, 2)
             whole[:, used[:, None], used] += flat @ flat.swapaxes(1, 2)
             gradient[:, used] += (flat @ (off * root).reshape(rows, -1, 1))[..., 0]
-        solved = np.linalg.solve(normal, np.concatenate([mixed, right[..., None]], axis=3))
-        of_mixed, of_right = solved[..., :-1], solved[..., -1]
+        inverted = inverse(normal)
+        of_mixed, of_right = inverted @ mixed, (inverted @ right[..., None])[..., 0]
         eliminated = mixed.reshape(rows, -1, count).swapaxes(1, 2)
         reduced = whole - eliminated @ of_mixed.reshape(rows, -1, count)
         rest = gradient - (eliminated @ of_right.reshape(rows, -1, 1))[..., 0]
