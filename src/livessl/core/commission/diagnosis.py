@@ -33,6 +33,9 @@ MIN_LEAD_OF_GAIN: Final = 0.12
 """Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
 the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
 
+EQUAL: Final = 0.5
+"""Share of the least lead within which alternatives explain the sounds equally well."""
+
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
 """The same for sounds at places that somebody measured, in the Bayesian information criterion."""
@@ -171,7 +174,7 @@ def _decided(
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
     named = contradicts and lead > least_lead and best.is_large
-    undecided = _undecided(rivals, least_lead) if contradicts and not named else ()
+    undecided = _undecided(rivals, EQUAL * least_lead) if contradicts and not named else ()
     return Diagnosis(
         sounds,
         misfit_s,
@@ -183,10 +186,10 @@ def _decided(
     )
 
 
-def _undecided(rivals: Sequence[Alternative], least_lead: float) -> tuple[Alternative, ...]:
+def _undecided(rivals: Sequence[Alternative], apart: float) -> tuple[Alternative, ...]:
     """Return the best alternatives if they are the same fault of different arrays, such as a shift of one of two."""
     best = rivals[0]
-    close = [one for one in rivals if one.criterion - best.criterion <= least_lead and one.array != best.array]
+    close = [one for one in rivals if one.criterion - best.criterion <= apart and one.array != best.array]
     if not close or any(one.fault != best.fault or not one.is_large for one in (best, *close)):
         return ()
     firsts = {one.array: one for one in reversed((best, *close))}
