@@ -149,7 +149,7 @@ def _by_criterion(trial: Trial) -> Diagnosis:
     rivals = sorted(tried, key=lambda one: one.criterion)
     gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
     contradicts = gained > KNOWN_MIN_GAIN and filed_s > MIN_RATIO * max(rivals[0].misfit_s, KNOWN_FLOOR_S)
-    return _decided(trial.sounds, filed_s, rivals, gained, contradicts, KNOWN_MIN_LEAD)
+    return _decided(trial.sounds, filed_s, rivals, gained, contradicts, KNOWN_MIN_LEAD, KNOWN_MIN_LEAD)
 
 
 def _by_judge(judge: Judge) -> Diagnosis:
@@ -163,18 +163,24 @@ def _by_judge(judge: Judge) -> Diagnosis:
     contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
     rivals[0] = judge.with_misfit(rivals[0])
     least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
-    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead)
+    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, EQUAL * least_lead)
 
 
 def _decided(
-    sounds: int, misfit_s: float, rivals: Sequence[Alternative], gained: float, contradicts: bool, least_lead: float
+    sounds: int,
+    misfit_s: float,
+    rivals: Sequence[Alternative],
+    gained: float,
+    contradicts: bool,
+    least_lead: float,
+    apart: float,
 ) -> Diagnosis:
-    """Name the best alternative if it leads, or those that are as good."""
+    """Name the best alternative if it leads by so much, or those that are not further apart."""
     best = rivals[0]
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
     named = contradicts and lead > least_lead and best.is_large
-    undecided = _undecided(rivals, EQUAL * least_lead) if contradicts and not named else ()
+    undecided = _undecided(rivals, apart) if contradicts and not named else ()
     return Diagnosis(
         sounds,
         misfit_s,
