@@ -147,7 +147,7 @@ class Onset(MapEstimator):
             return sharp
         place = sharp.consensus.place
         (peak,) = self._search.among([tolerant(part) for part in sharp.evidence])(1)
-        if np.linalg.norm(self.grid.point_m(peak.point) - place.position_m) <= NEAR_M + self.grid.spacing_m:
+        if np.linalg.norm(self.grid.point_m(peak.point) - place.position_m) <= NEAR_M:
             return sharp
         wide = self._answer_by(tuple(tolerant(part) for part in evidence), suspect, whole=whole)
         return max(sharp, wide, key=_Answer.rank)
