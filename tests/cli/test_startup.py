@@ -35,7 +35,16 @@ LOCALIZES = {
     "livessl.core.locate.srp",
     "livessl.core.stream.fusion",
 }
-NEVER_LIVE = {"matplotlib", "pyarrow", "scipy.signal", "scipy.sparse", "scipy.spatial", "scipy.stats", "tqdm"}
+NEVER_LIVE = {
+    "matplotlib",
+    "opentelemetry",
+    "pyarrow",
+    "scipy.signal",
+    "scipy.sparse",
+    "scipy.spatial",
+    "scipy.stats",
+    "tqdm",
+}
 
 
 def loaded(*arguments: str, code: int) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import urllib.error
 import urllib.request
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +24,16 @@ def add_server(parser: Any, text: str) -> None:
 
 
 def ask(url: str, path: str, token_file: Path | None) -> Any:
-    """Return a server's answer to `GET /api/v1/PATH`.
+    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
+    address = f"{url.rstrip('/')}/api/v1/{path}"
+    try:
+        return json.loads(fetch(address, token_file))
+    except ValueError as error:
+        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
+
+
+def fetch(address: str, token_file: Path | None) -> bytes:
+    """Return the body of a server's answer to `GET`.
 
     Raises
     ------
@@ -32,9 +42,8 @@ def ask(url: str, path: str, token_file: Path | None) -> Any:
     RunError
         If the server does not answer, or refuses.
     """
-    address = f"{url.rstrip('/')}/api/v1/{path}"
     if not address.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
+        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {}
     if token_file is not None:
         try:
@@ -44,10 +53,11 @@ def ask(url: str, path: str, token_file: Path | None) -> Any:
     request = urllib.request.Request(address, headers=headers)  # noqa: S310 - the address begins with http
     try:
         with urllib.request.urlopen(request, timeout=ANSWER_S) as response:  # noqa: S310
-            return json.load(response)
+            body: bytes = response.read()
+            return body
     except urllib.error.HTTPError as error:
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
         raise RunError(f"{address}: the server answered {error.code} {error.reason}{cure}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error

@@ -22,6 +22,7 @@ from livessl.server.clips.service import Clips
 from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
+from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.latency import Latency
@@ -30,6 +31,8 @@ from livessl.server.overload import Overload
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
+from livessl.server.recent_log import RecentLog
+from livessl.server.reload import Reloader
 from livessl.server.retention import delete_old_events
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
@@ -42,6 +45,7 @@ from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
+from livessl.traces import traces_in_use
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
@@ -63,6 +67,7 @@ def assemble(
     receiver: Inbox | None = None,
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
+    read_site: Callable[[], Site] | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -76,6 +81,8 @@ def assemble(
         Gets every event after the sinks and before `publish`; called on the fusion thread.
     url : str
         Address of the server, for the links in alerts.
+    read_site : callable or None
+        Reads the site file again; None for a server without one.
 
     Raises
     ------
@@ -104,7 +111,9 @@ def assemble(
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
         array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
+        found = traces_in_use()
+        traces = None if found is None else EventTraces(found)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones, traces)
         undo.callback(alerts.stop)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
@@ -116,15 +125,16 @@ def assemble(
         tracks = Tracks(presence)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
+        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts, traces)
         publisher = Publisher(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
         floor_plan = read_floor_plan(site)
+        reloader = Reloader(site, read_site, zone_book, alerts)
         undo.pop_all()
     return Parts(
         site=site,
@@ -149,6 +159,8 @@ def assemble(
         zone_book=zone_book,
         presence=presence,
         floor_plan=floor_plan,
+        reloader=reloader,
+        recent_log=RecentLog(),
     )
 
 
@@ -167,6 +179,8 @@ class Server:
         Stands in for the nodes' socket.
     stepped : bool
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
+    read_site : callable or None
+        Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
 
     Raises
     ------
@@ -187,12 +201,10 @@ class Server:
         on_event: Callable[[JsonObject], None] | None = None,
         receiver: Inbox | None = None,
         stepped: bool = False,
+        read_site: Callable[[], Site] | None = None,
     ) -> None:
-        faults = unprotected_addresses(site)
-        if faults:
-            raise ConfigError(faults)
-        if method is not None:
-            site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
+        site = _usable(site, method)
+        read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
         self._access = Access(None if http.tokens is None else site.file(http.tokens))
         certificate = certificate_of(site)
@@ -214,7 +226,8 @@ class Server:
             if self._compiler is not None:
                 undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
-            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
+            fanout = Fanout(first_seq)
+            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
         """The HTTP server."""
@@ -230,11 +243,13 @@ class Server:
         gc.collect()
         gc.freeze()  # what exists now stays, and the collector need not look through it again
         try:
-            asyncio.run(self._serve())
+            with self.parts.recent_log.attached():
+                asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
             if self._compiler is not None:
                 self._compiler.stop()
+            self.parts.reloader.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
@@ -264,6 +279,7 @@ class Server:
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
+        self.parts.reloader.start()
         if not self._stepped:
             self.parts.store.backlog.start()
             self.parts.engine.start()
@@ -293,3 +309,19 @@ class Server:
             loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed, and no subscriber is left
             _log.debug("a message was published after the event loop had closed")
+
+
+def _usable(site: Site, method: str | None) -> Site:
+    """Return a site with the method of the command line, if it may be served.
+
+    Raises
+    ------
+    ConfigError
+        If the server would be open to the network.
+    """
+    faults = unprotected_addresses(site)
+    if faults:
+        raise ConfigError(faults)
+    if method is None:
+        return site
+    return site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
