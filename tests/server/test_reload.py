@@ -185,7 +185,7 @@ def test_poses_are_taken_over_or_need_a_restart(tmp_path: Path, fault: str | Non
     path = write_site(tmp_path)
     with running_server(load_site(path)) as server:
         parts, poses = server.parts, Still(parts_site := server.parts.site, fault)
-        reloader = Reloader(parts_site, lambda: load_site(path), parts.zone_book, parts.alerts, poses)
+        reloader = Reloader(parts_site, lambda: load_site(path), parts.zone_book, parts.alerts, None, poses)
         write_site(tmp_path, {"arrays.north.position_m": [1.8, 1.3, 1.4], "arrays.north.band_hz": [200, 4000]})
         result = reloader.reload()
         pose, band = ["arrays.north.position_m"], ["arrays.north.band_hz"]

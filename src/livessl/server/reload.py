@@ -85,6 +85,8 @@ class Reloader:
         Reads and checks the site file, and raises `ConfigError` with all of its faults; None for a server without one.
     zone_book : ZoneBook
     alerts : Alerts
+    note : callable or None
+        Gets the site after each reload that has changed it, for the journal.
     poses : Poses or None
         None if poses need a restart.
     """
@@ -95,12 +97,14 @@ class Reloader:
         read: Callable[[], Site] | None,
         zone_book: ZoneBook,
         alerts: Alerts,
+        note: Callable[[Site], None] | None = None,
         poses: Poses | None = None,
     ) -> None:
         self._in_force = site
         self._read = read
         self._zone_book = zone_book
         self._alerts = alerts
+        self._note = note
         self._poses = poses
         self._lock = threading.Lock()
         self._requests: queue.SimpleQueue[bool] = queue.SimpleQueue()  # its `put` may interrupt itself
@@ -132,6 +136,8 @@ class Reloader:
             self.is_usable = False
             result = self._take_over(self._read())
             self.is_usable, self.needs_restart = True, result.needs_restart
+            if result.changed and self._note is not None:
+                self._note(self._in_force)
         _log.info("the site file was read again: %s", result)
         return result
 

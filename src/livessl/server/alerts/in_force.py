@@ -10,6 +10,7 @@ from pathlib import Path
 from livessl.clock import Clock
 from livessl.server.alerts.actions import ActionSetting, make_action
 from livessl.server.alerts.courier import Courier
+from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
 from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.message import AlertMessages
@@ -36,6 +37,8 @@ class Surroundings:
         Returns the zones that are in force.
     url : str
         Address of the server, for links, unless the site file gives another one.
+    evidence : Evidence
+        Pictures and clips of alerts.
     traces : EventTraces or None
         Adds spans of alerts; None if nothing is traced.
     """
@@ -44,6 +47,7 @@ class Surroundings:
     store: Store
     zones: Callable[[], ZoneMap]
     url: str
+    evidence: Evidence
     traces: EventTraces | None = None
 
 
@@ -97,5 +101,5 @@ def _courier(name: str, site: Site, around: Surroundings, outbox: Outbox, url: s
     alike = {other for other, each in alerts.actions.items() if each.kind == config.kind}
     taken = {rule for rule, each in alerts.rules.items() if not alike.isdisjoint(each.actions)}
     others = sorted((alerts.rules.keys() | outbox.states().keys()) - taken)
-    action = make_action(ActionSetting(name, config, site, around.clock, rules, others, url))
+    action = make_action(ActionSetting(name, config, site, around.clock, rules, others, url, around.evidence))
     return Courier(name, config, action, outbox, around.clock, around.traces)

@@ -14,11 +14,11 @@ from contextlib import suppress
 from typing import Final
 
 from livessl.clock import Clock
-from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
 from livessl.server.alerts.backlog import Backlog, Batch, final_until_ns
 from livessl.server.alerts.courier import NS_PER_S, REST_S, Courier
+from livessl.server.alerts.evidence import ClipSource, Evidence
 from livessl.server.alerts.history import DryRuns, past_pages
 from livessl.server.alerts.in_force import AlertsInForce, Surroundings, outbox_path
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
@@ -71,6 +71,8 @@ class Alerts:
         Address of the server, for links, unless the site file gives another one.
     zones : callable or None
         Returns the zones that are in force; None for those of the site.
+    clips : ClipSource or None
+        Finds the clips of events; None if the site keeps none.
     traces : EventTraces or None
         Adds spans of alerts; None if nothing is traced.
 
@@ -93,6 +95,7 @@ class Alerts:
         publish: Callable[[JsonObject], None],
         url: str = "",
         zones: Callable[[], ZoneMap] | None = None,
+        clips: ClipSource | None = None,
         traces: EventTraces | None = None,
     ) -> None:
         self._site = site
@@ -102,9 +105,12 @@ class Alerts:
         self._set_up_watch = set_up_watch
         self._site_time = site_time
         self._publish = publish
-        self._around = Surroundings(clock, store, fixed_zones(site) if zones is None else zones, url, traces)
+        zones = fixed_zones(site) if zones is None else zones
         self.outbox = Outbox(outbox_path(site))
         """Alerts, deliveries and the rules' states."""
+        self.evidence = Evidence(site, zones, clips)
+        """Pictures and clips of alerts."""
+        self._around = Surroundings(clock, store, zones, url, self.evidence, traces)
         try:
             self._in_force = AlertsInForce(site, self.outbox, self._around)
         except BaseException:
@@ -388,10 +394,8 @@ class Alerts:
         self._backlog.work_off_changes(lambda changes: self._announce(self._in_force.judge.judge_changes(changes)))
         now_ns = self._clock.now_ns()
         if self._in_force.judges_conditions and not self._site_time.is_replay:
-            set_up = self._set_up_watch.state
-            findings = set_up.findings if set_up.sounds >= LEAST_SOUNDS else None
             arrays = self._array_states.describe(levels=False)
-            self._announce(self._in_force.judge.judge_conditions(arrays, findings, now_ns))
+            self._announce(self._in_force.judge.judge_conditions(arrays, self._set_up_watch.state, now_ns))
         days = self._site.store.retention_days
         if days is not None and now_ns - self._expired_ns >= EXPIRE_NS:
             self._expired_ns = now_ns
