@@ -37,7 +37,7 @@ LOCALIZES = {
 }
 NEVER_LIVE = {
     "matplotlib",
-    "opentelemetry",
+    "opentelemetry.sdk",
     "pyarrow",
     "scipy.signal",
     "scipy.sparse",

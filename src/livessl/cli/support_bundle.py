@@ -16,8 +16,6 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from livessl import __version__
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
@@ -25,8 +23,6 @@ from livessl.cli.output import complain
 from livessl.cli.server_answers import add_server, ask, fetch
 from livessl.clock import SystemClock, utc_text
 from livessl.errors import ConfigError, RunError
-from livessl.site.addresses import in_url
-from livessl.site.redact import redacted, scrubbed
 
 LINES: Final = 1000
 """Most lines of the server's log, and of the journal."""
@@ -55,6 +51,8 @@ class Bundle:
 
     def add(self, name: str, make: Callable[[], str]) -> None:
         """Add a part without its secrets, or note why it cannot be had."""
+        from livessl.site.redact import scrubbed
+
         try:
             text = make()
         except (RunError, ConfigError, OSError, ValueError, subprocess.SubprocessError) as error:
@@ -100,6 +98,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _add_site(bundle: Bundle, path: Path) -> Any:
     """Add the site file without secrets, and what `check` finds in it; return its data, None if it has none."""
+    import yaml
+
+    from livessl.site.redact import redacted
+
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
@@ -148,6 +150,8 @@ def _add_answers(bundle: Bundle, url: str, token_file: Path | None) -> None:
 
 def _url(data: Any) -> str:
     """Return the address of the server on this machine, from the data of a site file that need not be valid."""
+    from livessl.site.addresses import in_url
+
     http = data
     for key in ("server", "http"):
         http = http.get(key) if isinstance(http, dict) else None
