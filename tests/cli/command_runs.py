@@ -13,7 +13,7 @@ from small_site import RATE_HZ
 
 COMMANDS = (
     "demo", "serve", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan", "doctor",
-    "calibrate", "keys", "init", "check", "config", "devices", "levels",
+    "calibrate", "support-bundle", "keys", "init", "check", "config", "devices", "levels",
 )  # fmt: skip
 
 

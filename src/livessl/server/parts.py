@@ -18,7 +18,9 @@ from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.proposals import Proposals
 from livessl.server.receiver import Inbox
+from livessl.server.recent_log import RecentLog
 from livessl.server.refusals import Refusals
+from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
@@ -63,13 +65,15 @@ class Parts:
     journal: Journal
     presence: Presence
     floor_plan: FloorPicture | None
+    reloader: Reloader
+    recent_log: RecentLog
 
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
         parts = (
             *(self.engine, self.receiver, self.maps, self.set_up_watch, self.proposals),
-            *(self.alerts, self.clips, self.store.backlog),
+            *(self.alerts, self.clips, self.store.backlog, self.reloader),
         )
         failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)
