@@ -44,7 +44,9 @@ subtracted and the sound is looked for beneath it."""
 
 
 FAR_BELOW: Final = 0.1
-"""Power of a background relative to that of the sound, 10 dB below, from which on it counts in full."""
+COMPARABLE: Final = 0.2
+"""Power of a background relative to that of the sound, 10 and 7 dB below, from which on it counts, and counts in full.
+What a room still gives of an earlier sound from the same place is usually weaker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +124,7 @@ class Onset(MapEstimator):
         if answer.judgement.features.background >= BACKGROUND:
             beneath = self._without_background(evidence, answer.consensus.place)
             other = self._answer(beneath, suspect)
-            if other.rank() > answer.rank():
+            if other.refused is None and other.rank() > answer.rank():
                 evidence, answer = beneath, other
         outside = self._outside(answer)
         separation = None
@@ -286,9 +288,8 @@ def _background(sound: Sound) -> Float32Array | None:
     """Lags that the frames of a sound would add up to if its background had gone on alone; None if it is not known.
 
     The background is known from the pre-roll without its last frames, in which the sound may begin. The weights of
-    onsets say little about power: a background `FAR_BELOW` the sound counts less, such as what the room still gives of
-    an earlier sound from the same place. Envelopes are magnitudes: those of noise do not cancel, and say nothing about
-    a place.
+    onsets say little about power, so that a background `FAR_BELOW` the sound is left out. Envelopes are magnitudes:
+    those of noise do not cancel, and say nothing about a place.
     """
     course = sound.course
     if course is None or not sound.onsets:
@@ -298,7 +299,10 @@ def _background(sound: Sound) -> Float32Array | None:
     if not known or before == len(sound.onsets) or np.iscomplexobj(sound.onsets[0].lags):
         return None
     level = float(course.powers[known].mean()) / max(float(course.powers[before:].mean()), 1e-30)
-    share = min(1.0, level / FAR_BELOW) * (len(sound.onsets) - before) / len(known)
+    counted = min(1.0, (level - FAR_BELOW) / (COMPARABLE - FAR_BELOW))
+    if counted <= 0.0:
+        return None
+    share = counted * (len(sound.onsets) - before) / len(known)
     return np.float32(share) * np.asarray(summed([sound.onsets[k] for k in known]).lags, dtype=np.float32)
 
 
