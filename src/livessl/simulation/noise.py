@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 
 from livessl.core.types import Float32Array, FloatArray
 
@@ -203,7 +204,7 @@ def _pink_spectra(rng: np.random.Generator, count: int, sample_rate_hz: float, c
     return np.asarray((drawn[0] + 1j * drawn[1]) * shape)
 
 
-def _in_time(spectra: FloatArray, count: int) -> Float32Array:
+def _in_time(spectra: FloatArray | NDArray[np.complex128], count: int) -> Float32Array:
     """Transform to the time domain and give every channel a mean power of 1."""
     noise = scipy.fft.irfft(spectra, count, axis=1)
     return np.asarray(noise / np.sqrt(np.square(noise).mean(axis=1, keepdims=True)), dtype=np.float32)

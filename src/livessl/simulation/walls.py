@@ -57,7 +57,7 @@ def wall_absorption(
     areas = np.repeat([y * z, x * z, x * y], 2).reshape(3, 2)
     relative = np.asarray(shares, dtype=np.float64)
     relative = relative * areas.sum() / (relative * areas).sum()
-    return np.minimum(mean * relative[..., None] * np.asarray(bands, dtype=np.float64), MOST_ABSORPTION)
+    return np.asarray(np.minimum(mean * relative[..., None] * np.asarray(bands, dtype=np.float64), MOST_ABSORPTION))
 
 
 def wall_responses(
