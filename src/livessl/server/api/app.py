@@ -15,9 +15,9 @@ from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
+from livessl.schema.answers import errors
 from livessl.server.api import documentation, routes
 from livessl.server.api.alert_routes import alert_routes, dead_letter_routes
-from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.clip_routes import clip_routes

@@ -15,8 +15,8 @@ from pydantic import WithJsonSchema
 from livessl import __version__
 from livessl.clock import utc_text
 from livessl.core.types import FRAME_S
-from livessl.server.api import answers
-from livessl.server.api.answers import errors
+from livessl.schema import answers
+from livessl.schema.answers import errors
 from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
@@ -47,7 +47,7 @@ Time = Annotated[str, WithJsonSchema(_DATE_TIME)]
 
 
 def as_json(found: JsonObject, status: int = 200) -> Response:
-    """An answer as JSON. The models in `answers.py` describe it and are not run."""
+    """An answer as JSON. The models in `schema/answers.py` describe it and are not run."""
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
