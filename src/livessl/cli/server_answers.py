@@ -22,6 +22,22 @@ def add_server(parser: Any, text: str) -> None:
     )
 
 
+def read_token(token_file: Path) -> str:
+    """Return the token in a file.
+
+    Raises
+    ------
+    UseError
+        If the file cannot be read.
+    """
+    try:
+        return token_file.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
+
+
 def ask(url: str, path: str, token_file: Path | None) -> Any:
     """Return a server's answer to `GET /api/v1/PATH`.
 
@@ -37,10 +53,7 @@ def ask(url: str, path: str, token_file: Path | None) -> Any:
         raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
     headers = {}
     if token_file is not None:
-        try:
-            headers["Authorization"] = f"Bearer {token_file.read_text(encoding='utf-8').strip()}"
-        except OSError as error:
-            raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+        headers["Authorization"] = f"Bearer {read_token(token_file)}"
     request = urllib.request.Request(address, headers=headers)  # noqa: S310 - the address begins with http
     try:
         with urllib.request.urlopen(request, timeout=ANSWER_S) as response:  # noqa: S310

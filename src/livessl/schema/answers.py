@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
-from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
+from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Seq, Track, UtcTime, Version
 from livessl.schema.zones import BoundsM, IntervalM, ZoneShape
 
 BandHz = Annotated[
@@ -182,6 +182,26 @@ class EventPage(_Versioned):
         "Null if no event was found.",
         examples=["1767225900050000000-42"],
     )
+
+
+class EventLog(_Versioned):
+    """Events in the order in which they were stored."""
+
+    position: str = Field(
+        description="Pass it unchanged as `after` for the events stored from now on, and treat it as opaque.",
+        examples=["0-4711"],
+    )
+    more: bool = Field(description="Whether more events are stored already: ask again at once.", examples=[False])
+    seq: Seq = Field(
+        description="Number of the last live message published before: live events up to it are older than these."
+    )
+    unsaved: int = Field(ge=0, description="Events published and not stored yet: ask again soon.", examples=[0])
+    complete: bool = Field(
+        description="False if events may be missing: the history asked for is not this one, as after a restart of a "
+        "server that keeps it in memory, or the position is too old.",
+        examples=[True],
+    )
+    events: list[Event]
 
 
 class OneEvent(_Versioned, Event):

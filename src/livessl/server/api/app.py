@@ -22,6 +22,7 @@ from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.clip_routes import clip_routes
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.event_log_route import event_log_route
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.live import live_routes
@@ -29,6 +30,7 @@ from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.set_up_routes import set_up_routes
+from livessl.server.api.stream import stream_route
 from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
 from livessl.server.store import StoreError
@@ -83,6 +85,8 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.switch_route(parts),
         routes.access_route(parts, access),
         history_routes(parts),
+        event_log_route(parts),
+        stream_route(parts),
         routes.map_route(parts),
         alert_routes(parts),
         dead_letter_routes(parts),

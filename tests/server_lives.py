@@ -1,0 +1,62 @@
+"""A server that is killed again and again: `python server_lives.py SITE_FILE COUNT`, one life for each line it reads.
+
+Each life publishes the events that are not final yet, and goes on serving. It is forked from a process that has loaded
+everything, so that a life begins at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from threading import Thread
+
+from alert_desk import after, sound
+from livessl.clock import SystemClock
+from livessl.core.stream.final_pass import FinalResults
+from livessl.server.api.encode import Messages
+from livessl.server.app import Server
+from livessl.site.load import load_site
+
+EARLY, FINAL = 0.5, 0.9
+"""Confidence of early and of final answers."""
+
+PAUSE_S = 0.004
+"""Time between two events, in seconds."""
+
+
+def live(site_file: str, count: int) -> None:
+    """Publish what is not final; each fifth event has an early answer before."""
+    site = load_site(Path(site_file))
+    server = Server(site, SystemClock(), stepped=True)
+    parts, messages = server.parts, Messages(site, 0, utc=True)
+    stored = parts.store.count()
+    assert stored is not None
+    parts.event_log.begin_live()
+    parts.store.backlog.start()  # events are published before they are stored, as in a server that hears
+    Thread(target=server.run).start()
+    while server.loop is None:
+        time.sleep(0.001)
+    for number in range(max(0, stored - 1), count):  # the last one may be early
+        if number % 5 == 4:
+            parts.event_log.add_early(sound(number, confidence=EARLY), messages)
+            time.sleep(PAUSE_S)
+        event = sound(number, confidence=FINAL)
+        parts.event_log.add_final(FinalResults((event,), after(event)), messages, {})
+        time.sleep(PAUSE_S)
+
+
+def main() -> None:
+    """Begin a life for each line; print its process. The reader of the lines ends it."""
+    for _ in sys.stdin:
+        process = os.fork()
+        if process == 0:
+            live(sys.argv[1], int(sys.argv[2]))
+            return
+        print(process, flush=True)
+        os.waitpid(process, 0)
+
+
+if __name__ == "__main__":
+    main()
