@@ -7,8 +7,12 @@ everything, so that a life begins at once.
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
@@ -18,12 +22,35 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.site.load import load_site
+from small_site import started
 
 EARLY, FINAL = 0.5, 0.9
 """Confidence of early and of final answers."""
 
 PAUSE_S = 0.004
 """Time between two events, in seconds."""
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def server_lives(site: Path, count: int) -> Iterator[Callable[[], int]]:
+    """Yield a function that begins a life of a server and returns its process, once the one before was killed."""
+    command = (sys.executable, __file__, site, str(count))
+    with started(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as lives:
+
+        def begin() -> int:
+            assert lives.stdin is not None
+            assert lives.stdout is not None
+            print("live", file=lives.stdin, flush=True)
+            return int(lives.stdout.readline())
+
+        yield begin
 
 
 def live(site_file: str, count: int) -> None:

@@ -6,9 +6,6 @@ import asyncio
 import os
 import random
 import signal
-import socket
-import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -16,13 +13,55 @@ from threading import Thread
 
 import pytest
 
-from livessl.client import Event, aconnect, connect
-from server_lives import EARLY, FINAL
-from small_site import HANG_S, started, wait_until, write_site
+from livessl.client import Event, Options, Received, aconnect, connect
+from server_lives import EARLY, FINAL, free_port, server_lives
+from small_site import HANG_S, wait_until, write_site
 
-LIVES = Path(__file__).parents[1] / "server_lives.py"
 KILLS = 5
 COUNT = 400
+
+
+class Follower(Thread):
+    """Follows a server by one of the clients until it has the final answer of every event."""
+
+    def __init__(self, url: str, names: set[str]) -> None:
+        super().__init__()
+        self.url, self.names = url, names
+        self.options = Options(kinds=["event"], since="2026-01-01T00:00:00Z", give_up_s=HANG_S)
+        self.got: list[tuple[str, float]] = []
+
+    @property
+    def is_complete(self) -> bool:
+        return {name for name, confidence in self.got if confidence == FINAL} == self.names
+
+    def take(self, message: Received) -> None:
+        assert isinstance(message, Event)
+        self.got.append((message.id, message.confidence))
+
+    def run(self) -> None:
+        with connect(self.url, **self.options) as live:
+            for message in live:
+                self.take(message)
+                if self.is_complete:
+                    return
+
+
+class AsyncFollower(Follower):
+    """The same with the asynchronous client."""
+
+    def run(self) -> None:
+        asyncio.run(self.follow())
+
+    async def follow(self) -> None:
+        async with aconnect(self.url, **self.options) as live:
+            async for message in live:
+                self.take(message)
+                if self.is_complete:
+                    return
+
+
+def kill(process: int) -> None:
+    os.kill(process, signal.SIGKILL)
 
 
 @pytest.mark.processes
@@ -30,63 +69,29 @@ def test_both_clients_get_every_event_once(tmp_path: Path) -> None:
     seed = random.randrange(10**6)
     print(f"seed {seed}")
     chance = random.Random(seed)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     site = write_site(tmp_path, {"server.events_db": "events.sqlite", "server.http.port": port})
-    url = f"http://127.0.0.1:{port}"
-    got: dict[str, list[tuple[str, float]]] = {"sync": [], "async": []}
     names = {f"small-{number}" for number in range(COUNT)}
-
-    def is_complete(kind: str) -> bool:
-        return {name for name, confidence in got[kind] if confidence == FINAL} == names
-
-    def follow() -> None:
-        with connect(url, kinds=["event"], since="2026-01-01T00:00:00Z", give_up_s=HANG_S) as live:
-            for message in live:
-                assert isinstance(message, Event)
-                got["sync"].append((message.id, message.confidence))
-                if is_complete("sync"):
-                    return
-
-    async def follow_too() -> None:
-        async with aconnect(url, kinds=["event"], since="2026-01-01T00:00:00Z", give_up_s=HANG_S) as live:
-            async for message in live:
-                assert isinstance(message, Event)
-                got["async"].append((message.id, message.confidence))
-                if is_complete("async"):
-                    return
-
-    followers = [Thread(target=follow), Thread(target=lambda: asyncio.run(follow_too()))]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with started(sys.executable, LIVES, site, str(COUNT), **pipes) as lives:
-        assert lives.stdin is not None
-        assert lives.stdout is not None
-
-        def begin() -> int:
-            print("live", file=lives.stdin, flush=True)
-            return int(lives.stdout.readline())  # type: ignore[union-attr]
-
+    followers = [kind(f"http://127.0.0.1:{port}", names) for kind in (Follower, AsyncFollower)]
+    with server_lives(site, COUNT) as begin:
         for follower in followers:
             follower.start()
         for _ in range(KILLS):
             process = begin()
-            more = {kind: len(events) + chance.randrange(30) for kind, events in got.items()}
+            more = [len(follower.got) + chance.randrange(30) for follower in followers]
             wait_until(
-                lambda more=more: all(len(got[kind]) >= least for kind, least in more.items()),  # type: ignore[misc]
-                f"some events, got { ({kind: len(events) for kind, events in got.items()}) }",
+                lambda more=more: all(len(f.got) >= least for f, least in zip(followers, more, strict=True)),  # type: ignore[misc]
+                "some events",
             )
             time.sleep(chance.uniform(0.0, 0.05))
-            os.kill(process, signal.SIGKILL)
-        assert not is_complete("sync"), "the events do not last for so many lives"
+            kill(process)
+        assert not any(follower.is_complete for follower in followers), "the events do not last for so many lives"
         process = begin()
-        try:
-            for follower in followers:
-                follower.join(timeout=HANG_S)
-        finally:
-            os.kill(process, signal.SIGKILL)
-    for kind, events in got.items():
-        assert is_complete(kind), kind
-        assert {answer: times for answer, times in Counter(events).items() if times > 1} == {}
-        assert dict(events) == dict.fromkeys(names, FINAL)  # the last answer of each is the final one
-        assert (f"small-{COUNT - 1}", EARLY) in events or any(confidence == EARLY for _, confidence in events)
+        for follower in followers:
+            follower.join(timeout=HANG_S)
+        kill(process)
+    for follower in followers:
+        assert follower.is_complete, type(follower)
+        assert {answer: times for answer, times in Counter(follower.got).items() if times > 1} == {}
+        assert dict(follower.got) == dict.fromkeys(names, FINAL)  # the last answer of each is the final one
+        assert any(confidence == EARLY for _, confidence in follower.got)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
@@ -164,7 +164,7 @@ class Rules(_Versioned):
     rules: list[Rule]
 
 
-class ArmSwitch(Model):
+class ArmSwitch(BaseModel):
     """Request to arm or disarm a rule."""
 
     model_config = ConfigDict(extra="forbid", strict=True)

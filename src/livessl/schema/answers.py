@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
@@ -326,7 +326,7 @@ class AccessList(_Versioned):
     refused: list[RefusedCaller] = Field(description="Callers that were refused, the latest first.")
 
 
-class Switch(Model):
+class Switch(BaseModel):
     """Request to use an array's sound or to ignore it."""
 
     model_config = ConfigDict(extra="forbid", strict=True)

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 _DATE_TIME: Final = {"type": "string", "format": "date-time"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
-_MAP_HEADERS: Final = {
+MAP_HEADERS: Final = {
     name: {"description": description, "schema": schema, "example": example}
     for name, schema, example, description in (
         ("X-Map-Shape", {"type": "string"}, "200,160", "Lengths of the axes: rows and columns, or x, y and z."),
@@ -238,7 +238,7 @@ def map_route(parts: Parts) -> APIRouter:
             200: {
                 "description": "The map: a picture, or little-endian float32 numbers, row by row.",
                 "content": {"image/png": _BINARY, "application/octet-stream": _BINARY},
-                "headers": _MAP_HEADERS,
+                "headers": MAP_HEADERS,
             },
             204: {"description": "No window has been localized yet."},
             **errors(404, texts={404: "There is no array of that name, or it has no part in the newest map."}),

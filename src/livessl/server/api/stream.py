@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import WithJsonSchema
@@ -23,6 +23,9 @@ a client whose filter admits little how far the numbers have come."""
 RETRY_MS: Final = 1000
 """Wait, in milliseconds, after which a browser connects again."""
 
+_HEADERS: Final = {"Content-Type": "text/event-stream", "X-Accel-Buffering": "no"}
+"""The second one has nginx pass messages on at once."""
+
 _FORM: Final = """\
 Messages of the live WebSocket, one a `data:` line. `id:` is the number to resume after: a browser sends it as
 `Last-Event-ID`. The first message is `hello`; after at most 10 s without a message there is a comment.
@@ -35,10 +38,13 @@ def _schema(name: str) -> WithJsonSchema:
     return WithJsonSchema({key: value for key, value in described.items() if key not in ("default", "title")})
 
 
+def _query(name: str) -> Any:
+    return Query(description=queries.LiveParameters.model_fields[name].description)
+
+
 def stream_route(parts: Parts) -> APIRouter:
     """`GET /api/v1/stream`."""
     router = APIRouter()
-    fields = queries.LiveParameters.model_fields
 
     @router.get(
         STREAM,
@@ -48,18 +54,12 @@ def stream_route(parts: Parts) -> APIRouter:
     )
     async def get_stream(
         request: Request,
-        kinds: Annotated[str | None, _schema("kinds"), Query(description=fields["kinds"].description)] = None,
-        min_confidence: Annotated[
-            str, _schema("min_confidence"), Query(description=fields["min_confidence"].description)
-        ] = "0",
-        zone: Annotated[str | None, _schema("zone"), Query(description=fields["zone"].description)] = None,
-        track: Annotated[str | None, _schema("track"), Query(description=fields["track"].description)] = None,
-        max_rate_hz: Annotated[
-            str | None, _schema("max_rate_hz"), Query(description=fields["max_rate_hz"].description)
-        ] = None,
-        since_seq: Annotated[
-            str | None, _schema("since_seq"), Query(description=fields["since_seq"].description)
-        ] = None,
+        kinds: Annotated[str | None, _schema("kinds"), _query("kinds")] = None,
+        min_confidence: Annotated[str, _schema("min_confidence"), _query("min_confidence")] = "0",
+        zone: Annotated[str | None, _schema("zone"), _query("zone")] = None,
+        track: Annotated[str | None, _schema("track"), _query("track")] = None,
+        max_rate_hz: Annotated[str | None, _schema("max_rate_hz"), _query("max_rate_hz")] = None,
+        since_seq: Annotated[str | None, _schema("since_seq"), _query("since_seq")] = None,
         last_event_id: Annotated[
             str | None, _schema("since_seq"), Header(description="Like `since_seq`, and stronger.")
         ] = None,
@@ -73,7 +73,7 @@ def stream_route(parts: Parts) -> APIRouter:
         except ValueError as error:
             raise queries.unprocessable(str(error).partition(":")[0], str(error)) from error
         if "head_only" in request.scope:
-            return Response(media_type="text/event-stream")
+            return Response(headers=_HEADERS)
         arrays = await asyncio.to_thread(parts.array_states.describe)
         subscription = parts.fanout.subscribe(wanted, since)
         hello = greeting(parts, str(request.scope["client_role"]), arrays)
@@ -96,10 +96,8 @@ class _Stream(Response):
         Whether older messages follow the first one, so that it must not count as the last one received.
     """
 
-    media_type = "text/event-stream"
-
     def __init__(self, parts: Parts, subscription: Subscription, hello: Numbered, *, resumes: bool) -> None:
-        super().__init__(headers={"X-Accel-Buffering": "no"})  # or nginx would keep messages back
+        super().__init__(headers=_HEADERS)
         del self.headers["content-length"]
         self._parts = parts
         self._subscription = subscription
