@@ -1,4 +1,4 @@
-"""A server that is killed again and again: `python server_lives.py SITE_FILE COUNT`, one life for each line it reads.
+"""A server that is killed again and again: `python server_lives.py SITE_FILE`, one life for each line it reads.
 
 Each life publishes the events that are not final yet, and goes on serving. It is forked from a process that has loaded
 everything, so that a life begins at once.
@@ -19,13 +19,16 @@ from threading import Thread
 from alert_desk import after, sound
 from livessl.clock import SystemClock
 from livessl.core.stream.final_pass import FinalResults
-from livessl.server.api.encode import Messages
+from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.app import Server
 from livessl.site.load import load_site
 from small_site import started
 
 EARLY, FINAL = 0.5, 0.9
 """Confidence of early and of final answers."""
+
+CLOCKS: JsonObject = {"heard": {}, "frames": {}, "known": {}}
+"""What is known of the nodes' clocks: nothing."""
 
 PAUSE_S = 0.004
 """Time between two events, in seconds."""
@@ -39,15 +42,18 @@ def free_port() -> int:
 
 
 @contextmanager
-def server_lives(site: Path, count: int) -> Iterator[Callable[[], int]]:
-    """Yield a function that begins a life of a server and returns its process, once the one before was killed."""
-    command = (sys.executable, __file__, site, str(count))
+def server_lives(site: Path) -> Iterator[Callable[[int], int]]:
+    """Yield a function that begins a life of a server, once the one before was killed, and returns its process.
+
+    It gets the number of events that are published when the life has done its work.
+    """
+    command = (sys.executable, __file__, site)
     with started(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as lives:
 
-        def begin() -> int:
+        def begin(count: int) -> int:
             assert lives.stdin is not None
             assert lives.stdout is not None
-            print("live", file=lives.stdin, flush=True)
+            print(count, file=lives.stdin, flush=True)
             return int(lives.stdout.readline())
 
         yield begin
@@ -60,9 +66,9 @@ def live(site_file: str, count: int) -> None:
     parts, messages = server.parts, Messages(site, 0, utc=True)
     stored = parts.store.count()
     assert stored is not None
-    parts.event_log.begin_live()
     parts.store.backlog.start()  # events are published before they are stored, as in a server that hears
-    Thread(target=server.run).start()
+    serving = Thread(target=server.run)
+    serving.start()
     while server.loop is None:
         time.sleep(0.001)
     for number in range(max(0, stored - 1), count):  # the last one may be early
@@ -70,16 +76,17 @@ def live(site_file: str, count: int) -> None:
             parts.event_log.add_early(sound(number, confidence=EARLY), messages)
             time.sleep(PAUSE_S)
         event = sound(number, confidence=FINAL)
-        parts.event_log.add_final(FinalResults((event,), after(event)), messages, {})
+        parts.event_log.add_final(FinalResults((event,), after(event)), messages, CLOCKS)
         time.sleep(PAUSE_S)
+    serving.join()
 
 
 def main() -> None:
     """Begin a life for each line; print its process. The reader of the lines ends it."""
-    for _ in sys.stdin:
+    for line in sys.stdin:
         process = os.fork()
         if process == 0:
-            live(sys.argv[1], int(sys.argv[2]))
+            live(sys.argv[1], int(line))
             return
         print(process, flush=True)
         os.waitpid(process, 0)

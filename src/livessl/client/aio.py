@@ -96,8 +96,9 @@ class AsyncClient:
                         yield message
             except (*LOST, UnreachableError) as error:
                 if not self._closed.is_set():
+                    wait_s = patience.next_wait_s(error)
                     with suppress(TimeoutError):
-                        await asyncio.wait_for(self._closed.wait(), patience.next_wait_s(error))
+                        await asyncio.wait_for(self._closed.wait(), wait_s)
 
     async def events(
         self,
