@@ -30,6 +30,9 @@ EARLY, FINAL = 0.5, 0.9
 CLOCKS: JsonObject = {"heard": {}, "frames": {}, "known": {}}
 """What is known of the nodes' clocks: nothing."""
 
+FOLLOWERS = 2
+"""Clients that a life waits for after half of its events: the first half they miss, as after a real restart."""
+
 PAUSE_S = 0.004
 """Time between two events, in seconds."""
 
@@ -64,14 +67,17 @@ def live(site_file: str, count: int) -> None:
     site = load_site(Path(site_file))
     server = Server(site, SystemClock(), stepped=True)
     parts, messages = server.parts, Messages(site, 0, utc=True)
-    stored = parts.store.count()
+    stored, early = parts.store.count(), parts.store.early_events()
     assert stored is not None
     parts.store.backlog.start()  # events are published before they are stored, as in a server that hears
     serving = Thread(target=server.run)
     serving.start()
     while server.loop is None:
         time.sleep(0.001)
-    for number in range(max(0, stored - 1), count):  # the last one may be early
+    begin = stored - len(early)
+    for number in range(begin, count):
+        while number > (begin + count) / 2 and parts.fanout.clients < FOLLOWERS:
+            time.sleep(0.005)
         if number % 5 == 4:
             parts.event_log.add_early(sound(number, confidence=EARLY), messages)
             time.sleep(PAUSE_S)

@@ -45,6 +45,15 @@ def publish(server: Server, *messages: dict[str, Any]) -> None:
         server.loop.call_soon_threadsafe(server.parts.fanout.publish, message)
 
 
+def clients(server: Server, count: int) -> None:
+    wait_until(lambda: server.parts.fanout.clients == count, f"{count} clients")
+
+
+def publish_to_one(server: Server, *messages: dict[str, Any]) -> None:
+    clients(server, 1)
+    publish(server, *messages)
+
+
 @pytest.mark.processes
 def test_import_is_quick_and_loads_nothing_of_the_server() -> None:
     program = f"""
@@ -72,7 +81,7 @@ def test_every_public_name_is_there() -> None:
 def test_live_messages_are_typed(server: Server) -> None:
     with connect(server.url, kinds=["event", "update"]) as live:
         messages = iter(live)
-        Thread(target=lambda: (clients(server, 1), publish(server, update_message(), event_message(id="a")))).start()
+        Thread(target=publish_to_one, args=(server, update_message(), event_message(id="a"))).start()
         update, event = next(messages), next(messages)
     assert isinstance(update, UpdateMessage)
     assert isinstance(event, Event)
@@ -132,7 +141,7 @@ def test_close_ends_the_iteration_of_another_thread(server: Server) -> None:
 def test_iteration_goes_on_where_it_ended(server: Server) -> None:
     with connect(server.url, kinds=["event"]) as live:
         first = iter(live)
-        Thread(target=lambda: (clients(server, 1), publish(server, event_message(id="c-0")))).start()
+        Thread(target=publish_to_one, args=(server, event_message(id="c-0"))).start()
         assert next(first).id == "c-0"  # type: ignore[union-attr]
         first.close()  # type: ignore[attr-defined]
         clients(server, 0)
@@ -199,10 +208,6 @@ def test_token_is_sent_and_its_revocation_ends_the_client(tmp_path: Path) -> Non
             with pytest.raises(RefusedError, match="the token is no longer valid"):
                 for _ in messages:
                     pass
-
-
-def clients(server: Server, count: int) -> None:
-    wait_until(lambda: server.parts.fanout.clients == count, f"{count} clients")
 
 
 def test_all_options_reach_the_server() -> None:

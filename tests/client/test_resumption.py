@@ -89,11 +89,10 @@ class ModelServer:
     def answer(self, step: Get) -> bytes | None:
         if not self.is_available:
             return None
-        seq = self.seq
         while self.unsaved and not self.is_full:  # a reader waits for what was published before
             self.store()
         life = 0 if self.is_durable else self.life + 1
-        head = {"v": 1, "complete": True, "more": False, "events": [], "seq": seq, "unsaved": len(self.unsaved)}
+        head = {"v": 1, "complete": True, "more": False, "events": [], "unsaved": len(self.unsaved)}
         if "after" not in step.query:
             return json.dumps({**head, "position": f"{life}-{self.number}"}).encode()
         of_life, after = map(int, step.query["after"].split("-"))

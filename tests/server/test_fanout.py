@@ -55,7 +55,7 @@ def test_messages_are_numbered_without_holes() -> None:
 
 
 def test_filter_by_track_admits_its_states_and_changes_only() -> None:
-    messages = [
+    messages: list[JsonObject] = [
         {"kind": "track", "id": 7},
         {"kind": "track", "id": 8},
         {"kind": "zone", "track_id": 7},

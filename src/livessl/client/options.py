@@ -73,7 +73,7 @@ class Wanted:
         kinds = None if given is None else frozenset(given)
         names = ("zone", "min_confidence", "track", "max_rate_hz")
         query = {name: str(options[name]) for name in names if options.get(name) is not None}  # type: ignore[literal-required]
-        filters = {name: query[name] for name in ("zone", "min_confidence") if name in query}
+        filters = {name: value for name, value in query.items() if name in ("zone", "min_confidence")}
         if kinds is not None:
             query["kinds"] = ",".join(sorted(kinds))
         return cls(kinds, query, filters, rfc3339(options.get("since"), "since"))

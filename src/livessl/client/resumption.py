@@ -95,21 +95,20 @@ class Memory:
     """Events delivered since the log was read."""
     _known: OrderedDict[str, _Known] = field(default_factory=OrderedDict)
 
-    def is_news(self, event: Event, log_seq: int | None = None) -> bool:
-        """Return whether an event is to be delivered: with an answer that is neither known nor outdated; remember it.
+    def is_news(self, event: Event) -> bool:
+        """Return whether an event is to be delivered, because its answer is neither known nor outdated; remember it.
 
-        Parameters
-        ----------
-        event : Event
-        log_seq : int or None
-            For an event of the log, the number of the last message published before the log was read.
+        After an event came from the log, its other answers come from there, too: a live one may be an older one that
+        was still on its way.
         """
-        known = self._known.get(event.id, _Known((), 0))
-        answer = _answer(event)
-        outdated = isinstance(event, EventMessage) and event.seq <= known.log_seq
-        if answer in known.answers or outdated:
+        known = self._known.get(event.id, _Known((), is_logged=False))
+        answer, is_live = _answer(event), isinstance(event, EventMessage)
+        if answer in known.answers:
             return False
-        self._known[event.id] = _Known((*known.answers, answer), known.log_seq if log_seq is None else log_seq)
+        if is_live and known.is_logged:
+            self.is_behind = True
+            return False
+        self._known[event.id] = _Known((*known.answers, answer), is_logged=not is_live)
         self._known.move_to_end(event.id)
         if len(self._known) > REMEMBERED:
             self._known.popitem(last=False)
@@ -118,10 +117,10 @@ class Memory:
 
 
 class _Known(NamedTuple):
-    """What was delivered of an event: the hashes of its answers, and `log_seq` if the last one was in the log."""
+    """The hashes of the answers that were delivered of an event, and whether one came from the log."""
 
     answers: tuple[int, ...]
-    log_seq: int
+    is_logged: bool
 
 
 def _answer(event: Event) -> int:
@@ -160,7 +159,7 @@ def conversation(memory: Memory, wanted: Wanted) -> Steps:
         message = None if text is None else parse(text)
         if isinstance(message, Gap):
             memory.is_behind = True
-            if wanted.kinds != {"event"}:  # the log has the events
+            if wanted.kinds != frozenset({"event"}):  # the log has the events
                 yield Deliver(message)
         elif message is not None and not isinstance(message, Hello):
             memory.last_seq = message.seq
@@ -183,7 +182,7 @@ def _read_log(memory: Memory, wanted: Wanted) -> Steps:
             reason = "the server does not have all events since the connection was lost; it may have lost its history"
             yield Deliver(Gap(kind="gap", v=1, missed=None, reason=reason))
         for event in page.events:
-            if memory.is_news(event, page.seq):
+            if memory.is_news(event):
                 yield Deliver(event)
         memory.position, has_more = page.position, page.more
     memory.is_behind, memory.unread = page.unsaved > 0, 0
@@ -205,7 +204,7 @@ def _begin(memory: Memory, wanted: Wanted) -> Steps:
         cursor = page.next_cursor  # type: ignore[assignment]
     memory.position, memory.is_behind = begin.position, begin.unsaved > 0  # there is no further request that could fail
     for event in reversed(events):
-        if memory.is_news(event, begin.seq):
+        if memory.is_news(event):
             yield Deliver(event)
     memory.unread = 0
 

@@ -16,7 +16,7 @@ from websockets.sync.client import connect as open_socket
 from livessl.client.address import Address, UnavailableError, UnreachableError
 from livessl.client.options import Options, Wanted
 from livessl.client.questions import event_query, health_of
-from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, conversation, live_query
+from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, Steps, conversation, live_query
 from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience
 from livessl.schema.answers import Arrays, EventPage, Health, HealthStatus, OneEvent, Site, Tracks
 from livessl.schema.values import Event
@@ -164,7 +164,8 @@ class Client:
             ping_interval=None,  # `_receive` pings
         ) as socket:
             self._socket = socket
-            steps, answer = conversation(self._memory, self._wanted), None  # type: Steps, str | bytes | None
+            steps: Steps = conversation(self._memory, self._wanted)
+            answer: str | bytes | None = None
             while not self._closed.is_set():
                 step = steps.send(answer)
                 answer = None

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
-from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Seq, Track, UtcTime, Version
+from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
 from livessl.schema.zones import BoundsM, IntervalM, ZoneShape
 
 BandHz = Annotated[
@@ -192,9 +192,6 @@ class EventLog(_Versioned):
         examples=["0-4711"],
     )
     more: bool = Field(description="Whether more events are stored already: ask again at once.", examples=[False])
-    seq: Seq = Field(
-        description="Number of the last live message published before: live events up to it are older than these."
-    )
     unsaved: int = Field(ge=0, description="Events published and not stored yet: ask again soon.", examples=[0])
     complete: bool = Field(
         description="False if events may be missing: the history asked for is not this one, as after a restart of a "

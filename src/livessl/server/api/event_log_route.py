@@ -48,13 +48,11 @@ def event_log_route(parts: Parts) -> APIRouter:
             place = None if after is None else LogPosition.parse(after)
         except ValueError as error:
             raise unprocessable("after", f"after: {error}") from error
-        seq = parts.fanout.last_seq  # before the history is read: what is published meanwhile may be newer
         page = parts.store.log(EventQuery(zone=zone, min_confidence=min_confidence, limit=limit), place)
         head = {
             "v": API_VERSION,
             "position": str(page.position),
             "more": page.has_more,
-            "seq": seq,
             "unsaved": parts.event_log.unsaved,
             "complete": page.is_complete,
         }
