@@ -20,7 +20,7 @@ from livessl.errors import UseError
 from livessl.server.app import Server
 from livessl.site.tokens import add_token, revoke_token
 from messages import START_NS, event_message, update_message
-from server_lives import free_port
+from publishing_lives import free_port
 from small_site import HANG_S, running_server, site_of, wait_until
 
 FORBIDDEN = ("fastapi", "numba", "numpy", "scipy", "sqlalchemy", "uvicorn", "yaml", "zmq", "livessl.server")

@@ -14,7 +14,7 @@ from threading import Thread
 import pytest
 
 from livessl.client import Event, Options, Received, aconnect, connect
-from server_lives import FINAL, free_port, server_lives
+from publishing_lives import FINAL, free_port, server_lives
 from small_site import HANG_S, wait_until, write_site
 
 KILLS = 5

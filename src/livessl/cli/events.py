@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 URL: Final = "http://127.0.0.1:8000"
 """Address of a server whose site file does not say otherwise."""
 
-KINDS: Final = ("event", "update", "track", "arrays", "alert", "zone", "zones")
+KINDS: Final = ("event", "update", "track", "arrays", "alert", "zone", "zones", "poses")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,6 +95,8 @@ def _line(found: dict[str, Any]) -> str:
             what = f"{found['rule']}: {found['text']}"
         case "zone":
             what = f"track {found['track_id']} {found['change']} {found['zone']}  {xyz(found['position_m'])}"
+        case "poses":
+            what = ", ".join(found["changed"])
         case "zones":
             what = ", ".join(found["by_name"]) or "none"
         case _:

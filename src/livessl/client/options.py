@@ -15,7 +15,8 @@ class Options(TypedDict, total=False):
     """Options of `connect` and `aconnect`."""
 
     kinds: Iterable[str]
-    """Message kinds: `event`, `update`, `track`, `arrays`, `alert`, `zone`, `zones`; all, and `hello`, if absent."""
+    """Message kinds: `event`, `update`, `track`, `arrays`, `alert`, `zone`, `zones`, `poses`; all, and `hello`,
+    if absent."""
     zone: str
     """Only messages about this zone; those that are about no place pass."""
     min_confidence: float

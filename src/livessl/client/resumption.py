@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Generator
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -21,11 +21,13 @@ from livessl.errors import RunError
 from livessl.schema.alerts import Alert
 from livessl.schema.answers import EventLog, EventPage
 from livessl.schema.messages import (
+    MESSAGES,
     ArraysMessage,
     EventMessage,
     Gap,
     Hello,
     Message,
+    PosesMessage,
     TrackMessage,
     UpdateMessage,
     ZoneMessage,
@@ -46,9 +48,20 @@ RETRY_S: Final = 2.0
 PAGE: Final = 500
 """Events that are asked for at once."""
 
-_KINDS: Final = frozenset({"hello", "event", "update", "track", "arrays", "alert", "zone", "zones", "gap"})
+_KINDS: Final = frozenset(get_args(model.model_fields["kind"].annotation)[0] for model in MESSAGES)
 
-Received = Hello | Event | UpdateMessage | TrackMessage | ArraysMessage | Alert | ZoneMessage | ZonesMessage | Gap
+Received = (
+    Hello
+    | Event
+    | UpdateMessage
+    | TrackMessage
+    | ArraysMessage
+    | PosesMessage
+    | Alert
+    | ZoneMessage
+    | ZonesMessage
+    | Gap
+)
 """What a client delivers. An event is an `EventMessage` if it came live, and an `Event` if it was missed."""
 
 

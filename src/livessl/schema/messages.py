@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field
 
 from livessl.core.states import Status
 from livessl.schema.alerts import Alert
+from livessl.schema.answers import ArrayGeometry
 from livessl.schema.base import Model
 from livessl.schema.values import (
     Array,
@@ -115,6 +116,14 @@ class ZonesMessage(_Numbered):
     by_name: dict[str, ZoneShape] = Field(description="All zones by name.")
 
 
+class PosesMessage(_Numbered):
+    """Where the arrays are, after other poses have come into force."""
+
+    kind: Literal["poses"]
+    arrays: dict[str, ArrayGeometry] = Field(description="All arrays by name.")
+    changed: list[str] = Field(description="Names of the arrays that changed.", examples=[["south"]])
+
+
 class Gap(Model):
     """Notice of messages that this client will not get; it has no number of its own."""
 
@@ -138,6 +147,7 @@ MESSAGES: Final[tuple[type[BaseModel], ...]] = (
     AlertMessage,
     ZoneMessage,
     ZonesMessage,
+    PosesMessage,
     Gap,
 )
 """Every message of the live WebSocket."""
@@ -151,6 +161,7 @@ Message = Annotated[
     | AlertMessage
     | ZoneMessage
     | ZonesMessage
+    | PosesMessage
     | Gap,
     Field(discriminator="kind"),
 ]

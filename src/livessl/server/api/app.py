@@ -22,8 +22,10 @@ from livessl.server.api.event_log_route import event_log_route
 from livessl.server.api.headers import SafeHeaders, other_origins
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
+from livessl.server.api.journal_routes import journal_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.set_up_routes import set_up_routes
@@ -73,11 +75,13 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         history_routes(parts),
         event_log_route(parts),
         stream_route(parts),
+        journal_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
         dead_letter_routes(parts),
         zone_routes(parts),
         set_up_routes(parts),
+        proposal_routes(parts),
         clip_routes(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
