@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 
 from livessl import client
-from livessl.client import Client, Event, RefusedError, UnreachableError, UpdateMessage, aconnect, connect
+from livessl.cli import events
+from livessl.client import Client, Event, RefusedError, UnreachableError, UpdateMessage, aconnect, connect, resumption
 from livessl.client.options import Options, Wanted
 from livessl.errors import UseError
+from livessl.server.api import queries
 from livessl.server.app import Server
 from livessl.site.tokens import add_token, revoke_token
 from messages import START_NS, event_message, update_message
@@ -76,6 +78,11 @@ def test_every_public_name_is_there() -> None:
     assert set(client.__all__) <= set(dir(client))
     with pytest.raises(AttributeError, match="no attribute 'konnect'"):
         client.konnect  # noqa: B018
+
+
+def test_clients_know_all_kinds_of_the_server() -> None:
+    assert set(events.KINDS) == queries.KINDS
+    assert queries.KINDS | {"hello", "gap"} == resumption._KINDS
 
 
 def test_live_messages_are_typed(server: Server) -> None:
