@@ -23,6 +23,22 @@ def add_server(parser: Any, text: str) -> None:
     )
 
 
+def read_token(token_file: Path) -> str:
+    """Return the token in a file.
+
+    Raises
+    ------
+    UseError
+        If the file cannot be read.
+    """
+    try:
+        return token_file.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
+
+
 def ask(url: str, path: str, token_file: Path | None) -> Any:
     """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
     address = _address(url, path)
@@ -79,10 +95,7 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
         raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {} if body is None else {"Content-Type": "application/json"}
     if token_file is not None:
-        try:
-            headers["Authorization"] = f"Bearer {token_file.read_text(encoding='utf-8').strip()}"
-        except OSError as error:
-            raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+        headers["Authorization"] = f"Bearer {read_token(token_file)}"
     request = urllib.request.Request(address, body, headers)  # noqa: S310 - the address begins with http
     try:
         with urllib.request.urlopen(request, timeout=wait_s) as response:  # noqa: S310
