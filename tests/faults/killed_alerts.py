@@ -184,11 +184,8 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int, least_
         guard = {"webhook": {"url": receiver.url}, "first_wait_s": 0.05, "longest_wait_s": 0.5, "attempts": 1000}
         alerts = {"actions": {"guard": guard}, "rules": RULES}
         changes = {"alerts": alerts, "zones.fan": FAN, "zones_file": "zones.yaml"}
-        site = stack.enter_context(Forked(recordings, directory, lead_s=30.0, seed=seed, changes=changes))
-        site.start_server()
-        site.wait_ready(WITHIN_S)
-        for name in site.nodes:
-            site.start_node(name)
+        site = stack.enter_context(Forked(recordings, directory, seed=seed, changes=changes))
+        site.start()
         operator, killed = Operator(site), 0
         site.sleep_until(0.5)
         while killed < kills:

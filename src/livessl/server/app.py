@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Final
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
+from livessl.garbage import collect_as_usual
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
@@ -19,9 +19,10 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
 from livessl.server.clips.service import Clips
-from livessl.server.compiling import load_kernels
+from livessl.server.compiling import KernelLoader
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
+from livessl.server.event_retention import delete_old_events
 from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.journal import Journal, also
@@ -31,7 +32,6 @@ from livessl.server.overload import Overload
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
-from livessl.server.retention import delete_old_events
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
@@ -212,6 +212,7 @@ class Server:
         certificate = certificate_of(site)
         self._clock = clock
         self._stepped = stepped
+        self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
         # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
@@ -224,9 +225,6 @@ class Server:
             undo.callback(sinks.close)
             store = Store.of(site)
             undo.callback(store.close)
-            self._compiler = load_kernels()
-            if self._compiler is not None:
-                undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
@@ -241,14 +239,12 @@ class Server:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
-        gc.collect()
-        gc.freeze()  # what exists now stays, and the collector need not look through it again
+        collect_as_usual()
         try:
             asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
-            if self._compiler is not None:
-                self._compiler.stop()
+            self._kernel_loader.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
@@ -280,7 +276,7 @@ class Server:
             self.parts.clips.start()
         if not self._stepped:
             self.parts.store.backlog.start()
-            self.parts.engine.start()
+            self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
         try:
