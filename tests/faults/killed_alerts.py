@@ -36,7 +36,7 @@ RULES: Final = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What arrived at the webhook.
+    """Alerts that arrived at the webhook, and changes that were kept.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Forked(Playing):
         self.pid = int(self._lives.stdout.readline())
 
     def kill_server(self) -> None:
-        """With -9."""
+        """Kill it by SIGKILL."""
         assert self._lives.stdout is not None
         os.kill(self.pid, signal.SIGKILL)
         status = int(self._lives.stdout.readline())
