@@ -21,7 +21,7 @@ from livessl.server.alerts.message import AlertMessages
 from livessl.site.load import load_site
 from webhook_receiver import Receiver, Request, running_receiver
 
-LIVES: Final = Path(__file__).parents[1] / "server_lives.py"
+LIVES: Final = Path(__file__).with_name("forked_servers.py")
 WITHIN_S: Final = 90.0
 """Longest wait for a server that starts, and for the last alerts, in seconds."""
 
