@@ -31,10 +31,12 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
+from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
 from livessl.server.recent_log import RecentLog
 from livessl.server.reload import Reloader
+from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
@@ -148,8 +150,13 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
+        set_up = SetUpInForce(site, clock, publish)
+        proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
+        # the engine first: if its estimator cannot be made, nothing changes
+        for follower in (engine.take_over, set_up_watch.take_over, *(() if clips is None else (clips.take_over,))):
+            set_up.follow(follower)
         floor_plan = read_floor_plan(site)
-        reloader = Reloader(site, read_site, zone_book, alerts, journal.site)
+        reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
         undo.pop_all()
     return Parts(
         site=site,
@@ -167,6 +174,8 @@ def assemble(
         maps=maps,
         latency=latency,
         overload=overload,
+        set_up=set_up,
+        proposals=proposals,
         set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
@@ -265,6 +274,7 @@ class Server:
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
+            self.parts.proposals.stop()
             self.parts.alerts.stop()
             if self.parts.clips is not None:
                 self.parts.clips.stop()
@@ -288,6 +298,7 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
+        self.parts.proposals.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()

@@ -124,11 +124,20 @@ class Site(_Versioned):
     privacy: Privacy
 
 
+class PlacedArray(Array):
+    """State of an array, and where it is."""
+
+    position_m: PositionM = Field(description="Mean position of the microphones [x, y, z] in metres.")
+    microphones_m: list[PositionM] = Field(
+        min_length=2, description="Position of each microphone in channel order, in metres."
+    )
+
+
 class Arrays(_Versioned):
-    """State of every array."""
+    """State of every array, and where it is."""
 
     now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
-    arrays: list[Array]
+    arrays: list[PlacedArray]
 
 
 class Finding(BaseModel):

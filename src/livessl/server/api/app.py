@@ -28,6 +28,7 @@ from livessl.server.api.journal_routes import journal_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.log_route import log_route
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.reload_routes import reload_route
@@ -92,6 +93,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         dead_letter_routes(parts),
         zone_routes(parts),
         set_up_routes(parts),
+        proposal_routes(parts),
         clip_routes(parts),
         reload_route(parts),
         log_route(parts),

@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field
 
 from livessl.core.types import Status
 from livessl.server.api.alert_schema import Alert
+from livessl.server.api.answers import ArrayGeometry
 from livessl.server.api.schema import (
     Array,
     ArrayNames,
@@ -114,6 +115,14 @@ class ZonesMessage(_Numbered):
     by_name: dict[str, ZoneShape] = Field(description="All zones by name.")
 
 
+class PosesMessage(_Numbered):
+    """Where the arrays are, after other poses have come into force."""
+
+    kind: Literal["poses"]
+    arrays: dict[str, ArrayGeometry] = Field(description="All arrays by name.")
+    changed: list[str] = Field(description="Names of the arrays that changed.", examples=[["south"]])
+
+
 class Gap(BaseModel):
     """Notice of messages that this client will not get; it has no number of its own."""
 
@@ -137,6 +146,7 @@ MESSAGES: Final[tuple[type[BaseModel], ...]] = (
     AlertMessage,
     ZoneMessage,
     ZonesMessage,
+    PosesMessage,
     Gap,
 )
 """Every message of the live WebSocket."""
@@ -150,6 +160,7 @@ Message = Annotated[
     | AlertMessage
     | ZoneMessage
     | ZonesMessage
+    | PosesMessage
     | Gap,
     Field(discriminator="kind"),
 ]

@@ -18,7 +18,7 @@ from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
 from livessl.site.models import Site
 
-KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "zone", "zones"})
+KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "poses", "zone", "zones"})
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
 
 
@@ -27,8 +27,8 @@ class LiveParameters(BaseModel):
 
     kinds: str | None = Field(
         default=None,
-        description="Message kinds, separated by commas: alert, arrays, event, track, update, zone, zones. All if "
-        "absent.",
+        description="Message kinds, separated by commas: alert, arrays, event, poses, track, update, zone, "
+        "zones. All if absent.",
         examples=["event,track"],
     )
     min_confidence: float = Field(

@@ -62,19 +62,12 @@ def describe_site(parts: Parts) -> JsonObject:
         "mode": parts.site_time.mode,
         "room": {"size_m": list(site.room.size_m)},
         "grid": {"bounds_m": [list(b) for b in grid.bounds_m], "spacing_m": grid.spacing_m, "shape": list(grid.shape)},
-        "speed_of_sound_m_s": site.c_m_s,
+        "speed_of_sound_m_s": parts.set_up.site.c_m_s,
         "band_hz": list(site.band_hz),
         "method": site.fusion.method,
         "frame_s": FRAME_S,
         "activity": {"threshold": site.activity.threshold, "floor_factor": site.activity.floor_factor},
-        "arrays": {
-            spec.name: {
-                "position_m": spec.centre_m.round(4).tolist(),
-                "microphones_m": spec.microphones_m.round(4).tolist(),
-                "band_hz": list(spec.band_hz),
-            }
-            for spec in site.processed
-        },
+        "arrays": parts.set_up.describe_arrays(),
         "joint": {name: list(members) for name, members in site.joint.items()},
         "zones": parts.zone_book.describe(),
         "can_draw": site.zones_file is not None,
@@ -106,9 +99,13 @@ def state_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/arrays", tags=["state"], response_model=answers.Arrays)
     def get_arrays() -> Response:
-        """State, age of the last message, levels, drift and counters of every array."""
-        now_utc = utc_text(parts.site_time.now_ns())
-        return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": parts.array_states.describe()})
+        """State, age of the last message, levels, drift and counters of every array, and where it is."""
+        now_utc, places = utc_text(parts.site_time.now_ns()), parts.set_up.describe_arrays()
+        arrays = [
+            {**array, **{key: places[array["name"]][key] for key in ("position_m", "microphones_m")}}
+            for array in parts.array_states.describe()
+        ]
+        return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": arrays})
 
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
