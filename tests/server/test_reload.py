@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
+import yaml
 
 from alert_desk import ELSEWHERE, PATIENT, after, key_of, sound
 from livessl.core.stream.final_pass import FinalResults
-from livessl.core.types import Event
+from livessl.core.types import Event, FloatArray
 from livessl.errors import ConfigError, RunError
 from livessl.server.alerts.outbox import DeliveryState
 from livessl.server.api.encode import Messages
@@ -26,11 +28,13 @@ from livessl.site.load import load_site
 from livessl.site.models import Site
 from livessl.site.tokens import add_token
 from livessl.site.zone_models import Zone
-from small_site import HANG_S, Changes, running_server, started, wait_until, write_site
+from small_site import HANG_S, SMALL, Changes, running_server, site_of, started, wait_until, write_site
 from webhook_receiver import running_receiver
 
 CENTRE = {"bounds_m": [[1.5, 2.5], [1.5, 2.5], [0.0, 2.5]]}
 """A zone in which `ELSEWHERE` lies."""
+
+WEST = {"position_m": [0.6, 2.5, 1.5]}
 
 DOOR = {"events": {"zones": ["door"]}, "hold_off_s": 0}
 IN_CENTRE = {"events": {"zones": ["centre"]}, "hold_off_s": 0}
@@ -164,6 +168,36 @@ def test_first_rules_of_a_site_are_kept_and_alert_about_what_comes_then(tmp_path
         finish(server, sound(2))
         wait_until(lambda: alerted(server) == [key_of(sound(2))], "the alert, and none about the time before")
         assert server.parts.alerts.outbox.path == tmp_path / "alerts.sqlite"
+
+
+def test_calibration_file_and_moved_array_take_effect(tmp_path: Path) -> None:
+    before_m = site_of().array("south").microphones_m
+
+    def measure(microphones_m: FloatArray) -> None:
+        content = {"arrays": {"south": {"microphones_m": microphones_m.round(4).tolist()}}}
+        (tmp_path / "measured.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+
+    measure(before_m)
+    with serving(tmp_path, {"calibration": "measured.yaml"}) as server:
+
+        def microphones(array: str) -> Any:
+            site = httpx.get(f"{server.url}/api/v1/site", timeout=HANG_S).json()
+            return site["arrays"][array]["microphones_m"]
+
+        moved_m = before_m + np.array([0.05, 0.0, 0.0])
+        measure(moved_m)
+        write_site(tmp_path, {"calibration": "measured.yaml", "arrays.north.position_m": [1.8, 1.3, 1.4]})
+        result = server.parts.reloader.reload()
+        assert (sorted(result.changed), list(result.needs_restart)) == (
+            ["arrays.north.position_m", "arrays.south"],
+            [],
+        )
+        assert microphones("south") == moved_m.round(4).tolist()
+        assert np.mean(microphones("north"), axis=0)[0] == pytest.approx(1.8)
+        write_site(tmp_path, {"calibration": "measured.yaml", "arrays.west": SMALL["arrays"]["south"] | WEST})
+        result = server.parts.reloader.reload()
+        assert (list(result.changed), sorted(result.needs_restart)) == ([], ["arrays.north.position_m", "arrays.west"])
+        assert microphones("south") == moved_m.round(4).tolist()
 
 
 class Still:
