@@ -26,8 +26,8 @@ from livessl.core.types import FloatArray
 MIN_GAIN: Final = 9.0
 GAIN_PER_ARRAY: Final = 1.0
 """Least gain in the deviance of sounds at unknown places from which a set-up is said to be other than filed, and what
-is added to it for each array beyond the first, because more arrays have more alternatives. In simulated careful set-ups
-one in fifty gains more."""
+is added to it for each array beyond the first, because more arrays have more alternatives. Few careful set-ups exceed
+it by chance (`benchmarks/doctor_chance.py`)."""
 
 MIN_LEAD: Final = 6.0
 MIN_LEAD_OF_GAIN: Final = 0.12
