@@ -174,8 +174,8 @@ class Operator:
 def play_killed(recordings: Path, directory: Path, kills: int, seed: int) -> Outcome:
     """Play recordings to a server that is killed again and again; let it finish, and return what arrived.
 
-    A life lasts until none, one or two deliveries have been tried, and then up to half a second longer: on a slow machine
-    a server that is killed sooner never comes to an event.
+    A life lasts until none, one or two deliveries have been tried, and then up to half a second longer: on a slow
+    machine a server that is killed sooner never comes to an event.
     """
     chance, end_s = random.Random(seed), duration_s(recordings)
     with ExitStack() as stack:
