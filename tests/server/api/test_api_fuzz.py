@@ -51,7 +51,7 @@ def api(token: tuple[str, Path], headers: dict[str, str]) -> Iterator[Any]:
 
 def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:
     operations = [found.ok() for found in api.get_all_operations()]
-    assert len(operations) == 37
+    assert len(operations) == sum(len(methods) for methods in api.raw_schema["paths"].values()) > 30
     for operation in operations:
 
         @settings(max_examples=15, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
