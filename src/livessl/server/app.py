@@ -23,6 +23,7 @@ from livessl.server.compiling import load_kernels
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -83,6 +84,11 @@ def assemble(
         See `Receiver`, `Alerts` and `Clips`.
     """
 
+    def publish_to_all(message: JsonObject) -> None:
+        if hub_link is not None and not site_time.is_replay:
+            hub_link.take(message)
+        publish(message)
+
     def publish_event(event: JsonObject) -> None:
         sinks.take(event)
         if on_event is not None:
@@ -94,6 +100,9 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
+        hub_link = None
+        if store.outbox is not None:
+            hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
         zone_book = ZoneBook(site, publish)
 
         def zones() -> ZoneMap:
@@ -103,8 +112,10 @@ def assemble(
         overload = Overload(clock)
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
+        array_states = ArrayStates(
+            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_to_all
+        )
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish_to_all, url, zones)
         undo.callback(alerts.stop)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
@@ -118,7 +129,7 @@ def assemble(
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
+            publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
@@ -149,6 +160,7 @@ def assemble(
         zone_book=zone_book,
         presence=presence,
         floor_plan=floor_plan,
+        hub_link=hub_link,
     )
 
 
@@ -195,7 +207,7 @@ class Server:
             site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
         http = site.server.http
         self._access = Access(None if http.tokens is None else site.file(http.tokens))
-        certificate = certificate_of(site)
+        certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
         self.loop: asyncio.AbstractEventLoop | None = None
@@ -216,7 +228,7 @@ class Server:
             url = url_of(self._listener, tls=certificate is not None)
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
-        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
+        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
         self.endpoint = self.parts.receiver.endpoint
         """The address that nodes connect to."""
@@ -242,6 +254,8 @@ class Server:
             if self.parts.clips is not None:
                 self.parts.clips.stop()
             self.parts.receiver.stop()
+            if self.parts.hub_link is not None:
+                self.parts.hub_link.stop()
             self.parts.store.close()
             self.parts.sinks.close()
             self._listener.close()
@@ -264,6 +278,8 @@ class Server:
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
+        if self.parts.hub_link is not None:
+            self.parts.hub_link.start()
         if not self._stepped:
             self.parts.store.backlog.start()
             self.parts.engine.start()

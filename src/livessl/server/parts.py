@@ -12,6 +12,7 @@ from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -54,10 +55,14 @@ class Parts:
     zone_book: ZoneBook
     presence: Presence
     floor_plan: FloorPicture | None
+    hub_link: HubLink | None
 
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        parts = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips, self.store.backlog)
+        parts = (
+            *(self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips, self.store.backlog),
+            self.hub_link,
+        )
         failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)

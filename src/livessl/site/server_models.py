@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
 from livessl.site.fields import FileName, Model, Positive
 from livessl.site.history_place import check_history_place
+from livessl.site.hub_models import HubLinkConfig
 from livessl.site.sink_types import check_sink_type
 
 
@@ -81,6 +82,7 @@ class ServerConfig(Model):
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
     listen: bool = False
+    hub: HubLinkConfig | None = None
 
     @field_validator("bind")
     @classmethod

@@ -63,6 +63,8 @@ class Query:
         Array that detected the event or contributed to it.
     text : str or None
         Part of the event's id, status, reason, method, zones or arrays, in any case.
+    site : str or None
+        Site that the event comes from, in the history of a hub.
     """
 
     since_ns: int | None = None
@@ -77,6 +79,7 @@ class Query:
     min_level_dbfs: float | None = None
     array: str | None = None
     text: str | None = None
+    site: str | None = None
 
 
 class Row(NamedTuple):

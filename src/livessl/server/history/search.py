@@ -17,9 +17,10 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
     -------
     Select, FromClause
         The statement, and the table that has `time_ns` and `number` in the order of the index that is searched: with
-        a zone or an array that of the tags, else that of the events.
+        a zone, an array or a site that of the tags, else that of the events.
     """
-    wanted = [(kind, name) for kind, name in (("zone", query.zone), ("array", query.array)) if name is not None]
+    tagged = (("zone", query.zone), ("array", query.array), ("site", query.site))
+    wanted = [(kind, name) for kind, name in tagged if name is not None]
     searched: FromClause = tags if wanted else events
     statement = select(*columns)
     if wanted:

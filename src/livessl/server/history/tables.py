@@ -74,7 +74,8 @@ tags: Final = Table(
     PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
     sqlite_with_rowid=False,
 )
-"""Zones and arrays of the events: rows of kind `zone` and `array`, with what a search compares besides."""
+"""Zones and arrays of the events, and at a hub their sites: rows of kind `zone`, `array` and `site`, with what a search
+compares besides."""
 
 Index("event_tags_number", tags.c.number)
 
