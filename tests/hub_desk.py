@@ -124,7 +124,7 @@ def ids_at(url: str, site: str) -> list[str]:
     found: list[str] = []
     cursor: str | None = None
     while True:
-        asked = {"site": site, "limit": 1000, **({} if cursor is None else {"cursor": cursor})}
+        asked: dict[str, str | int] = {"site": site, "limit": 1000, **({} if cursor is None else {"cursor": cursor})}
         page = httpx.get(f"{url}/api/v1/events", params=asked, timeout=HANG_S).raise_for_status().json()
         found += [event["id"] for event in page["events"]]
         cursor = page["next_cursor"]

@@ -12,7 +12,7 @@ from typing import Any
 from small_site import RATE_HZ
 
 COMMANDS = (
-    "demo", "serve", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan", "doctor",
+    "demo", "serve", "hub", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan", "doctor",
     "calibrate", "keys", "init", "check", "config", "devices", "levels",
 )  # fmt: skip
 

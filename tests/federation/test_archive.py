@@ -137,7 +137,13 @@ def test_states_tracks_and_alerts_follow_the_messages(archive: Archive) -> None:
     track = {"kind": "track", "id": 7, "state": "new", "time_utc": now}
     array = {"kind": "array", "name": "north", "state": "lost", "time_utc": now}
     alert = {"kind": "alert", "key": "alert_1", "raised_utc": now}
-    bodies = [("start", {}), ("track", track), ("track", {**track, "id": 8}), ("array", array), ("alert", alert)]
+    bodies: list[tuple[str, JsonObject]] = [
+        ("start", {}),
+        ("track", track),
+        ("track", {**track, "id": 8}),
+        ("array", array),
+        ("alert", alert),
+    ]
     archive.take([delivery(n, body, kind=kind) for n, (kind, body) in enumerate(bodies, 1)], PATIENCE)
     assert [each["id"] for each in archive.tracks("lab")] == [7, 8]
     assert archive.arrays(None) == [{**array, "site": "lab"}]

@@ -325,7 +325,7 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     connection.execute(insert(history.events), list(rows.values()))
     columns = history.events.c.number, history.events.c.id, history.events.c.body
     stored = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
-    tags = []
+    tags: list[dict[str, Any]] = []
     for number, key, body in stored:
         message, row = orjson.loads(body), rows[key]
         tags += history.tag_rows(message, row, number)

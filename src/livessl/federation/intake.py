@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -119,7 +118,7 @@ class Intake:
         async def again() -> None:
             self._note(None)
 
-        handlers: dict[str, Callable[..., Awaitable[None]]] = {"error_cb": failed, "reconnected_cb": again}
+        handlers: dict[str, Any] = {"error_cb": failed, "reconnected_cb": again}
         client: Client = self._nats.NATS()
         await client.connect(**self._options, **handlers, name=f"livessl hub {self._name}")
         try:

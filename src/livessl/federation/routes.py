@@ -20,7 +20,7 @@ from livessl.federation.archive import Archive
 from livessl.federation.intake import Intake
 from livessl.server.api.answers import errors
 from livessl.server.api.auth import HEALTH
-from livessl.server.api.encode import API_VERSION
+from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.history_routes import Time, cached
 from livessl.server.api.metrics import CONTENT_TYPE
 from livessl.server.api.queries import instant, page_cursor, unprocessable
@@ -67,7 +67,7 @@ def _add_state(router: APIRouter, name: str, archive: Archive, intake: Intake) -
             conditions = dict(Counter(site["status"] for site in archive.sites()))
         except StoreError as error:
             reasons.append(str(error))
-        found = {"v": API_VERSION, "status": "degraded" if reasons else "ok"}
+        found: JsonObject = {"v": API_VERSION, "status": "degraded" if reasons else "ok"}
         if request.scope["client_role"] is not None:
             found |= {
                 "hub": name,

@@ -37,6 +37,7 @@ from livessl.site.models import Site
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
+    from nats.js.api import PubAck
 
 WINDOW: Final = 500
 """Most messages that are sent before the first of them is acknowledged: about 750 kB, 40 ms at 150 Mbit/s."""
@@ -260,7 +261,7 @@ class HubLink:
     async def _send(self, client: Client, outbox: str, window: Sequence[Unsent], lost: asyncio.Event) -> int:
         """Send messages; return how many of the first ones the stream has acknowledged without a gap."""
         stream = client.jetstream()
-        waiting: list[asyncio.Future[object]] = []
+        waiting: list[asyncio.Future[PubAck]] = []
         losing = asyncio.create_task(lost.wait())
         try:
             for message in window:
@@ -275,8 +276,8 @@ class HubLink:
             losing.cancel()
         count = next((place for place, each in enumerate(waiting) if not _is_acknowledged(each)), len(waiting))
         if count < len(waiting):
-            error = _error_of(waiting[count])
-            self._note("the stream did not acknowledge a message in time" if error is None else _told(error))
+            refusal = _error_of(waiting[count])
+            self._note("the stream did not acknowledge a message in time" if refusal is None else _told(refusal))
         for each in waiting:
             each.cancel()
         return count
@@ -312,11 +313,11 @@ class HubLink:
         self._problem = problem
 
 
-def _is_acknowledged(sent: asyncio.Future[object]) -> bool:
+def _is_acknowledged(sent: asyncio.Future[PubAck]) -> bool:
     return sent.done() and not sent.cancelled() and sent.exception() is None
 
 
-def _error_of(sent: asyncio.Future[object]) -> BaseException | None:
+def _error_of(sent: asyncio.Future[PubAck]) -> BaseException | None:
     return sent.exception() if sent.done() and not sent.cancelled() else None
 
 
