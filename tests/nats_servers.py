@@ -29,19 +29,21 @@ class NatsServer:
     name : str
     further : str
         Lines for its configuration.
+    whole : str or None
+        Its configuration instead, without the port of its clients and of its monitor.
     """
 
-    def __init__(self, folder: Path, name: str = "n1", further: str = "") -> None:
+    def __init__(self, folder: Path, name: str = "n1", further: str = "", whole: str | None = None) -> None:
         self.name, self.port, self.monitor = name, free_port(), free_port()
         self._configuration = folder / f"{name}.conf"
         self._configuration.parent.mkdir(parents=True, exist_ok=True)
-        lines = (
+        addresses = (f"listen: 127.0.0.1:{self.port}", f"http: 127.0.0.1:{self.monitor}")
+        own = (
             f"server_name: {name}",
-            f"listen: 127.0.0.1:{self.port}",
-            f"http: 127.0.0.1:{self.monitor}",
             f'jetstream {{store_dir: "{folder / name}", max_file_store: 10GB, max_memory_store: 100MB}}',
             further,
         )
+        lines = (*addresses, *(own if whole is None else (whole,)))
         self._configuration.write_text("\n".join(lines), encoding="utf-8")
         self._process: subprocess.Popen[bytes] | None = None
 

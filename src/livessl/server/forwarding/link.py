@@ -26,7 +26,6 @@ from livessl.server.forwarding.stream import (
     STREAM,
     Place,
     connect_options,
-    inbox_of,
     message_id,
     nats_library,
     subject,
@@ -90,7 +89,7 @@ class HubLink:
         config = site.server.hub
         assert config is not None
         self._nats = nats_library(PLACE)
-        self._options = connect_options(config, site.file, PLACE) | {"inbox_prefix": inbox_of(site.site)}
+        self._options = connect_options(config, site.file, PLACE)
         self._site = site.site
         self._location_deg = config.location_deg
         self._clock = clock
@@ -103,6 +102,7 @@ class HubLink:
         self._thread: threading.Thread | None = None
         self._news, self._end = asyncio.Event(), asyncio.Event()
         self._problem: str | None = "not connected yet"
+        self._complaint: str | None = None  # what NATS has said since the last window was sent
         self.sent = 0
         """Messages that the stream has acknowledged since the start."""
         self.waiting = 0
@@ -207,7 +207,8 @@ class HubLink:
         """Connect, and send as long as the connection is open; the library connects again by itself."""
 
         async def failed(error: Exception) -> None:
-            self._note(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+            self._complaint = _told(error)
+            self._note(self._complaint)
 
         async def call(work: Callable[[], None]) -> None:
             work()
@@ -263,6 +264,7 @@ class HubLink:
         stream = client.jetstream()
         waiting: list[asyncio.Future[PubAck]] = []
         losing = asyncio.create_task(lost.wait())
+        self._complaint = None
         try:
             for message in window:
                 headers = {MESSAGE_ID: message_id(Place(outbox, message.number)), "Nats-Expected-Stream": STREAM}
@@ -277,7 +279,8 @@ class HubLink:
         count = next((place for place, each in enumerate(waiting) if not _is_acknowledged(each)), len(waiting))
         if count < len(waiting):
             refusal = _error_of(waiting[count])
-            self._note("the stream did not acknowledge a message in time" if refusal is None else _told(refusal))
+            unknown = self._complaint or "the stream did not acknowledge a message in time"
+            self._note(unknown if refusal is None else _told(refusal))
         for each in waiting:
             each.cancel()
         return count
@@ -329,4 +332,4 @@ def _told(error: BaseException) -> str:
         case "AuthorizationError":
             return "NATS refuses the user or password; correct server.hub.user, password or credentials"
         case _:
-            return f"{type(error).__name__}: {error}"
+            return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -94,11 +94,6 @@ def nats_library(where: str) -> Any:
         raise ConfigError([Fault(where, "needs the package nats-py; pip install 'livessl[hub]'")]) from error
 
 
-def inbox_of(site: str) -> str:
-    """Return the prefix of the subjects on which a site gets acknowledgements: its own, so that no other reads them."""
-    return f"_INBOX.{_token(site)}"
-
-
 def _token(site: str) -> str:
     """Return a site's name as one part of a subject, in which a dot separates no parts."""
     return site.replace(".", "%2E")

@@ -98,9 +98,9 @@ class Database:
         self._problem = ""
         if isinstance(place, str):
             self.name = make_url(place).render_as_string(hide_password=True)
-            self._writing = _postgresql(place, readers=0)
+            self._writing: Engine = _postgresql(place, readers=0)
             self._reading = _postgresql(place, readers=READERS)
-            self._sessions = _postgresql(place, readers=0).execution_options(isolation_level="AUTOCOMMIT")
+            self._sessions: Engine = _postgresql(place, readers=0).execution_options(isolation_level="AUTOCOMMIT")
         elif place is None:
             self.name = "memory"
             self._writing = self._reading = self._sessions = _sqlite(":memory:", 1, writes=True)
