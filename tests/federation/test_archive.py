@@ -157,6 +157,16 @@ def test_states_tracks_and_alerts_follow_the_messages(archive: Archive) -> None:
     assert archive.tracks("lab") == []  # a server that starts follows no track of before
 
 
+def test_old_events_and_alerts_are_deleted(archive: Archive) -> None:
+    alert = {"kind": "alert", "key": "old", "raised_utc": event(1)["time_utc"]}
+    newer = {"kind": "alert", "key": "new", "raised_utc": event(3)["time_utc"]}
+    archive.take([delivery(1), delivery(2, event(3)), delivery(3, alert, kind="alert")], PATIENCE)
+    archive.take([delivery(4, newer, kind="alert")], PATIENCE)
+    assert archive.expire(sound(2).start_ns) == 1
+    assert stored(archive) == ["lab-3"]
+    assert [each["key"] for _, each in archive.alerts(None, 10, None)] == ["new"]
+
+
 def test_only_one_hub_at_a_time_has_the_turn(place: DatabasePlace, archive: Archive) -> None:
     if not isinstance(place, str):
         pytest.skip("the hubs of an SQLite file are not kept apart")

@@ -50,8 +50,8 @@ def add_arguments(parser: Any) -> None:
         sub = actions.add_parser(
             name,
             help=text,
-            description=f"{text[0].upper()}{text[1:]}. With a running server, the command prompts for each clap: give "
-            "its site file by --site, or its address by --url. With a recording of the claps, give --session or --wav.",
+            description=f"{text[0].upper()}{text[1:]}. To use a running server, give its site file (--site) or its "
+            "address (--url); the command then prompts for each clap. To use recordings, give --session or --wav.",
             epilog=f"example: livessl calibrate {example}",
         )
         sub.set_defaults(act=act)
@@ -69,7 +69,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "verify",
         _verify,
-        "print the error at places that you know, and what explains it",
+        "print the error of claps at places that you know, and its likely cause",
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
@@ -80,7 +80,9 @@ def add_arguments(parser: Any) -> None:
         "measure where the arrays are, by claps at places that you know",
         "poses --site site.yaml --at 2,3,1.2 --at 6,8,1.2 … --write",
     )
-    _add_places(sub, "place of a clap in metres; repeat for each. Without it, places are proposed if a server runs")
+    _add_places(
+        sub, "place of a clap in metres; repeat for each. With a running server, omit --at and places are proposed"
+    )
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -93,7 +95,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "refine",
         _refine,
-        "measure where the arrays are from sounds at unknown places; one array's pose must be right",
+        "use sounds at unknown places to measure the arrays' poses; one array's pose must be right",
         "refine --site site.yaml --known north --write",
     )
     sub.add_argument(

@@ -32,8 +32,8 @@ def add_file(parser: Any) -> None:
         nargs="?",
         const=BESIDE_THE_SITE,
         metavar="FILE",
-        help="store the result; without FILE in the calibration file that the site file names, or else in "
-        "calibration/SITE.yaml beside it",
+        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
+        "calibration/SITE.yaml beside the site file)",
     )
     parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
 

@@ -9,6 +9,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
+from livessl.garbage import collect_as_usual
 
 
 def add_arguments(parser: Any) -> None:
@@ -22,8 +23,8 @@ def add_arguments(parser: Any) -> None:
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="time stamp of the files' first sample, RFC 3339 (default: now; with several nodes the next multiple of "
-        "5 s, so that they agree)",
+        help="time stamp of the files' first sample, RFC 3339 (default: now, or the next multiple of 5 s if the "
+        "site has several nodes, so that all start together)",
     )
 
 
@@ -39,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     clock = SystemClock()
     name = run_id(arguments.node, clock)
     device = audio_device(arguments, config, clock)
+    collect_as_usual()
     if device is not None:
         with stop_on_signal() as stop:
             capture_device(site, arguments.node, device, clock, name, stop.is_set)

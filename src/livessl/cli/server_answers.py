@@ -16,9 +16,9 @@ ANSWER_S: Final = 10.0
 
 def add_server(parser: Any, text: str) -> None:
     """Add --url and --token-file."""
-    parser.add_argument("--url", help=f"running server to ask, such as http://127.0.0.1:8000; {text}")
+    parser.add_argument("--url", help=f"address of a running server, such as http://127.0.0.1:8000; {text}")
     parser.add_argument(
-        "--token-file", type=Path, metavar="FILE", help="file that holds a token for the server, where it wants one"
+        "--token-file", type=Path, metavar="FILE", help="file with an access token, if the server requires one"
     )
 
 

@@ -24,10 +24,10 @@ from livessl.server.api.auth import Access, Gate
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.event_retention import delete_old_events
 from livessl.server.history.database import StoreError
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.refusals import Refusals
-from livessl.server.retention import delete_old_events
 
 PAGE: Final = Path(__file__).parent / "page"
 """Files of the page."""
@@ -133,10 +133,9 @@ class HubServer:
         self.uvicorn.should_exit = True
 
     async def _serve(self) -> None:
-        store = self.archive.store
         receiving = asyncio.create_task(self.intake.run())
         receiving.add_done_callback(lambda _: self.stop())
-        retention = delete_old_events(store, self._clock, self._hub.settings.retention_days)
+        retention = delete_old_events(self.archive, self._clock, self._hub.settings.retention_days)
         tasks = [receiving, *(asyncio.create_task(work) for work in (retention, self._access.reload_tokens()))]
         try:
             await self.uvicorn.serve(sockets=[self._listener])

@@ -7,6 +7,7 @@ that stores the message. So it does not matter how often a message comes, and to
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import groupby
@@ -82,6 +83,13 @@ class Archive:
         """The history of events; the id of an event is `SITE/ID` there."""
         self._database = self.store.database
         self._clock = clock
+
+    def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
+        """Delete events and alerts of before a time; return the number of events."""
+        gone = self.store.expire(before_ns, end)
+        with self._database.writing("delete old alerts") as connection:
+            connection.execute(delete(alerts).where(alerts.c.time_ns < max(before_ns, 0)))
+        return gone
 
     def close(self) -> None:
         """Release the database."""

@@ -22,8 +22,10 @@ from livessl.server.forwarding.stream import (
     CONSUMER,
     KINDS,
     MESSAGE_ID,
+    RECONNECT_S,
     STREAM,
     connect_options,
+    connected,
     health_of_all,
     nats_library,
     parse_message_id,
@@ -58,9 +60,6 @@ DUPLICATES_S: Final = 600.0
 TURN_S: Final = 0.25
 """Interval, in seconds, at which a hub that waits for its turn tries to get it."""
 
-REST_S: Final = 1.0
-"""Wait, in seconds, after NATS or the database failed."""
-
 DAY_S: Final = 86_400.0
 
 PLACE: Final = "nats"
@@ -84,9 +83,9 @@ class Intake:
 
     def __init__(self, hub: Hub, archive: Archive) -> None:
         self._nats = nats_library(PLACE)
-        self._options = connect_options(hub.settings.nats, hub.file, PLACE)
+        name = f"livessl hub {hub.settings.hub}"
+        self._options = connect_options(hub.settings.nats, hub.file, PLACE) | {"name": name}
         self._stream = hub.settings.stream
-        self._name = hub.settings.hub
         self._archive = archive
         self._problem: str | None = "not connected yet"
         self.has_turn = False
@@ -108,29 +107,27 @@ class Intake:
                 await self._receive()
             except (self._nats.errors.Error, StoreError, SQLAlchemyError, OSError, TimeoutError) as error:
                 self._note(_told(error))
-            await asyncio.sleep(REST_S)
+            await asyncio.sleep(RECONNECT_S)
 
     async def _receive(self) -> None:
+        """Receive as long as a connection lasts."""
+        lost = asyncio.Event()
+
         async def failed(error: Exception) -> None:
-            if not client.is_connected:
+            if lost.is_set() or self._problem is not None:
                 self._note(_told(error))
 
-        async def again() -> None:
-            self._note(None)
+        async def end() -> None:
+            lost.set()
 
-        handlers: dict[str, Any] = {"error_cb": failed, "reconnected_cb": again}
-        client: Client = self._nats.NATS()
-        await client.connect(**self._options, **handlers, name=f"livessl hub {self._name}")
-        try:
+        async with connected(self._nats, self._options, failed, end) as client:
             await self._make_stream(client)
             self._note(None)
             await client.subscribe(health_of_all(), queue=CONSUMER, cb=self._take_report)
-            while True:
+            while not lost.is_set():
                 await self._take_turn(client)
                 await asyncio.sleep(TURN_S)
-        finally:
-            with suppress(Exception):
-                await client.close()
+        self._note("the connection was lost")
 
     async def _make_stream(self, client: Client) -> None:
         """Make the stream and the consumer, or change them to what the hub's file says."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Final
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
+from livessl.garbage import collect_as_usual
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
@@ -19,24 +19,26 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
 from livessl.server.clips.service import Clips
-from livessl.server.compiling import load_kernels
+from livessl.server.compiling import KernelLoader
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
+from livessl.server.event_retention import delete_old_events
 from livessl.server.fanout import Fanout
 from livessl.server.forwarding.link import HubLink
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
+from livessl.server.journal import Journal, also
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
-from livessl.server.retention import delete_old_events
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
@@ -50,6 +52,10 @@ releases it thousands of times a second; by Python's default it would wait 5 ms 
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
+
+RESTORED: Final = 100
+"""Newest alerts of the outbox that are put into the journal at the start: a server that was killed may have kept them
+in the outbox only."""
 
 _log = logging.getLogger(__name__)
 
@@ -100,6 +106,8 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
+        journal = Journal(store, clock)
+        journal.site(site)
         hub_link = None
         if store.outbox is not None:
             hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
@@ -112,11 +120,16 @@ def assemble(
         overload = Overload(clock)
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
+        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(journal.alert, publish_to_all)
         array_states = ArrayStates(
-            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_to_all
+            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish_to_all, url, zones)
+        kept, listeners = site.server.clips, Listeners()
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips)
         undo.callback(alerts.stop)
+        for _, alert in reversed(alerts.outbox.recent(RESTORED)):
+            journal.alert(alert)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -124,9 +137,7 @@ def assemble(
             publish(change)
 
         presence = Presence(zones, publish_change)
-        tracks = Tracks(presence)
-        kept, listeners = site.server.clips, Listeners()
-        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
         publisher = Publisher(
             publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
@@ -158,6 +169,7 @@ def assemble(
         sinks=sinks,
         fanout=fanout,
         zone_book=zone_book,
+        journal=journal,
         presence=presence,
         floor_plan=floor_plan,
         hub_link=hub_link,
@@ -210,6 +222,7 @@ class Server:
         certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
+        self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
         # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
@@ -222,9 +235,6 @@ class Server:
             undo.callback(sinks.close)
             store = Store.of(site)
             undo.callback(store.close)
-            self._compiler = load_kernels()
-            if self._compiler is not None:
-                undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
             self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
             undo.pop_all()
@@ -239,14 +249,12 @@ class Server:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
-        gc.collect()
-        gc.freeze()  # what exists now stays, and the collector need not look through it again
+        collect_as_usual()
         try:
             asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
-            if self._compiler is not None:
-                self._compiler.stop()
+            self._kernel_loader.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
@@ -282,7 +290,7 @@ class Server:
             self.parts.hub_link.start()
         if not self._stepped:
             self.parts.store.backlog.start()
-            self.parts.engine.start()
+            self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
         try:

@@ -142,8 +142,9 @@ class ArrayStates:
             if all(state == self._reported.get(name) for name, state in states.items()):
                 return
         self._reported_ns = now_ns
-        reported = self._ingest.node_reports.findings(self._nodes, now_ns)
-        self._set_up_watch.note_reports(with_inputs(self._site, reported))
+        reports = self._ingest.node_reports
+        reported = with_inputs(self._site, reports.findings(self._nodes, now_ns))
+        self._set_up_watch.note_reports(reported, are_complete=reports.are_complete(now_ns))
         arrays = self.describe()
         for array in arrays:
             before = self._reported.get(array["name"])

@@ -86,6 +86,7 @@ class Engine:
         self._sound_takers = sound_takers
         self._parallel = Parallel()
         self._stop = threading.Event()
+        self._prepare: Callable[[], None] | None = None
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
@@ -96,8 +97,9 @@ class Engine:
         """Windows of this run that were not localized because newer ones were due."""
         return self._run.fusion.updates_left_out
 
-    def start(self) -> None:
-        """Start the thread."""
+    def start(self, prepare: Callable[[], None]) -> None:
+        """Start the thread, which calls `prepare` before its first turn."""
+        self._prepare = prepare
         self._thread.start()
 
     def stop(self) -> None:
@@ -146,6 +148,8 @@ class Engine:
 
     def _work(self) -> None:
         try:
+            if self._prepare is not None:
+                self._prepare()
             while not self._stop.is_set():
                 self.turn()
         except BaseException as error:

@@ -1,7 +1,8 @@
 """Measures how far nodes' clocks are behind the server's, from when their messages were sent and received.
 
 A message that was sent by a clock that is behind seems to have taken that long. A real delay varies, so the least one
-of some seconds is taken; it is the clock's, or that of a network which never is faster.
+of some seconds is taken; it is the clock's, or that of a network which never is faster. Frames from the future are
+rejected by `core.stream.alignment`, and arrays are compared with each other by `core.stream.clock_offsets`.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
 from livessl.server.forwarding.link import HubLink
+from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -53,6 +54,7 @@ class Parts:
     sinks: Sinks
     fanout: Fanout
     zone_book: ZoneBook
+    journal: Journal
     presence: Presence
     floor_plan: FloorPicture | None
     hub_link: HubLink | None

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
+from livessl.core.commission.report_watch import REPORTED
 from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation
 from livessl.server.heard_sounds import HeardSounds
@@ -41,11 +42,18 @@ class SetUpState:
         Faults of the set-up, errors first.
     errors : mapping of array to str
         The error that concerns each array, in words; arrays without one are left out.
+    are_reports_complete : bool
+        Whether the nodes have reported for long enough to show all that their reports can show.
     """
 
     sounds: int = 0
     findings: tuple[Finding, ...] = ()
     errors: Mapping[str, str] = field(default_factory=dict)
+    are_reports_complete: bool = False
+
+    def knows(self, fault: str) -> bool:
+        """Return whether a fault of this code that is no finding is known not to be there, or to have ended."""
+        return self.are_reports_complete if fault in REPORTED else self.sounds >= LEAST_SOUNDS
 
 
 class SetUpWatch:
@@ -76,6 +84,7 @@ class SetUpWatch:
         self._of_layout = layout_findings(site)
         self._of_sounds: tuple[Finding, ...] = ()
         self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
+        self._are_reports_complete = False
         self.state = SetUpState(findings=self._of_layout)
         """The latest state. Read it once for values that belong together."""
         self._stop = threading.Event()
@@ -92,9 +101,10 @@ class SetUpWatch:
         if event.source == 1 and len(event.received) > 0:
             self.heard.take(event)
 
-    def note_reports(self, findings: Sequence[Finding]) -> None:
-        """Take in what the reports of the nodes show now; new faults are logged."""
+    def note_reports(self, findings: Sequence[Finding], *, are_complete: bool = False) -> None:
+        """Take in what the reports of the nodes show now, and whether that is all; new faults are logged."""
         with self._lock:
+            self._are_reports_complete = are_complete
             self._log_new(self._reported, findings)
             self._reported = tuple(findings)
             self._publish()
@@ -157,7 +167,7 @@ class SetUpWatch:
             for array in ([finding.array] if finding.array is not None else all_arrays)
         }
         findings = in_order([*self._of_sounds, *self._reported, *self._of_layout])
-        self.state = SetUpState(len(self._sounds), tuple(findings), errors)
+        self.state = SetUpState(len(self._sounds), tuple(findings), errors, self._are_reports_complete)
 
     @staticmethod
     def _log_new(known: Sequence[Finding], findings: Sequence[Finding]) -> None:

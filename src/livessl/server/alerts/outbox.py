@@ -1,7 +1,8 @@
 """The outbox: alerts, their deliveries and the rules' states, in SQLite, so that none is lost in a restart.
 
 What a batch of events raises is written in one transaction with how far the events are judged. A server that is killed
-judges the others again, and the keys of alerts prevent a second entry.
+judges the others again, and the keys of alerts prevent a second entry. `courier` delivers what is in it, and says when
+to try again.
 """
 
 from __future__ import annotations
@@ -172,6 +173,11 @@ class Outbox:
     def has(self, keys: Iterable[str]) -> bool:
         """Return whether there is an alert with one of these keys."""
         return any(self._rows("SELECT 1 FROM alerts WHERE key = ?", (key,)) for key in keys)
+
+    def get(self, key: str) -> JsonObject | None:
+        """Return the alert of a key; None if there is none, or none any more."""
+        rows = self._rows("SELECT json FROM alerts WHERE key = ?", (key,))
+        return dict(json.loads(rows[0][0])) if rows else None
 
     def states(self) -> dict[str, RuleState]:
         """Return the states of all rules that have one."""

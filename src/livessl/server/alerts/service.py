@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
-from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import FRAME_NS
 from livessl.server.alerts.actions import ActionSetting, make_action
 from livessl.server.alerts.backlog import Backlog, Batch, final_until_ns
 from livessl.server.alerts.courier import NS_PER_S, REST_S, Courier
+from livessl.server.alerts.evidence import ClipSource, Evidence
 from livessl.server.alerts.history import DryRuns, past_pages
 from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.message import AlertMessages
@@ -69,6 +69,8 @@ class Alerts:
         Address of the server, for links, unless the site file gives another one.
     zones : callable or None
         Returns the zones that are in force; None for those of the site.
+    clips : ClipSource or None
+        Finds the clips of events; None if the site keeps none.
 
     Raises
     ------
@@ -89,6 +91,7 @@ class Alerts:
         publish: Callable[[JsonObject], None],
         url: str = "",
         zones: Callable[[], ZoneMap] | None = None,
+        clips: ClipSource | None = None,
     ) -> None:
         self._site = site
         self._config = site.alerts
@@ -109,9 +112,13 @@ class Alerts:
         self.outbox = Outbox(_outbox_path(site))
         """Alerts, deliveries and the rules' states."""
         base = self._config.url or url + site.server.http.root_path
+        self.evidence = Evidence(site, zones, clips)
+        """Pictures and clips of alerts."""
         try:
             self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base), zones)
-            self.couriers = {name: _courier(name, site, clock, self.outbox, base) for name in self._config.actions}
+            self.couriers = {
+                name: _courier(name, site, clock, self.outbox, base, self.evidence) for name in self._config.actions
+            }
             """The courier of each action, by name."""
             _leave_the_past(self.outbox, self.couriers, None if self._judges_events else site.site)
         except BaseException:
@@ -308,10 +315,8 @@ class Alerts:
         self._backlog.work_off_changes(lambda changes: self._announce(self._judge.judge_changes(changes)))
         now_ns = self._clock.now_ns()
         if self._judges_conditions and not self._site_time.is_replay:
-            set_up = self._set_up_watch.state
-            findings = set_up.findings if set_up.sounds >= LEAST_SOUNDS else None
             arrays = self._array_states.describe(levels=False)
-            self._announce(self._judge.judge_conditions(arrays, findings, now_ns))
+            self._announce(self._judge.judge_conditions(arrays, self._set_up_watch.state, now_ns))
         days = self._site.store.retention_days
         if days is not None and now_ns - self._expired_ns >= EXPIRE_NS:
             self._expired_ns = now_ns
@@ -340,13 +345,13 @@ class Alerts:
                 loop.call_soon_threadsafe(work)
 
 
-def _courier(name: str, site: Site, clock: Clock, outbox: Outbox, url: str) -> Courier:
+def _courier(name: str, site: Site, clock: Clock, outbox: Outbox, url: str, evidence: Evidence) -> Courier:
     alerts, config = site.alerts, site.alerts.actions[name]
     rules = [rule for rule, each in alerts.rules.items() if name in each.actions]
     alike = {other for other, each in alerts.actions.items() if each.kind == config.kind}
     taken = {rule for rule, each in alerts.rules.items() if not alike.isdisjoint(each.actions)}
     others = sorted((alerts.rules.keys() | outbox.states().keys()) - taken)
-    action = make_action(ActionSetting(name, config, site, clock, rules, others, url))
+    action = make_action(ActionSetting(name, config, site, clock, rules, others, url, evidence))
     return Courier(name, config, action, outbox, clock)
 
 

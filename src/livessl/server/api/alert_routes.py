@@ -12,6 +12,7 @@ from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from livessl.clock import utc_text
 from livessl.server.alerts.history import DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
+from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
 from livessl.server.alerts.schedule import is_open
 from livessl.server.api import alert_schema
@@ -25,6 +26,8 @@ DAY_NS: Final = 86_400_000_000_000
 DRY_RUN_RETRY_S: Final = 5
 """Wait, in seconds, that is asked of a client whose dry run found another one under way."""
 
+_BINARY: Final = {"type": "string", "format": "binary"}
+_NO_PICTURE: Final = "There is no alert of that key, or it is about no place."
 _NO_RULE: Final = "There is no rule of that name."
 _NOT_ON_EVENTS: Final = "There is no rule of that name on events: only events are stored."
 _NO_LETTER: Final = "There is no dead letter of that number, or the site file does not have its action."
@@ -58,6 +61,26 @@ def alert_routes(parts: Parts) -> APIRouter:
         next_before = rows[limit - 1][0] if len(rows) > limit else None
         return as_json({"v": API_VERSION, "alerts": found, "next_before": next_before})
 
+    @router.get(
+        "/{key}/picture.png",
+        response_class=Response,
+        responses={
+            200: {"description": "The picture.", "content": {"image/png": {"schema": _BINARY}}},
+            **errors(404, 503, texts={404: _NO_PICTURE, 503: _OUTBOX}),
+        },
+    )
+    def get_picture(
+        key: str,
+        size: Annotated[int, Query(ge=64, le=MAX_PX, description="length of the longer side in pixels")] = DEFAULT_PX,
+    ) -> Response:
+        """The floor plan with arrays, zones, and the place of an alert with its ellipse of 95 %."""
+        with _outbox_errors():
+            alert = alerts.outbox.get(key)
+        picture = None if alert is None else alerts.evidence.picture(alert, size)
+        if picture is None:
+            raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
+        return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
+
     @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
@@ -74,7 +97,9 @@ def alert_routes(parts: Parts) -> APIRouter:
         _check_rule(parts, name)
         with _outbox_errors():
             alerts.arm(name, switch.armed)
-        _log.info("%r has %s rule %r", request.scope["client_name"], "armed" if switch.armed else "disarmed", name)
+        who, done = request.scope["client_name"], "armed" if switch.armed else "disarmed"
+        _log.info("%r has %s rule %r", who, done, name)
+        parts.journal.configuration(f"rule {name}", who, f"{who!r} has {done} rule {name!r}", switch.model_dump())
         return as_json({"v": API_VERSION, "name": name, "armed": switch.armed})
 
     @router.get(

@@ -58,6 +58,16 @@ class Alert(BaseModel):
     link: str = Field(
         description="Address of the event on the dashboard.", examples=["http://127.0.0.1:8000/#event=lab-1"]
     )
+    picture: str | None = Field(
+        default=None,
+        description="Address of a picture of the floor plan with the place; null for an alert about no place.",
+        examples=["http://127.0.0.1:8000/api/v1/alerts/alert_0f3c5b9d7e8a41c6a2b4d6e8f0a1b2c3/picture.png"],
+    )
+    clips: str | None = Field(
+        default=None,
+        description="Address of the list of the event's recordings; null if the site keeps none.",
+        examples=["http://127.0.0.1:8000/api/v1/events/lab-1/clips"],
+    )
     zones: list[str] = Field(description="Zones of the rule that it came from.", examples=[["door"]])
     membership: list[Membership] = Field(description="The same zones with their probabilities.")
     count: int = Field(ge=1, description="Events that the rule asks for within its span.", examples=[1])

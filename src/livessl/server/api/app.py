@@ -24,6 +24,7 @@ from livessl.server.api.clip_routes import clip_routes
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
+from livessl.server.api.journal_routes import journal_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proxy import BehindProxy
@@ -83,6 +84,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.switch_route(parts),
         routes.access_route(parts, access),
         history_routes(parts),
+        journal_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
         dead_letter_routes(parts),

@@ -201,7 +201,9 @@ def switch_route(parts: Parts) -> APIRouter:
         except StoreError as error:
             raise HTTPException(503, str(error)) from error
         done = "enabled" if switch.enabled else "disabled"
-        _log.info("%r has %s array %r", request.scope["client_name"], done, name)
+        who = request.scope["client_name"]
+        _log.info("%r has %s array %r", who, done, name)
+        parts.journal.configuration(f"array {name}", who, f"{who!r} has {done} array {name!r}", switch.model_dump())
         return as_json({"v": API_VERSION, "name": name, "enabled": switch.enabled})
 
     return router

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -23,9 +23,11 @@ from livessl.server.forwarding.outbox import Outbox, Outgoing, Unsent
 from livessl.server.forwarding.stream import (
     HEALTH,
     MESSAGE_ID,
+    RECONNECT_S,
     STREAM,
     Place,
     connect_options,
+    connected,
     message_id,
     nats_library,
     subject,
@@ -89,7 +91,7 @@ class HubLink:
         config = site.server.hub
         assert config is not None
         self._nats = nats_library(PLACE)
-        self._options = connect_options(config, site.file, PLACE)
+        self._options = connect_options(config, site.file, PLACE) | {"name": f"livessl {site.site}"}
         self._site = site.site
         self._location_deg = config.location_deg
         self._clock = clock
@@ -204,44 +206,44 @@ class HubLink:
             sending.result()  # raises the error that ended it
 
     async def _stay_connected(self) -> None:
-        """Connect, and send as long as the connection is open; the library connects again by itself."""
+        """Connect, send as long as the connection lasts, and connect again, until cancelled."""
+        lost = asyncio.Event()
 
         async def failed(error: Exception) -> None:
             self._complaint = _told(error)
             self._note(self._complaint)
 
-        async def call(work: Callable[[], None]) -> None:
-            work()
+        async def end() -> None:
+            lost.set()
+            self._news.set()
 
-        lost = asyncio.Event()
-        handlers: dict[str, Callable[..., Awaitable[None]]] = {
-            "error_cb": failed,
-            "disconnected_cb": partial(call, lost.set),
-            "reconnected_cb": partial(call, self._news.set),
-        }
-        client = await self._nats.connect(**self._options, **handlers, name=f"livessl {self._site}")
-        try:
-            reporting = asyncio.create_task(self._report(client))
+        while True:
+            lost.clear()
             try:
-                await self._send_all(client, lost)
-            finally:
-                reporting.cancel()
-                await asyncio.gather(reporting, return_exceptions=True)
+                async with connected(self._nats, self._options, failed, end) as client:
+                    await self._send_while_connected(client, lost)
+            except (self._nats.errors.Error, OSError, TimeoutError) as error:
+                self._note(_told(error))
+            await asyncio.sleep(RECONNECT_S)
+
+    async def _send_while_connected(self, client: Client, lost: asyncio.Event) -> None:
+        reporting = asyncio.create_task(self._report(client))
+        try:
+            await self._send_all(client, lost)
         finally:
-            with suppress(Exception):
-                await client.close()
+            reporting.cancel()
+            await asyncio.gather(reporting, return_exceptions=True)
 
     async def _send_all(self, client: Client, lost: asyncio.Event) -> None:
-        """Send what waits and what comes, until cancelled."""
-        while True:
+        """Send what waits and what comes, until the connection is lost."""
+        while not lost.is_set():
             self._news.clear()
             wait_s = REPORT_S
             try:
                 head = await asyncio.to_thread(self._outbox.head)
                 window = await asyncio.to_thread(self._outbox.unsent, WINDOW)
                 self.waiting = head.last - head.acknowledged if window else 0
-                if window and client.is_connected:
-                    lost.clear()
+                if window:
                     count = await self._send(client, head.outbox, window, lost)
                     if count:
                         await asyncio.to_thread(self._outbox.acknowledge, window[count - 1].number)
@@ -250,7 +252,7 @@ class HubLink:
                         self._note(None)
                         continue
                     wait_s = RETRY_S
-                elif client.is_connected:
+                elif not lost.is_set():
                     self._note(None)
             except StoreError as error:
                 self._note(str(error))
@@ -288,9 +290,8 @@ class HubLink:
     async def _report(self, client: Client) -> None:
         """Publish a report of the site on itself at every `REPORT_S`, until cancelled; none is kept for later."""
         while True:
-            if client.is_connected:
-                with suppress(self._nats.errors.Error):
-                    await client.publish(subject(self._site, HEALTH), orjson.dumps(self._described()))
+            with suppress(self._nats.errors.Error):
+                await client.publish(subject(self._site, HEALTH), orjson.dumps(self._described()))
             await asyncio.sleep(REPORT_S)
 
     def _described(self) -> JsonObject:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from livessl.errors import ConfigError, Fault
 from livessl.site.hub_models import NatsConfig
 from livessl.site.secret_files import read_secret
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
 
 STREAM: Final = "LIVESSL"
 """Name of the stream, which a hub makes."""
@@ -31,7 +36,10 @@ CONNECT_S: Final = 2
 """Longest time, in seconds, of an attempt to connect."""
 
 RECONNECT_S: Final = 0.25
-"""Wait, in seconds, between two attempts to connect to the same server."""
+"""Wait, in seconds, before another attempt to connect."""
+
+CLOSE_S: Final = 1.0
+"""Longest time, in seconds, that the end of a connection may take."""
 
 PING_S: Final = 5
 """Interval, in seconds, of the pings by which a dead connection is noticed, after two that are not answered."""
@@ -94,13 +102,44 @@ def nats_library(where: str) -> Any:
         raise ConfigError([Fault(where, "needs the package nats-py; pip install 'livessl[hub]'")]) from error
 
 
+@asynccontextmanager
+async def connected(
+    nats: Any,
+    options: dict[str, Any],
+    failed: Callable[[Exception], Awaitable[None]],
+    lost: Callable[[], Awaitable[None]],
+) -> AsyncIterator[Client]:
+    """A connection to NATS, closed at the end of the context; the caller makes another one when it is lost.
+
+    The library would connect again by itself, but forgets to close connections whose handshake failed.
+
+    Parameters
+    ----------
+    nats : module
+    options : dict of str to Any
+        Arguments of `connect`.
+    failed : callable
+        Gets the errors that the library reports.
+    lost : callable
+        Called when the connection is lost.
+    """
+    client: Client = nats.NATS()
+    try:
+        await client.connect(**options, error_cb=failed, disconnected_cb=lost)
+        yield client
+    finally:
+        with suppress(Exception):
+            async with asyncio.timeout(CLOSE_S):
+                await client.close()
+
+
 def _token(site: str) -> str:
     """Return a site's name as one part of a subject, in which a dot separates no parts."""
     return site.replace(".", "%2E")
 
 
 def connect_options(config: NatsConfig, file: Callable[[str], Path], where: str) -> dict[str, Any]:
-    """Return the arguments of `nats.connect`, for a connection that is tried for ever.
+    """Return the arguments of `nats.connect`, for one connection.
 
     Parameters
     ----------
@@ -119,7 +158,8 @@ def connect_options(config: NatsConfig, file: Callable[[str], Path], where: str)
         "servers": list(config.servers),
         "connect_timeout": CONNECT_S,
         "reconnect_time_wait": RECONNECT_S,
-        "max_reconnect_attempts": -1,
+        "max_reconnect_attempts": 1,
+        "allow_reconnect": False,
         "ping_interval": PING_S,
         "max_outstanding_pings": 2,
     }

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +21,9 @@ from sqlalchemy.pool import QueuePool
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault, RunError
 from livessl.server.history.tables import metadata
+from livessl.server.history.turns import Turns
 
-HEAD: Final = "0002"
+HEAD: Final = "0003"
 """The newest revision in `migrations/`; a database that has it needs no Alembic."""
 
 BUSY_S: Final = 0.2
@@ -93,7 +93,7 @@ class Database:
         self.cure = CURE_OF_SERVER if self.is_remote else CURE
         """The cure of a database that cannot be written."""
         self._preparing = threading.Lock()
-        self._turns = _Turns()
+        self._turns = Turns()
         self._is_prepared = False
         self._problem = ""
         if isinstance(place, str):
@@ -186,7 +186,10 @@ class Database:
         """
         self._check()
         try:
-            with self._reading.connect() as connection:
+            with (
+                self._reading.connect() as connection,
+                nullcontext() if self.is_remote else _ending_in_time(connection),
+            ):
                 yield connection
         except PoolTimeoutError as error:
             what = f"server.events_db: all {READERS} connections for reading are taken by other searches"
@@ -243,31 +246,6 @@ class Database:
         self._reading.dispose()
         self._writing.dispose()
         self._sessions.dispose()
-
-
-class _Turns:
-    """A lock that goes to the thread that has waited longest: one that writes all the time keeps out no other."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._is_taken = False
-        self._waiting: deque[threading.Event] = deque()
-
-    def __enter__(self) -> None:
-        turn = threading.Event()
-        with self._lock:
-            if not self._is_taken:
-                self._is_taken = True
-                return
-            self._waiting.append(turn)
-        turn.wait()
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            if self._waiting:
-                self._waiting.popleft().set()  # the lock stays taken
-            else:
-                self._is_taken = False
 
 
 def told(error: Exception) -> str:
@@ -343,19 +321,25 @@ def _sqlite(name: str, connections: int, *, writes: bool) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        if not writes:
-            _end_in_time(connection)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     return engine
 
 
-def _end_in_time(connection: Connection) -> None:
-    """Have SQLite interrupt what the connection still does after `STATEMENT_S`."""
+@contextmanager
+def _ending_in_time(connection: Connection) -> Iterator[None]:
+    """Have SQLite interrupt what the connection still does after `STATEMENT_S`.
+
+    A history in memory has one connection for everything, so what is written afterwards has no such limit.
+    """
     driver: Any = connection.connection.dbapi_connection
     clock = SystemClock()
     end_ns = clock.monotonic_ns() + round(1e9 * STATEMENT_S)
     driver.set_progress_handler(lambda: clock.monotonic_ns() > end_ns, STEPS)
+    try:
+        yield
+    finally:
+        driver.set_progress_handler(None, STEPS)
 
 
 def _on_connect(engine: Engine, set_up: Callable[[Any], None]) -> None:
