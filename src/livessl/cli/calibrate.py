@@ -23,7 +23,7 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
-from livessl.errors import UseError
+from livessl.errors import ConfigError, UseError
 
 if TYPE_CHECKING:
     from livessl.calibration import Clap, HeardSound
@@ -133,10 +133,22 @@ def run(arguments: argparse.Namespace) -> int:
     from livessl.calibration import MOST_CLAPS
 
     if getattr(arguments, "undo", False):
-        return calibration_file.undo(arguments)
+        path = calibration_file.undo(arguments)
+        calibration_file.tell_server(arguments, _server_of_file(arguments), path)
+        return OK
     if len(getattr(arguments, "at", [])) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
     return int(arguments.act(arguments))
+
+
+def _server_of_file(arguments: argparse.Namespace) -> str | None:
+    """Return the address of the server; None if neither it nor a valid site file is given."""
+    if arguments.site is None:
+        return None if arguments.url is None else str(arguments.url)
+    try:
+        return _address(arguments, read_site(arguments))
+    except ConfigError:
+        return None  # no server runs with a site file that cannot be loaded
 
 
 def _is_live(arguments: argparse.Namespace) -> bool:
@@ -160,12 +172,9 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
         return sounds.site(), sounds
     site = read_site(arguments)
     print_warnings(site)
-    http = site.server.http
-    host = "127.0.0.1" if http.host in ("0.0.0.0", "::") else http.host  # noqa: S104 - where the server listens
-    if arguments.url is None and http.port == 0:
+    url = _address(arguments, site)
+    if url is None:
         raise UseError("calibrate: the site file leaves the server's port open; give its address as --url")
-    scheme = "http" if http.certificate is None else "https"
-    url = arguments.url or f"{scheme}://{f'[{host}]' if ':' in host else host}:{http.port}"
     sounds = ServerSounds(url, arguments.token_file, arguments.wait)
     mine, served = ({spec.name: len(spec.microphones_m) for spec in one.processed} for one in (site, sounds.site()))
     if mine != served:
@@ -174,6 +183,18 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
             f"{_counted(mine)}; give that file, or --url alone"
         )
     return site, sounds
+
+
+def _address(arguments: argparse.Namespace, site: Site) -> str | None:
+    """Return the address of the site's server, as it is given or by the site file; None if the port is left open."""
+    if arguments.url is not None:
+        return str(arguments.url)
+    http = site.server.http
+    if arguments.site is None or http.port == 0:
+        return None
+    host = "127.0.0.1" if http.host in ("0.0.0.0", "::") else http.host  # noqa: S104 - where the server listens
+    scheme = "http" if http.certificate is None else "https"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{http.port}"
 
 
 def _counted(arrays: dict[str, int]) -> str:
@@ -249,9 +270,9 @@ def _poses(arguments: argparse.Namespace) -> int:
     def cure() -> str:
         import numpy as np
 
-        from livessl.cli.guided import next_place
+        from livessl.site.build.set_up import next_clap_place
 
-        place_m = next_place(site, np.array([clap.place_m for clap in claps]), arguments.place_std)
+        place_m = next_clap_place(site, np.array([clap.place_m for clap in claps]), arguments.place_std)
         where = "" if place_m is None else f", next at {', '.join(f'{x:.1f}' for x in place_m)}"
         return f"clap at more places, on all its sides, near and far, high and low{where}"
 
@@ -309,5 +330,6 @@ def _told(
             f"degrees; {cure()}"
         )
     if arguments.write is not None and not doubtful:
-        calibration_file.write(arguments, site, action, measured)
+        path = calibration_file.write(arguments, site, action, measured)
+        calibration_file.tell_server(arguments, _address(arguments, site), path)
     return FAILED if doubtful else OK

@@ -123,6 +123,10 @@ class Clips:
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
+    def take_over(self, site: Site) -> None:
+        """Take the arrays to be where this site has them, from the next clip on; any thread may call it."""
+        self._site, self._specs = site, {spec.name: spec for spec in site.processed}
+
     # --- for the fusion thread
 
     def take(self, messages: Iterable[Message], settled: int | None) -> None:
