@@ -35,7 +35,8 @@ import orjson
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "faults")]
 
-from history import START_NS, Times, random_event
+from history import Times
+from history_rows import START_NS, random_event
 from hub_desk import newest_at
 from hub_world import HubProcess, HubWorld, running_world
 from livessl.clock import SystemClock, utc_text

@@ -18,7 +18,7 @@ from livessl.federation.archive import Archive
 from livessl.federation.config import Hub
 from livessl.federation.intake import Intake
 from livessl.federation.routes import hub_routes, metrics_route
-from livessl.server.api.answers import errors
+from livessl.schema.answers import errors
 from livessl.server.api.app import STATIC
 from livessl.server.api.auth import Access, Gate
 from livessl.server.api.hosts import HostCheck, ServerNames

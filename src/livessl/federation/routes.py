@@ -18,7 +18,7 @@ from livessl.core.types import Status
 from livessl.federation import schema
 from livessl.federation.archive import Archive
 from livessl.federation.intake import Intake
-from livessl.server.api.answers import errors
+from livessl.schema.answers import errors
 from livessl.server.api.auth import HEALTH
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.history_routes import Time, cached

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from livessl.server.api.alert_schema import Alert
-from livessl.server.api.schema import ArrayCondition, Event, Track, UtcTime, Version
+from livessl.schema.alerts import Alert
+from livessl.schema.values import ArrayCondition, Event, Track, UtcTime, Version
 
 SiteName = Annotated[str, Field(description="Name of the site.", examples=["lab"])]
 
