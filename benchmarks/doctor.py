@@ -202,7 +202,17 @@ def table(rows: Sequence[Row]) -> str:
             cells.append(str(sum(wrong)) if fault.expected else _share(wrong))
         if any(row["fault"] == fault.name for row in rows):
             lines.append(cells)
-    return as_markdown([Table(titles, lines)])
+    return as_markdown([Table(titles, lines), _cost(rows)])
+
+
+def _cost(rows: Sequence[Row]) -> str:
+    """Say how much time of a processor the conclusions took."""
+    of = {
+        kind: [row["cpu_s"] for row in rows if (row["fault"] == "none") == (kind == "without faults")]
+        for kind in ("without faults", "with one")
+    }
+    parts = [f"{np.median(each):.2f} s {kind} ({np.percentile(each, 95):.2f} s)" for kind, each in of.items() if each]
+    return f"The examination of ten sounds took this much time of one processor, median and 95 %: {', '.join(parts)}."
 
 
 def _share(flags: Sequence[bool]) -> str:

@@ -21,7 +21,7 @@ from livessl.server.alerts.message import AlertMessages
 from livessl.site.load import load_site
 from webhook_receiver import Receiver, Request, running_receiver
 
-LIVES: Final = Path(__file__).parents[1] / "server_lives.py"
+LIVES: Final = Path(__file__).with_name("forked_servers.py")
 WITHIN_S: Final = 90.0
 """Longest wait for a server that starts, and for the last alerts, in seconds."""
 
@@ -36,7 +36,7 @@ RULES: Final = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What arrived at the webhook.
+    """Alerts that arrived at the webhook, and changes that were kept.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Forked(Playing):
         self.pid = int(self._lives.stdout.readline())
 
     def kill_server(self) -> None:
-        """With -9."""
+        """Kill it by SIGKILL."""
         assert self._lives.stdout is not None
         os.kill(self.pid, signal.SIGKILL)
         status = int(self._lives.stdout.readline())
@@ -184,11 +184,8 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int, least_
         guard = {"webhook": {"url": receiver.url}, "first_wait_s": 0.05, "longest_wait_s": 0.5, "attempts": 1000}
         alerts = {"actions": {"guard": guard}, "rules": RULES}
         changes = {"alerts": alerts, "zones.fan": FAN, "zones_file": "zones.yaml"}
-        site = stack.enter_context(Forked(recordings, directory, lead_s=10.0, seed=seed, changes=changes))
-        site.start_server()
-        site.wait_ready(WITHIN_S)
-        for name in site.nodes:
-            site.start_node(name)
+        site = stack.enter_context(Forked(recordings, directory, seed=seed, changes=changes))
+        site.start()
         operator, killed = Operator(site), 0
         site.sleep_until(0.5)
         while killed < kills:

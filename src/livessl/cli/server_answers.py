@@ -23,21 +23,43 @@ def add_server(parser: Any, text: str) -> None:
     )
 
 
+def read_token(token_file: Path) -> str:
+    """Return the token in a file.
+
+    Raises
+    ------
+    UseError
+        If the file cannot be read.
+    """
+    try:
+        return token_file.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
+
+
 def ask(url: str, path: str, token_file: Path | None) -> Any:
-    """Return a server's answer to `GET /api/v1/PATH`.
+    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
+    address = _address(url, path)
+    return _decoded(address, fetch(address, token_file))
+
+
+def fetch(address: str, token_file: Path | None) -> bytes:
+    """Return the body of a server's answer to `GET`.
 
     Raises
     ------
     UseError
         If the address or the token's file cannot be used.
     RunError
-        If the server does not answer, or refuses.
+        If the server does not answer, or refuses; with the server's reason.
     """
-    return _answer(url, path, token_file, None, ANSWER_S)
+    return _answer(address, token_file, None, ANSWER_S)
 
 
 def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> Any:
-    """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
+    """Return a server's answer, which is JSON, to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters
     ----------
@@ -50,40 +72,30 @@ def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: floa
 
     Raises
     ------
-    UseError
-        If the address or the token's file cannot be used.
-    RunError
-        If the server does not answer, or refuses; with the server's reason.
+    UseError, RunError
+        See `fetch`.
     """
-    return _answer(url, path, token_file, json.dumps(value).encode(), wait_s)
+    address = _address(url, path)
+    return _decoded(address, _answer(address, token_file, json.dumps(value).encode(), wait_s))
 
 
-def _answer(url: str, path: str, token_file: Path | None, body: bytes | None, wait_s: float) -> Any:
-    if not url.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
-    address = f"{url.rstrip('/')}/api/v1/{path}"
+def _address(url: str, path: str) -> str:
+    return f"{url.rstrip('/')}/api/v1/{path}"
+
+
+def _decoded(address: str, body: bytes) -> Any:
     try:
-        return json.loads(fetch(address, token_file, body, wait_s))
+        return json.loads(body)
     except ValueError as error:
-        raise RunError(f"{address}: no answer from a server ({error}); check that it runs and its address") from error
+        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
 
 
-def fetch(address: str, token_file: Path | None, body: bytes | None = None, wait_s: float = ANSWER_S) -> bytes:
-    """Return the body of a server's answer at an address, to `POST` of JSON if there is a body to send, else to `GET`.
-
-    Raises
-    ------
-    UseError
-        If the token's file cannot be used.
-    RunError
-        If the server does not answer, or refuses; with the server's reason.
-    """
+def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: float) -> bytes:
+    if not address.startswith(("http://", "https://")):
+        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {} if body is None else {"Content-Type": "application/json"}
     if token_file is not None:
-        try:
-            headers["Authorization"] = f"Bearer {token_file.read_text(encoding='utf-8').strip()}"
-        except OSError as error:
-            raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
+        headers["Authorization"] = f"Bearer {read_token(token_file)}"
     request = urllib.request.Request(address, body, headers)  # noqa: S310 - the address begins with http
     try:
         with urllib.request.urlopen(request, timeout=wait_s) as response:  # noqa: S310

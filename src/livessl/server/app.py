@@ -318,9 +318,10 @@ class Server:
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
-        while self.parts.failure is None:
+        while self.parts.failure is None and not self.uvicorn.should_exit:
             await asyncio.sleep(WATCH_S)
         self.stop()
+        self.parts.fanout.ended.set()
 
     def _publish(self, message: JsonObject) -> None:
         """Hand a message to subscribers; on the fusion thread."""

@@ -10,13 +10,13 @@ from typing import Annotated, Final
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 
 from livessl.clock import utc_text
+from livessl.schema import alerts as alert_schema
+from livessl.schema.answers import errors
 from livessl.server.alerts.history import DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
 from livessl.server.alerts.schedule import is_open
-from livessl.server.api import alert_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.routes import as_json
 from livessl.server.parts import Parts

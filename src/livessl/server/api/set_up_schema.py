@@ -8,8 +8,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from livessl.core.commission.verification import SetUpVerdict
 from livessl.core.types import Status
-from livessl.server.api.answers import Finding
-from livessl.server.api.schema import PositionM, UtcTime, Version
+from livessl.schema.answers import Finding
+from livessl.schema.values import PositionM, UtcTime, Version
 
 MOST_CLAPS = 64
 """Most known places of one verification."""
