@@ -27,6 +27,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).par
 
 from deaths import DEATHS, make_death_recordings, play_death
 from fuzz import fuzz, lines_missed
+from killed_alerts import play_killed
 from mutation import campaign
 from processes import NODES, Playing, make_recordings, play
 from scenarios import HARMLESS, difference, nodes_killed, undisturbed
@@ -186,6 +187,20 @@ def compared(name: str, got: list[dict[str, Any]], expected: list[dict[str, Any]
     }
 
 
+def alerted(folder: Path, kills: int, seed: int) -> int:
+    """Kill a whole server that alerts, and print what became of the alerts and of what operators changed."""
+    recordings = folder / f"recordings-{kills}"
+    if not recordings.exists():
+        make_recordings(recordings, 6 * kills, gap_s=1.2)
+    shutil.rmtree(folder / "site", ignore_errors=True)
+    outcome = play_killed(recordings, folder / "site", kills, seed)
+    counts = {name: getattr(outcome, name) for name in ("kills", "sounds", "changes", "differing", "copies")}
+    counts |= {"alerts": len(outcome.wanted), "accepted": len(outcome.accepted)}
+    wrong = {name: getattr(outcome, name) for name in ("missing", "unwanted", "forgotten")}
+    print(json.dumps(counts | wrong, indent=1))
+    return 1 if any(wrong.values()) or outcome.differing or outcome.kills < kills else 0
+
+
 def damaged(count: int) -> int:
     """Decode damaged messages in ten parts, and print the memory after each."""
     logging.disable(logging.CRITICAL)
@@ -261,11 +276,17 @@ def main() -> int:
     sub = campaigns.add_parser("deaths", help="real processes: the delay of events when an array fails")
     sub.add_argument("--out", type=Path, required=True, help="folder for recordings; they are kept")
     sub.add_argument("--fault", choices=list(DEATHS), action="append", help="only this fault; may be repeated (all)")
+    sub = campaigns.add_parser("alerts", help="real processes: the whole server is killed while it alerts")
+    sub.add_argument("--out", type=Path, required=True, help="folder for recordings; they are kept")
+    sub.add_argument("--kills", type=int, default=50, help="number of kills (50)")
+    sub.add_argument("--seed", type=int, default=0, help="seed of their moments (0)")
     sub = campaigns.add_parser("fuzz", help="coverage-guided fuzzing of the wire")
     sub.add_argument("--seconds", type=float, default=300.0, help="running time (300)")
     arguments = parser.parse_args()
     if arguments.campaign == "fuzz":
         return fuzzed(arguments.seconds)
+    if arguments.campaign == "alerts":
+        return alerted(arguments.out, arguments.kills, arguments.seed)
     if arguments.campaign == "deaths":
         deaths(arguments.out, arguments.fault or list(DEATHS))
         return 0

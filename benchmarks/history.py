@@ -26,6 +26,7 @@ import httpx
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from history_rows import DAY_NS, EVENTS_A_DAY, START_NS, STEP_NS, fill, random_event
 from livessl.clock import SystemClock, utc_text
 from livessl.server.api.encode import JsonObject
 from livessl.server.app import Server
@@ -44,14 +45,14 @@ arrays:
 zones: {{{zones}}}
 server: {{bind: "tcp://127.0.0.1:*", http: {{port: 0}}, events_db: {place}}}
 """
-EVENTS_A_DAY: Final = 100_000
-DAY_NS: Final = 86_400_000_000_000
-START_NS: Final = 1_767_225_600_000_000_000
 ZONES: Final = 8
 """Zones: slabs of the room, each 1.25 m deep, so that an event lies in one of them."""
 
-BATCH: Final = 5000
-"""Events that are stored in one transaction while the database is filled."""
+DELETED: Final = 1_000_000
+"""Most old events that are deleted."""
+
+STORED: Final = 20_000
+"""Events by which the speed of the store is measured."""
 
 MAX_SEARCH_P95_MS: Final = 50.0
 MAX_HEAT_MAP_MS: Final = 500.0
@@ -86,52 +87,6 @@ def _p95_ms(seconds: list[float]) -> float:
     return round(1000 * statistics.quantiles(seconds, n=20, method="inclusive")[18], 3)
 
 
-def random_event(rng: random.Random, number: int, time_ns: int) -> JsonObject:
-    """Return an event as the server stores it."""
-    x_m, y_m, z_m = (round(rng.uniform(0, size), 4) for size in (8.0, 9.999, 4.0))
-    refused = rng.random() < 0.2
-    contribution = {"active_s": 0.2, "level_dbfs": -31.2, "azimuth_deg": 12.31, "elevation_deg": -4.52}
-    return {
-        "kind": "event",
-        "id": f"history-{number}",
-        "time_utc": utc_text(time_ns),
-        "start_s": (time_ns - START_NS) / 1e9,
-        "duration_s": round(rng.uniform(0.1, 2.0), 6),
-        "position_m": None if refused else [x_m, y_m, z_m],
-        "covariance_m2": None if refused else [[0.0123, 0.001, 0.002], [0.001, 0.0456, 0.003], [0.002, 0.003, 0.0789]],
-        "confidence": 0.0 if refused else round(rng.random(), 4),
-        "arrays": [] if refused else ["north", "south"],
-        "method": "onset",
-        "status": "refused" if refused else "located",
-        "reason": "no direction stands out in the sound" if refused else None,
-        "heard_by": ["north", "south"],
-        "level_dbfs": round(rng.uniform(-60, -10), 1),
-        "contributions": [
-            {"array": name, **contribution, "distance_m": 3.2, "agrees": True, "off_deg": 1.5, "asked": False}
-            for name in ("north", "south")
-        ],
-        "zones": [] if refused else [f"zone-{int(y_m / 1.25)}"],
-        "late_frames": 0,
-        "latency_s": 0.1234,
-        "latency_stages_s": {"waited": 0.1, "sent": 0.01, "received": 0.001, "located": 0.0124},
-        "late": False,
-        "replaces": [],
-        "source": 1,
-        "candidates": [],
-    }
-
-
-def fill(store: Store, count: int) -> float:
-    """Store random events, oldest first; return how many a second."""
-    rng, begun, step_ns = random.Random(1), time.perf_counter(), DAY_NS // EVENTS_A_DAY
-    for first in range(0, count, BATCH):
-        times = [START_NS + number * step_ns for number in range(first, min(first + BATCH, count))]
-        store.add_all([(random_event(rng, first + k, at), at) for k, at in enumerate(times)])
-        if first % 500_000 == 0:
-            print(f"{first} of {count} events are stored", file=sys.stderr)
-    return count / (time.perf_counter() - begun)
-
-
 @contextmanager
 def served(place: str) -> Iterator[Server]:
     """The real server with that database."""
@@ -161,8 +116,7 @@ def timed(client: httpx.Client, requests: list[str]) -> Times:
 
 def random_search(rng: random.Random, count: int) -> str:
     """Return a request with a zone, a time and a confidence, each of many widths."""
-    step_ns = DAY_NS // EVENTS_A_DAY
-    end_ns = START_NS + rng.randrange(count) * step_ns
+    end_ns = START_NS + rng.randrange(count) * STEP_NS
     span_ns = rng.choice([DAY_NS // 24, DAY_NS, 7 * DAY_NS, 1000 * DAY_NS])
     query = {
         "zone": f"zone-{rng.randrange(ZONES)}",
@@ -183,16 +137,25 @@ def measure_searches(client: httpx.Client, count: int, searches: int) -> dict[st
         "array, status, level": lambda: (
             f"/api/v1/events?array=south&status=refused&min_level_dbfs={rng.randint(-60, -12)}"
         ),
-        "by id": lambda: f"/api/v1/events/history-{rng.randrange(count)}",
+        "by id": lambda: f"/api/v1/events/history-{rng.randrange(count):09d}",
     }
     return {kind: timed(client, [request() for _ in range(searches)]) for kind, request in kinds.items()}
+
+
+def measure_storing(store: Store, count: int) -> int:
+    """Return how many events a second the store takes, 5000 at a time."""
+    rng, begun, first = random.Random(5), time.perf_counter(), count + 2 * 10**6
+    for batch in range(first, first + STORED, 5000):
+        times = [(number, START_NS + number * STEP_NS) for number in range(batch, batch + 5000)]
+        store.add_all([(random_event(rng, number, at_ns), at_ns) for number, at_ns in times])
+    return round(STORED / (time.perf_counter() - begun))
 
 
 def measure_heat_map(client: httpx.Client, count: int) -> Times:
     """Return how long the heat map of a day takes."""
     rng, requests = random.Random(3), []
     for _ in range(10):
-        first_ns = START_NS + rng.randrange(max(1, count - EVENTS_A_DAY)) * (DAY_NS // EVENTS_A_DAY)
+        first_ns = START_NS + rng.randrange(max(1, count - EVENTS_A_DAY)) * STEP_NS
         span = urlencode({"since": utc_text(first_ns), "until": utc_text(first_ns + DAY_NS - 1)})
         requests.append(f"/api/v1/history/heat-map?{span}")
     return timed(client, requests)
@@ -200,7 +163,7 @@ def measure_heat_map(client: httpx.Client, count: int) -> Times:
 
 def measure_exports(client: httpx.Client, count: int) -> dict[str, int]:
     """Return the events a second of each format, for at most 100 000 of them."""
-    since = utc_text(START_NS + max(0, count - EVENTS_A_DAY) * (DAY_NS // EVENTS_A_DAY))
+    since = utc_text(START_NS + max(0, count - EVENTS_A_DAY) * STEP_NS)
     found = {}
     for form in ("jsonl", "csv", "parquet"):
         begun, size = time.perf_counter(), 0
@@ -233,7 +196,7 @@ def live_events(store: Store, first: int, until: Callable[[int], bool], per_s: f
     rng, put, stored, number = random.Random(4), [], [], 0
     pause, begun = threading.Event(), time.perf_counter()
     while not until(number):
-        at_ns = START_NS + (first + number) * (DAY_NS // EVENTS_A_DAY)
+        at_ns = START_NS + (first + number) * STEP_NS
         event, handed = random_event(rng, first + number, at_ns), time.perf_counter()
 
         def work(event: JsonObject = event, at_ns: int = at_ns, handed: float = handed) -> None:
@@ -250,26 +213,25 @@ def live_events(store: Store, first: int, until: Callable[[int], bool], per_s: f
 
 def measure(place: str, count: int, searches: int) -> JsonObject:
     """Fill a database and measure."""
-    store = Store(place if "://" in place else Path(place))
-    inserted_per_s = fill(store, count)
-    store.close()
+    filled_per_s = fill(place, count)
     with served(place) as server, httpx.Client(base_url=server.url, timeout=120) as client:
         store = server.parts.store
         client.get("/api/v1/events")
         found = {
             "events": count,
-            "inserted_per_s": round(inserted_per_s),
+            "filled_per_s": round(filled_per_s),
+            "stored_per_s": measure_storing(store, count),
             "searches": {kind: asdict(times) for kind, times in measure_searches(client, count, searches).items()},
             "heat_map_of_a_day": asdict(measure_heat_map(client, count)),
             "exported_per_s": measure_exports(client, count),
         }
         quiet = live_events(store, count, lambda number: number >= 500)
-        old = max(BATCH, min(count // 2, 1_000_000))
+        old = max(5000, min(count // 2, DELETED))
         expired: list[tuple[int, float]] = []
 
         def expire() -> None:
             begun = time.perf_counter()
-            gone = store.expire(START_NS + old * (DAY_NS // EVENTS_A_DAY))
+            gone = store.expire(START_NS + old * STEP_NS)
             expired.append((gone, time.perf_counter() - begun))
 
         deleting = threading.Thread(target=expire)

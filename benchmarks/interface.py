@@ -2,8 +2,8 @@
 
 `python benchmarks/interface.py faults --repeats 5` measures how soon a node reports each fault and has sound again,
 `losses --minutes 60 --spinning 2` counts lost samples, `resources` measures memory and processor time of a node, and
-`stamps` how even the stamps are. The virtual interface is in tests/interface; it needs gcc and libasound2-dev. The
-results are in docs/reliability.md.
+`stamps` how even the stamps are. The virtual interface is livessl.lab.virtual_interface; it needs gcc and
+libasound2-dev. The results are in docs/reliability.md.
 """
 
 from __future__ import annotations

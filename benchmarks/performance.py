@@ -362,14 +362,18 @@ def _service(live: Sequence[Json]) -> Iterator[str]:
 
 
 def _startup(startup: Json) -> Iterator[str]:
-    took_s, processor_s = (np.asarray(startup[name]) for name in ("took_s", "processor_s"))
+    took_s, processor_s, answered_s = (np.asarray(startup[name]) for name in ("took_s", "processor_s", "answered_s"))
     yield "## Starting"
     yield ""
     median_s, of_processor_s = float(np.median(took_s)), float(np.median(processor_s))
     yield _paragraph(
         f"`livessl serve` listens {_number(median_s)} s after it was called (median of {len(took_s)},",
         f"{_number(took_s.min())} to {_number(took_s.max())} s; {_number(of_processor_s)} s of processor),",
-        "with two arrays in that room and a grid of 0.05 m. The first start on a machine compiles kernels and logs it.",
+        "with two arrays in that room and a grid of 0.05 m. A request that is sent then is answered after",
+        f"{_number(float(np.median(answered_s)))} s, counted from the call: meanwhile the fusion thread loads what it",
+        "computes with ([decision 58](decisions/0058-the-fusion-thread-loads-what-computes.md)). At the first start on",
+        "a machine it works on NumPy until the kernels are compiled",
+        "([decision 57](decisions/0057-numpy-until-kernels-are-compiled.md)).",
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from livessl.clock import Clock, SystemClock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Estimate, Event, Status
+from livessl.server.alerts.evidence import ClipSource
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.encode import JsonObject, Messages
@@ -110,7 +111,9 @@ class LiveTime:
 class Desk:
     """Alerts with a store and an event log, without sockets and sound."""
 
-    def __init__(self, site: Site, clock: Clock | None = None, state: str = "healthy") -> None:
+    def __init__(
+        self, site: Site, clock: Clock | None = None, state: str = "healthy", clips: ClipSource | None = None
+    ) -> None:
         self.clock = SystemClock() if clock is None else clock
         self.site = site
         self.published: list[JsonObject] = []
@@ -118,7 +121,7 @@ class Desk:
         self.store = Store.of(site)
         arrays, findings, time = cast(Any, self.arrays), cast(Any, self.findings), cast(Any, self.time)
         publish, url = self.published.append, "http://127.0.0.1:8000"
-        self.alerts = Alerts(site, self.clock, self.store, arrays, findings, time, publish, url)
+        self.alerts = Alerts(site, self.clock, self.store, arrays, findings, time, publish, url, clips=clips)
         latency = Latency(self.clock, Arrivals())
         self.log = EventLog(site.site, self.clock, self.store, latency, lambda _: None, self.alerts)
         self.log.begin_live()

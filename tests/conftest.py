@@ -7,10 +7,17 @@ import signal
 
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from livessl.core.locate.peak_search import warm_up
+from livessl.garbage import collect_as_usual
 
 pytest_plugins = ["api_contract", "history_places"]
+
+# As in every command: matrix products are small here, and a second BLAS thread would wait in a loop, which costs forty
+# times the processor time of a product.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
+threadpool_limits(limits=1, user_api="blas")  # for one that is loaded
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background: children would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -44,6 +51,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(
         key=lambda item: LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else len(LONGEST_FIRST)
     )
+
+
+def pytest_collection_finish() -> None:
+    collect_as_usual()  # the tests themselves stay
 
 
 def require(condition: bool, reason: str) -> None:

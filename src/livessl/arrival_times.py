@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.commission.arrivals import Arrivals, mean_times_s
 from livessl.core.commission.findings import LEAST_SHARPNESS

@@ -12,16 +12,15 @@ from livessl import offline
 from livessl.arrival_times import arrival_times
 from livessl.clock import UnpacedClock
 from livessl.core.commission.finding import Finding
-from livessl.core.commission.findings import sharp_delays
 from livessl.core.commission.observe import observe
 from livessl.core.commission.refine import LEAST_UNKNOWN, refine
-from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp, measure_poses
+from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp
 from livessl.core.commission.trial import PLACE_STD_M
 from livessl.core.types import Event, FloatArray, Observation
 from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording
 from livessl.site.build.grid import search_grid
-from livessl.site.build.set_up import verify_set_up
+from livessl.site.build.set_up import measure_set_up, observed_delays, verify_set_up
 from livessl.site.models import Site
 
 MOST_CLAPS: Final = 64
@@ -116,9 +115,9 @@ def measured_poses(site: Site, claps: Sequence[Clap], place_std_m: float = PLACE
     RunError
         If no array received enough of them.
     """
-    microphones, delays = _delays(site, [clap.sound for clap in claps])
+    sounds, places_m = [clap.sound.observations for clap in claps], np.array([clap.place_m for clap in claps])
     try:
-        return measure_poses(microphones, delays, np.array([clap.place_m for clap in claps]), site.c_m_s, place_std_m)
+        return measure_set_up(site, sounds, places_m, place_std_m)
     except ValueError as error:
         raise RunError(
             f"expected {LEAST_PLACES} claps or more that an array received clearly, got {len(claps)} in all; clap at "
@@ -143,7 +142,7 @@ def refined(
     RunError
         If there are too few sounds, or no array to refine.
     """
-    microphones, delays = _delays(site, sounds)
+    microphones, delays = observed_delays(site, [sound.observations for sound in sounds])
     bounds_m = np.array(search_grid(site).bounds_m)
     try:
         measured = refine(microphones, delays, bounds_m, site.c_m_s, known, None, position_std_m)
@@ -152,7 +151,7 @@ def refined(
             return measured
         arrivals = arrival_times(
             together,
-            microphones | {name: pose.microphones_m for name, pose in measured.poses.items()},
+            {**microphones, **{name: pose.microphones_m for name, pose in measured.poses.items()}},
             [sound.start_s for sound in sounds],
             measured.places_m,
             measured.c_m_s,
@@ -174,10 +173,3 @@ def _on_one_clock(site: Site, parts: Sequence[AssignedRecording]) -> list[Assign
         if node is not None:
             by_node.setdefault(node, []).append(part)
     return max(by_node.values(), key=len, default=[])
-
-
-def _delays(site: Site, sounds: Sequence[HeardSound]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return the microphones and the delays of the arrays that clearly received any of the sounds."""
-    microphones = {spec.name: spec.microphones_m for spec in site.processed}
-    delays = sharp_delays(microphones, [sound.observations for sound in sounds], [])
-    return microphones, delays

@@ -89,6 +89,7 @@ def test_measured_poses_mend_a_wrong_site_file(run: Run, claps: Recorded, tmp_pa
     done = run("calibrate", "poses", *session, "--place-std", "0.01", "--write", written, "--json")
     assert done.code == 0
     assert "name it in the site file as calibration: calibration/lab.yaml" in done.err
+    assert "it takes effect when the server starts" in done.err
     poses = {one["array"]: one for one in done.objects}
     assert poses["south"]["turn_deg"] == pytest.approx([0.0, 0.0, -TURN_DEG], abs=2.0)
     assert poses["south"]["misfit_us"][1] < 20.0 < poses["south"]["misfit_us"][0]
@@ -122,9 +123,9 @@ def test_the_site_file_says_where_its_calibration_is_written_and_put_back(
 ) -> None:
     site = turned_site(tmp_path)
     session = ["--site", site, "--session", claps.directory, *places(claps)]
-    assert run("calibrate", "poses", *session, "--write").code == 0
+    done = run("calibrate", "poses", *session, "--write")
+    assert (done.code, "name it in the site file" in done.err) == (0, False)
     written = tmp_path / "calibration" / "small.yaml"
-    site.write_text(yaml.safe_dump(yaml.safe_load(site.read_text()) | {"calibration": "calibration/small.yaml"}))
     first = yaml.safe_load(written.read_text())
     first["arrays"]["north"]["position_std_m"] = 0.05
     written.write_text(yaml.safe_dump({**first, "arrays": {"north": first["arrays"]["north"]}}))
@@ -140,7 +141,8 @@ def test_the_site_file_says_where_its_calibration_is_written_and_put_back(
     assert np.shape(second["arrays"]["south"]["covariance"]) == (6, 6)
     assert run("calibrate", "poses", "--site", site, "--undo").code == 0
     assert set(yaml.safe_load(written.read_text())["arrays"]) == {"north"}
-    assert run("calibrate", "refine", "--site", site, "--undo").code == 2
+    again = run("calibrate", "refine", "--site", site, "--undo")
+    assert (again.code, "the file that --write has replaced; there is none" in again.err) == (2, True)
     assert run("calibrate", "refine", "--undo").code == 2
 
 
@@ -177,7 +179,7 @@ def test_a_failed_write_leaves_the_calibration_there(
     assert (written.read_text(), kept.read_text()) == ("arrays: {}\n", "arrays: 1\n")
     written.unlink()
     assert run("calibrate", "poses", *session, "--write", written).code == 0
-    assert not kept.exists(), "a kept file that is not the one before"
+    assert yaml.safe_load(kept.read_text()) == {"arrays": {}}, "a kept file that is not the one before"
 
 
 def test_poses_outside_the_room_are_not_written(run: Run, claps: Recorded, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from known_sounds import COUNT, at, events, finish, places_m
 from livessl.cli import guided
 from livessl.core.types import Event
 from livessl.server.app import Server
+from livessl.site.load import load_site
 from small_site import running_server, site_of, write_site
 
 Clapper = Callable[[Sequence[Event]], list[str]]
@@ -102,7 +103,31 @@ def test_poses_are_measured_until_they_are_good_enough_and_stored(
     assert all(np.linalg.norm(pose["shift_m"]) < 0.06 for pose in poses.values())
     stored = yaml.safe_load((tmp_path / "calibration" / "small.yaml").read_text())
     assert (stored["method"], stored["sounds"], set(stored["arrays"])) == ("poses", asked, {"north", "south"})
-    assert "name it in the site file as calibration: calibration/small.yaml" in done.err
+    assert f"the server at {server.url} has other poses: its file is calibration/small.yaml" in done.err
+
+
+def test_a_running_server_takes_over_what_is_written_and_undone(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = write_site(tmp_path, {"arrays.south.orientation_deg": {"yaw": 25.0}})
+    left = iter(events())
+    with running_server(load_site(site)) as turned:
+
+        def ask_for(text: str) -> None:
+            if text.startswith("clap"):
+                finish(turned, next(left))
+
+        monkeypatch.setattr(guided, "ask_for", ask_for)
+        filed_m = turned.parts.set_up.site.array("south").microphones_m
+        options = ["--site", site, "--url", turned.url]
+        done = run("calibrate", "poses", *options, *at(), "--place-std", "0.005", "--write")
+        assert done.code == 0, done.err
+        assert f"the server at {turned.url} has taken over north, south" in done.err
+        true_m = site_of().array("south").microphones_m
+        assert turned.parts.set_up.site.array("south").microphones_m == pytest.approx(true_m, abs=0.06)
+        undone = run("calibrate", "poses", *options, "--undo")
+        assert (undone.code, f"the server at {turned.url} has taken over north, south" in undone.err) == (0, True)
+        assert np.array_equal(turned.parts.set_up.site.array("south").microphones_m, filed_m)
 
 
 def test_places_are_proposed_where_none_is_given(server: Server, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,11 +112,8 @@ def play_death(recordings: Path, directory: Path, fault: str) -> Death:
     end_s = duration_s(recordings)
     shutil.rmtree(directory, ignore_errors=True)
     played = recordings / "silent" if fault == "all-zero samples" else recordings
-    with Playing(played, directory, lead_s=20.0, nodes=NODES, changes=WEST) as site:
-        site.start_server()
-        site.wait_ready()
-        for node in NODES:
-            site.start_node(node)
+    with Playing(played, directory, nodes=NODES, changes=WEST) as site:
+        site.start()
         with Hearer(site.http) as hearer:
             site.sleep_until(DIES_S)
             shown_s = DEATHS[fault](site, end_s)

@@ -40,6 +40,12 @@ FRAME_S = 0.05
 TAIL_S = 120.0
 """Quiet after the last sound: a node does not end because its server is away, and here it shall not either."""
 
+LEAST_LEAD_S = 8.0
+"""Least time from the start of the nodes to the recordings' first sample, in seconds."""
+
+LEAD = 4.0
+"""That time relative to the one that the server took to start, if that is longer."""
+
 NODES = {"a": "north", "b": "south"}
 
 WEST = {"arrays.west": {"geometry": {"tetrahedron": {"edge_m": 0.3}}, "position_m": [0.7, 2.4, 1.6]}}
@@ -55,6 +61,7 @@ def make_recordings(
     lead_s: float = 2.0,
 ) -> None:
     """A WAV for each array: bursts of noise at random places of the small room, without reverberation."""
+    directory.mkdir(parents=True, exist_ok=True)
     path = directory / "scene.yaml"
     path.write_text(yaml.safe_dump(small(changes)), encoding="utf-8")
     site = load_site(path)
@@ -79,7 +86,7 @@ def make_recordings(
 
 @dataclass
 class Playing:
-    """A site that plays the recordings of a folder, from `start_ns` on; its processes die with the context.
+    """A site that plays the recordings of a folder, from `start_ns` on; its processes end with the context.
 
     Parameters
     ----------
@@ -87,8 +94,6 @@ class Playing:
         Where the recordings are.
     directory : Path
         For site file, database, spools and what the processes say.
-    lead_s : float
-        From now to the recordings' first sample, seconds.
     nodes : dict of str to str
         The nodes, and each one's array.
     changes : dict
@@ -100,7 +105,6 @@ class Playing:
 
     recordings: Path
     directory: Path
-    lead_s: float = 40.0
     seed: int = 0
     nodes: dict[str, str] = field(default_factory=lambda: dict(NODES))
     changes: Changes = field(default_factory=dict)
@@ -137,7 +141,6 @@ class Playing:
         }
         self.site = self.directory / "site.yaml"
         self.site.write_text(yaml.safe_dump(data), encoding="utf-8")
-        self.start_ns = round((time.time() + self.lead_s) / 5) * 5_000_000_000
         return self
 
     def __exit__(
@@ -146,6 +149,16 @@ class Playing:
         for name in list(self.processes):
             self.kill(name)
         self._open.close()
+
+    def start(self) -> None:
+        """Start the server and then the nodes, which take no longer; the busier the machine, the later they play."""
+        began_s = time.monotonic()
+        self.start_server()
+        self.wait_ready(HANG_S)
+        lead_s = max(LEAST_LEAD_S, LEAD * (time.monotonic() - began_s))
+        self.start_ns = math.ceil((time.time() + lead_s) / 5) * 5_000_000_000
+        for name in self.nodes:
+            self.start_node(name)
 
     def start_server(self) -> None:
         """Start it; it may take seconds to answer."""
@@ -284,9 +297,7 @@ def play(
     with ExitStack() as open_cables:
         cables = {name: open_cables.enter_context(Cable(k)) for k, name in enumerate(NODES)} if cabled else {}
         site = open_cables.enter_context(Playing(recordings, directory, seed=seed, cables=cables))
-        site.start_server()
-        for name in NODES:
-            site.start_node(name)
+        site.start()
         disturb(site, random.Random(seed), end_s)
         for proxy in site.proxies.values():
             proxy.weather.cut = False

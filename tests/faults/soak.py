@@ -517,7 +517,7 @@ def soak(
     """Let so many hours pass, and hold the memory against what it was after the first of them."""
     began_s = time.monotonic()
     with (
-        patch("livessl.server.retention.EXPIRE_S", 2.0),
+        patch("livessl.server.event_retention.EXPIRE_S", 2.0),
         Soak(directory, seed, sample_s, tell, absence_first=absence_first) as world,
         Crowd(world.http.url) as crowd,
     ):

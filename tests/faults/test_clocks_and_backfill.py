@@ -70,11 +70,8 @@ def test_a_clock_that_is_off_and_sounds_that_one_array_hears(tmp_path: Path) -> 
     made = scene()
     record(tmp_path, made)
     changes = {"arrays.south.wav_offset_s": AHEAD_S}
-    with Playing(tmp_path, tmp_path / "live", lead_s=15.0, changes=changes) as site:
-        site.start_server()
-        site.wait_ready()
-        for name in NODES:
-            site.start_node(name)
+    with Playing(tmp_path, tmp_path / "live", changes=changes) as site:
+        site.start()
         site.sleep_until(made.duration_s - TAIL_S)
         wait_for(lambda: len(site.events()) >= len(made.sources), "the last event", 60)
         events = site.events()

@@ -120,10 +120,7 @@ def shown_after_s(site: Playing, array: str) -> float:
 
 def test_dead_node_and_cut_cable_show_within_two_seconds(recordings: Path, tmp_path: Path) -> None:
     with Playing(recordings, tmp_path) as site:
-        site.start_server()
-        site.wait_ready()
-        for name in ("a", "b"):
-            site.start_node(name)
+        site.start()
         wait_for(lambda: {array_state(site, a).get("state") for a in ("north", "south")} == {"healthy"}, "arrays", 60)
         cut_s: list[float] = []
         dead_s: list[float] = []

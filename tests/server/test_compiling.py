@@ -1,4 +1,4 @@
-"""At the first start on a machine the server works on NumPy until a process of its own has compiled the kernels."""
+"""A server listens before it loads the kernels, and works on NumPy at the first start until they are compiled."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from livessl.core.geometry import Grid, posed, tetrahedron
 from livessl.core.kernels import kernels, with_numba
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.types import ArraySpec
-from livessl.server.compiling import load_kernels, machine_code_folder
+from livessl.server.compiling import KernelLoader, machine_code_folder
 
 logging.basicConfig(level="INFO", stream=sys.stdout, format="%(message)s")
 folder = machine_code_folder(with_numba)
 folder.mkdir(parents=True, exist_ok=True)
-compiler = load_kernels([sys.executable, "-c", sys.argv[1]])
+loader = KernelLoader([sys.executable, "-c", sys.argv[1]])
+loader.load()
 assert kernels.NAME == "NumPy"
 spec = ArraySpec("a", posed(tetrahedron(0.5), (1.0, 1.0, 1.0)), (100.0, 6000.0))
 PeakSearch([spec], Grid(((0.0, 2.0), (0.0, 2.0), (0.0, 2.0)), 0.5), 343.0).prepare("a", np.arange(-700, 701) / 4e5)
@@ -32,15 +33,15 @@ if len(sys.argv) > 2:  # what the compiler would have made
         shutil.copy2(path, folder)
 if "sleep" not in sys.argv[1]:
     next(thread for thread in threading.enumerate() if thread.name == "compiling").join()
-compiler.stop()
+loader.stop()
 print("kernels of", kernels.NAME, "now")
 """
 
 AGAIN = """
-import logging, shutil, subprocess, sys
+import logging, shutil, subprocess, sys, threading
 from pathlib import Path
 from livessl.core.kernels import kernels, with_numba
-from livessl.server.compiling import COMPILE, load_kernels, machine_code_folder
+from livessl.server.compiling import COMPILE, KernelLoader, machine_code_folder
 
 logging.basicConfig(level="INFO", stream=sys.stdout, format="%(message)s")
 folder = machine_code_folder(with_numba)
@@ -48,7 +49,8 @@ folder.mkdir(parents=True, exist_ok=True)
 for path in Path(sys.argv[1]).glob("*.nb?"):
     shutil.copy2(path, folder)
 subprocess.run(COMPILE, check=True)
-assert load_kernels([sys.executable, "-c", "raise SystemExit('nothing is left to compile')"]) is None
+KernelLoader([sys.executable, "-c", "raise SystemExit('nothing is left to compile')"]).load()
+assert not [thread for thread in threading.enumerate() if thread.name == "compiling"]
 print("kernels of", kernels.NAME, "at once")
 """
 

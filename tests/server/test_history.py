@@ -42,6 +42,9 @@ OLD_TABLES = (
 """The tables of a file of the release before migrations existed."""
 
 
+FOREVER = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n"
+
+
 def event(number: int, **changes: object) -> JsonObject:
     return event_message(id=f"small-{number}", **changes)
 
@@ -253,16 +256,55 @@ def test_database_that_cannot_be_migrated_is_refused_with_the_reason(tmp_path: P
 
 
 def test_search_that_takes_too_long_is_ended(place: Path | str, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_long_search(place, monkeypatch)
+
+
+def test_search_in_memory_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_long_search(None, monkeypatch)
+
+
+def check_long_search(place: Path | str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "STATEMENT_S", 0.5)
     store = Store(place)
-    forever = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n"
     with (
         pytest.raises(StoreError, match=r"a search was ended after 0.5 s; narrow the span"),
         store._database.reading() as connection,
     ):
-        connection.execute(text(forever))
+        connection.execute(text(FOREVER))
     store.add(event(1), 0)
     assert store.get("small-1") == event(1)
+    store.close()
+
+
+def test_search_in_memory_limits_no_write_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both have the same connection there, and a write is no search."""
+    monkeypatch.setattr(database, "STATEMENT_S", 0.0)
+    store = Store(None)
+    with pytest.raises(StoreError, match="a search was ended"), store._database.reading() as connection:
+        connection.execute(
+            text("WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n")
+        )
+    many = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 50000) SELECT count(*) FROM n"
+    with store._database.writing("count") as connection:
+        assert connection.execute(text(many)).scalar() == 50_000
+    store.close()
+
+
+def test_events_of_before_the_journal_are_found_by_their_exclusion(place: Path | str) -> None:
+    """The database is of the revision before: no journal, and no tags of excluded events."""
+    store = Store(place)
+    store.add_all([(event(number) | {"excluded": number == 2}, number) for number in range(4)])
+    with store._database.writing("go back") as connection:
+        for sql in (
+            "DELETE FROM event_tags WHERE kind = 'flag'",
+            "DROP TABLE journal",
+            "UPDATE alembic_version SET version_num = '0002'",
+        ):
+            connection.execute(text(sql))
+    store.close()
+    store = Store(place)
+    found = [[each["id"] for each in store.find(Query(excluded=flag))[0]] for flag in (True, False)]
+    assert found == [["small-2"], ["small-3", "small-1", "small-0"]]
     store.close()
 
 

@@ -40,6 +40,7 @@ def random_event(rng: random.Random, number: int) -> JsonObject:
         arrays=[name for name in heard_by if rng.random() < 0.5],
         heard_by=heard_by,
         reason=rng.choice([None, "Größe, unklar", 'a "loud"\nsound']),
+        excluded=rng.random() < 0.4,
     )
 
 
@@ -78,6 +79,7 @@ def random_query(rng: random.Random) -> Query:
         status=maybe(rng.choice(STATUSES)),
         min_level_dbfs=maybe(rng.choice([-60.0, -40.0])),
         array=maybe(rng.choice(ARRAYS)),
+        excluded=maybe(rng.random() < 0.5),
         text=maybe(rng.choice(["GRÖßE", "small-1", "%", "_sure", "loud", "onset", "nowhere", "\\"])),
     )
 
@@ -94,6 +96,7 @@ def admits(query: Query, event: JsonObject, time_ns: int) -> bool:
         and (query.status is None or event["status"] == query.status)
         and (query.min_level_dbfs is None or (level is not None and level >= query.min_level_dbfs))
         and (query.array is None or query.array in event["arrays"] + event["heard_by"])
+        and (query.excluded is None or query.excluded == event["excluded"])
         and (query.text is None or any(query.text.lower() in word.lower() for word in words if word))
     )
 

@@ -23,7 +23,7 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
-from livessl.errors import UseError
+from livessl.errors import ConfigError, UseError
 
 if TYPE_CHECKING:
     from livessl.calibration import Clap, HeardSound
@@ -50,8 +50,8 @@ def add_arguments(parser: Any) -> None:
         sub = actions.add_parser(
             name,
             help=text,
-            description=f"{text[0].upper()}{text[1:]}. With a running server, the command prompts for each clap: give "
-            "its site file by --site, or its address by --url. With a recording of the claps, give --session or --wav.",
+            description=f"{text[0].upper()}{text[1:]}. To use a running server, give its site file (--site) or its "
+            "address (--url); the command then prompts for each clap. To use recordings, give --session or --wav.",
             epilog=f"example: livessl calibrate {example}",
         )
         sub.set_defaults(act=act)
@@ -69,7 +69,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "verify",
         _verify,
-        "print the error at places that you know, and what explains it",
+        "print the error of claps at places that you know, and its likely cause",
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
@@ -80,7 +80,9 @@ def add_arguments(parser: Any) -> None:
         "measure where the arrays are, by claps at places that you know",
         "poses --site site.yaml --at 2,3,1.2 --at 6,8,1.2 … --write",
     )
-    _add_places(sub, "place of a clap in metres; repeat for each. Without it, places are proposed if a server runs")
+    _add_places(
+        sub, "place of a clap in metres; repeat for each. With a running server, omit --at and places are proposed"
+    )
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -93,7 +95,7 @@ def add_arguments(parser: Any) -> None:
     sub = action(
         "refine",
         _refine,
-        "measure where the arrays are from sounds at unknown places; one array's pose must be right",
+        "use sounds at unknown places to measure the arrays' poses; one array's pose must be right",
         "refine --site site.yaml --known north --write",
     )
     sub.add_argument(
@@ -131,10 +133,22 @@ def run(arguments: argparse.Namespace) -> int:
     from livessl.calibration import MOST_CLAPS
 
     if getattr(arguments, "undo", False):
-        return calibration_file.undo(arguments)
+        path = calibration_file.undo(arguments)
+        calibration_file.tell_server(arguments, _server_of_file(arguments), path)
+        return OK
     if len(getattr(arguments, "at", [])) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
     return int(arguments.act(arguments))
+
+
+def _server_of_file(arguments: argparse.Namespace) -> str | None:
+    """Return the address of the server; None if neither it nor a valid site file is given."""
+    if arguments.site is None:
+        return None if arguments.url is None else str(arguments.url)
+    try:
+        return _address(arguments, read_site(arguments))
+    except ConfigError:
+        return None  # no server runs with a site file that cannot be loaded
 
 
 def _is_live(arguments: argparse.Namespace) -> bool:
@@ -158,12 +172,9 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
         return sounds.site(), sounds
     site = read_site(arguments)
     print_warnings(site)
-    http = site.server.http
-    host = "127.0.0.1" if http.host in ("0.0.0.0", "::") else http.host  # noqa: S104 - where the server listens
-    if arguments.url is None and http.port == 0:
+    url = _address(arguments, site)
+    if url is None:
         raise UseError("calibrate: the site file leaves the server's port open; give its address as --url")
-    scheme = "http" if http.certificate is None else "https"
-    url = arguments.url or f"{scheme}://{f'[{host}]' if ':' in host else host}:{http.port}"
     sounds = ServerSounds(url, arguments.token_file, arguments.wait)
     mine, served = ({spec.name: len(spec.microphones_m) for spec in one.processed} for one in (site, sounds.site()))
     if mine != served:
@@ -172,6 +183,18 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
             f"{_counted(mine)}; give that file, or --url alone"
         )
     return site, sounds
+
+
+def _address(arguments: argparse.Namespace, site: Site) -> str | None:
+    """Return the address of the site's server, as it is given or by the site file; None if the port is left open."""
+    if arguments.url is not None:
+        return str(arguments.url)
+    http = site.server.http
+    if arguments.site is None or http.port == 0:
+        return None
+    host = "127.0.0.1" if http.host in ("0.0.0.0", "::") else http.host  # noqa: S104 - where the server listens
+    scheme = "http" if http.certificate is None else "https"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{http.port}"
 
 
 def _counted(arrays: dict[str, int]) -> str:
@@ -247,9 +270,9 @@ def _poses(arguments: argparse.Namespace) -> int:
     def cure() -> str:
         import numpy as np
 
-        from livessl.cli.guided import next_place
+        from livessl.site.build.set_up import next_clap_place
 
-        place_m = next_place(site, np.array([clap.place_m for clap in claps]), arguments.place_std)
+        place_m = next_clap_place(site, np.array([clap.place_m for clap in claps]), arguments.place_std)
         where = "" if place_m is None else f", next at {', '.join(f'{x:.1f}' for x in place_m)}"
         return f"clap at more places, on all its sides, near and far, high and low{where}"
 
@@ -307,5 +330,6 @@ def _told(
             f"degrees; {cure()}"
         )
     if arguments.write is not None and not doubtful:
-        calibration_file.write(arguments, site, action, measured)
+        path = calibration_file.write(arguments, site, action, measured)
+        calibration_file.tell_server(arguments, _address(arguments, site), path)
     return FAILED if doubtful else OK

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from livessl.cli.exits import OK
 from livessl.cli.output import complain
-from livessl.clock import SystemClock, utc_text
-from livessl.errors import RunError, UseError
+from livessl.cli.server_answers import order
+from livessl.clock import SystemClock
+from livessl.errors import ConfigError, RunError, UseError
+from livessl.site.calibration_file import (
+    calibration_path,
+    default_name,
+    extended,
+    kept_path,
+    read_calibration,
+    undo_calibration,
+    write_calibration,
+)
+from livessl.site.models import CalibratedArray, CalibrationFile, Site
 
 if TYPE_CHECKING:
-    from livessl.core.commission.resection import MeasuredPose, MeasuredSetUp
-    from livessl.site.models import Site
-
-FOLDER: Final = "calibration"
-"""Folder of calibration files, beside the site file."""
+    from livessl.core.commission.resection import MeasuredSetUp
 
 BESIDE_THE_SITE: Final = Path()
-"""Value of --write without a file: the file that the site file names, or else `FOLDER/SITE.yaml`."""
+"""Value of --write without a file: the file that the site file names, or else calibration/SITE.yaml."""
+
+TAKE_OVER_S: Final = 60.0
+"""Longest wait, in seconds, for a server that takes over a calibration: it computes its tables anew."""
 
 
 def add_file(parser: Any) -> None:
@@ -32,14 +40,14 @@ def add_file(parser: Any) -> None:
         nargs="?",
         const=BESIDE_THE_SITE,
         metavar="FILE",
-        help="store the result; without FILE in the calibration file that the site file names, or else in "
-        "calibration/SITE.yaml beside it",
+        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
+        "calibration/SITE.yaml beside the site file)",
     )
     parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
 
 
-def write(arguments: argparse.Namespace, site: Site, action: str, measured: MeasuredSetUp) -> None:
-    """Write a calibration file, and keep the one that it replaces.
+def write(arguments: argparse.Namespace, site: Site, action: str, measured: MeasuredSetUp) -> Path:
+    """Write a calibration file, and keep the one that it replaces; return where it is.
 
     Raises
     ------
@@ -48,32 +56,27 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
     UseError
         If it cannot be written.
     """
-    import yaml
+    from livessl.site.build.calibrated import measured_arrays
 
     path = _path(arguments, site)
-    arrays = {name: array for joint, pose in measured.poses.items() for name, array in _arrays(site, joint, pose)}
+    arrays = measured_arrays(site, measured)
     _check_room(site, arrays)
-    content = {
-        "measured_utc": utc_text(SystemClock().now_ns()),
-        "method": action,
-        "sounds": measured.sounds,
-        "speed_of_sound_m_s": round(measured.c_m_s, 1),
-        "arrays": _others(path, arrays) | arrays,
-    }
+    now_ns = SystemClock().now_ns()
+    calibration = extended(_before(path), arrays, action, now_ns, measured.sounds, measured.c_m_s)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _replace(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None).encode())
+        write_calibration(path, calibration)
     except OSError as error:
         raise UseError(f"--write: cannot write {path}: {error.strerror}") from error
-    named = site.calibration is not None and site.file(site.calibration).resolve() == path.resolve()
-    hint = "" if named else f"; name it in the site file as calibration: {_relative(path, arguments)}"
+    found = path.resolve() == calibration_path(site).resolve()
+    hint = "" if found else f"; name it in the site file as calibration: {_relative(path, arguments)}"
     complain(f"written to {path}{hint}", kind="note")
+    return path
 
 
-def _check_room(site: Site, arrays: dict[str, dict[str, Any]]) -> None:
+def _check_room(site: Site, arrays: Mapping[str, CalibratedArray]) -> None:
     """Raise `RunError` if a microphone would be outside the room."""
     for name, array in arrays.items():
-        for number, at_m in enumerate(array["microphones_m"], 1):
+        for number, at_m in enumerate(array.microphones_m, 1):
             if not all(0.0 <= x <= size for x, size in zip(at_m, site.room.size_m, strict=True)):
                 size_m, where_m = ([f"{x:g}" for x in xyz] for xyz in (site.room.size_m, at_m))
                 raise RunError(
@@ -83,46 +86,43 @@ def _check_room(site: Site, arrays: dict[str, dict[str, Any]]) -> None:
                 )
 
 
-def _replace(path: Path, content: bytes) -> None:
-    """Write a file and keep the one before; at each moment either the whole old file or the whole new one is there."""
-    new, kept = _written(path, content), _kept(path)
-    if path.exists():
-        _written(kept, path.read_bytes()).replace(kept)
-    else:
-        kept.unlink(missing_ok=True)
-    new.replace(path)
+def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> None:
+    """Have the running server take over a calibration file that has changed, and tell the user whether it has.
+
+    Parameters
+    ----------
+    arguments : Namespace
+    url : str or None
+        Address of the server; None if it is not known.
+    path : Path
+        The file.
+    """
+    later = "it takes effect when the server starts, or by Set-up on its dashboard"
+    if url is None:
+        complain(f"no address of a running server is known; {later}", kind="note")
+        return
+    try:
+        answer = order(url, "set-up/reload", arguments.token_file, {}, TAKE_OVER_S)
+    except RunError as error:
+        complain(f"{error}; {later}", kind="note")
+        return
+    written = {name: array.microphones_m for name, array in read_calibration(path).arrays.items()}
+    elsewhere = [
+        name for name, array in answer["arrays"].items() if name in written and not _same(array, written[name])
+    ]
+    if elsewhere:
+        file = answer["calibration"]["file"]
+        complain(f"the server at {url} has other poses: its file is {file} beside its own site file; copy it there")
+    elif answer["changed"]:
+        complain(f"the server at {url} has taken over {', '.join(answer['changed'])}", kind="note")
 
 
-def _written(path: Path, content: bytes) -> Path:
-    """Write what shall replace a file to the disk, beside it; return where."""
-    new = path.with_name(path.name + ".new")
-    with new.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    return new
+def _same(array: dict[str, Any], microphones_m: Sequence[Sequence[float]]) -> bool:
+    return bool([list(at_m) for at_m in microphones_m] == array["microphones_m"])
 
 
-def _arrays(site: Site, name: str, pose: MeasuredPose) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield what is stored of a measured array; of a joint array, each of its members."""
-    first = 0
-    for member in site.members(name):
-        count = len(site.array(member).microphones_m)
-        yield (
-            member,
-            {
-                "microphones_m": pose.microphones_m[first : first + count].round(4).tolist(),
-                "position_std_m": round(pose.position_std_m, 4),
-                "orientation_std_deg": round(pose.orientation_std_deg, 2),
-                "misfit_us": [round(1e6 * pose.misfit_before_s, 1), round(1e6 * pose.misfit_s, 1)],
-                "covariance": [[float(f"{value:.3g}") for value in row] for row in pose.covariance.tolist()],
-            },
-        )
-        first += count
-
-
-def undo(arguments: argparse.Namespace) -> int:
-    """Put back the file before the last `write`; return the exit code.
+def undo(arguments: argparse.Namespace) -> Path:
+    """Put back the file before the last `write`; return where it is.
 
     Raises
     ------
@@ -133,17 +133,17 @@ def undo(arguments: argparse.Namespace) -> int:
         raise UseError("--undo: expected --site FILE, or --write FILE, the calibration file to put back")
     given: Path | None = arguments.write
     path = given if given is not None and given != BESIDE_THE_SITE else _named(arguments.site)
-    if not _kept(path).exists():
-        raise UseError(
-            f"--undo: expected {_kept(path)}, the file that --write has replaced; there is none. To do without "
-            "calibration, remove calibration: from the site file"
-        )
     try:
-        _kept(path).replace(path)
+        undo_calibration(path)
+    except FileNotFoundError as error:
+        raise UseError(
+            f"--undo: expected {kept_path(path)}, the file that --write has replaced; there is none. To do without "
+            f"calibration, delete {path} and remove calibration: from the site file"
+        ) from error
     except OSError as error:
         raise UseError(f"--undo: cannot replace {path}: {error.strerror}") from error
     complain(f"{path} is as it was before", kind="note")
-    return OK
+    return path
 
 
 def _named(site_file: Path) -> Path:
@@ -162,7 +162,7 @@ def _named(site_file: Path) -> Path:
     if isinstance(calibration, str):
         return site_file.parent / calibration
     if isinstance(site, str):
-        return site_file.parent / FOLDER / f"{site}.yaml"
+        return site_file.parent / default_name(site)
     raise UseError(f"--undo: expected site or calibration in {site_file}; give the calibration file as --write FILE")
 
 
@@ -172,20 +172,15 @@ def _path(arguments: argparse.Namespace, site: Site | None) -> Path:
         return given
     if site is None or arguments.site is None:
         raise UseError("--write: expected --site FILE to store the calibration beside, or --write FILE")
-    if site.calibration is not None:
-        return site.file(site.calibration)
-    return Path(arguments.site).parent / FOLDER / f"{site.site}.yaml"
+    return Path(arguments.site).parent / (site.calibration or default_name(site.site))
 
 
-def _others(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return the arrays of the file that is replaced which were not measured now: they stay as they are."""
-    import yaml
-
+def _before(path: Path) -> CalibrationFile:
+    """Return the calibration that is replaced: its arrays that were not measured now stay as they are."""
     try:
-        known = yaml.safe_load(path.read_text(encoding="utf-8"))["arrays"]
-        return {name: array for name, array in known.items() if name not in arrays}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
-        return {}  # there is no such file, or it is none
+        return read_calibration(path)
+    except ConfigError:
+        return CalibrationFile(arrays={})  # it is no calibration
 
 
 def _relative(path: Path, arguments: argparse.Namespace) -> str:
@@ -195,7 +190,3 @@ def _relative(path: Path, arguments: argparse.Namespace) -> str:
         return path.resolve().relative_to(Path(arguments.site).resolve().parent).as_posix()
     except ValueError:
         return str(path)
-
-
-def _kept(path: Path) -> Path:
-    return path.with_suffix(path.suffix + ".before")

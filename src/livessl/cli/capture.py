@@ -9,6 +9,8 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
+from livessl.garbage import collect_as_usual
+from livessl.traces import traced
 
 
 def add_arguments(parser: Any) -> None:
@@ -22,8 +24,8 @@ def add_arguments(parser: Any) -> None:
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="time stamp of the files' first sample, RFC 3339 (default: now; with several nodes the next multiple of "
-        "5 s, so that they agree)",
+        help="time stamp of the files' first sample, RFC 3339 (default: now, or the next multiple of 5 s if the "
+        "site has several nodes, so that all start together)",
     )
 
 
@@ -39,11 +41,13 @@ def run(arguments: argparse.Namespace) -> int:
     clock = SystemClock()
     name = run_id(arguments.node, clock)
     device = audio_device(arguments, config, clock)
+    collect_as_usual()
     if device is not None:
-        with stop_on_signal() as stop:
+        with stop_on_signal() as stop, traced("livessl-node", arguments.node):
             capture_device(site, arguments.node, device, clock, name, stop.is_set)
         return OK
     parts = recordings(arguments, site, clock.now_ns())
-    with stop_on_signal() as stop, progress.timed("playing", *span_ns(parts)) as bar:
+    traces = traced("livessl-node", arguments.node)
+    with stop_on_signal() as stop, traces, progress.timed("playing", *span_ns(parts)) as bar:
         capture_recordings(site, arguments.node, parts, clock, name, stop.is_set, bar)
     return OK

@@ -23,7 +23,7 @@ def add_arguments(parser: Any) -> None:
     )
     sub.add_argument("site", type=Path, help="site file")
     sub.add_argument("--given", action="store_true", help="only what the file gives, without defaults")
-    add_json(sub, "print one JSON object a setting")
+    add_json(sub, "print one JSON object per setting")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -19,8 +19,13 @@ from livessl.cli.output import xyz
 from livessl.clock import SystemClock
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractContextManager
+
+    from livessl.clock import Clock
     from livessl.lab import demo
     from livessl.server.api.encode import JsonObject
+    from livessl.simulation.scene import Scene
 
 WITHIN_M: Final = 0.5
 """Largest error, in metres, of a sound that counts as located; the paper uses the same limit."""
@@ -34,6 +39,12 @@ def add_arguments(parser: Any) -> None:
     add_json(parser)
     parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default 8000)")
     parser.add_argument("--events", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
+    parser.add_argument(
+        "--sound-card",
+        action="store_true",
+        help="play the scene on a virtual audio interface, from which a node records by ALSA and PortAudio as from a "
+        "real one (Linux; needs gcc, libasound2-dev and libportaudio2)",
+    )
     parser.add_argument("--no-browser", action="store_true", help="do not open the dashboard in a browser")
 
 
@@ -57,9 +68,9 @@ def _show(arguments: argparse.Namespace) -> int:
         progress.counted("simulating the room", "source") as bar,
     ):
         directory = Path(name)
-        site, scene = demo.prepare(directory, arguments.port, arguments.events, bar)
+        scene, start = _prepared(arguments, directory, clock, bar)
         truth = demo.read_truth(directory)
-        with demo.running(directory, site, loop=not arguments.once, clock=clock) as running:
+        with start() as running:
             print(f"dashboard: {running.url}", file=sys.stderr)
             if not arguments.once and not arguments.no_browser:
                 threading.Thread(target=webbrowser.open, args=(running.url,), daemon=True).start()
@@ -75,6 +86,8 @@ def _show(arguments: argparse.Namespace) -> int:
                 return silent_ns > 0 and (all(map(_is_good, outcomes())) or silent_ns > demo.LAST_NS)
 
             for event in demo.events_of(running.url, is_over):
+                if not demo.is_of_scene(event, running.start_ns):
+                    continue
                 for replaced in event["replaces"]:
                     events.pop(replaced, None)
                 events[event["id"]] = event
@@ -88,6 +101,22 @@ def _show(arguments: argparse.Namespace) -> int:
     summary = f"{good} of {len(truth)} sounds located within {WITHIN_M:g} m; {surplus} events without a sound"
     print(summary, file=sys.stderr)
     return OK if good == len(truth) else FAILED
+
+
+def _prepared(
+    arguments: argparse.Namespace, directory: Path, clock: Clock, bar: Callable[[int, int], None]
+) -> tuple[Scene, Callable[[], AbstractContextManager[demo.Running]]]:
+    """Return the scene, and what starts the processes that play it."""
+    from livessl.lab import demo
+
+    port, events, loop = arguments.port, arguments.events, not arguments.once
+    if not arguments.sound_card:
+        site, scene = demo.prepare(directory, port, events, bar)
+        return scene, lambda: demo.running(directory, site, loop=loop, clock=clock)
+    from livessl.lab import demo_card
+
+    site, scene, interfaces = demo_card.prepare(directory, port, events, bar)
+    return scene, lambda: demo_card.running(directory, site, scene, interfaces, loop=loop, clock=clock)
 
 
 def _is_good(outcome: demo.Outcome) -> bool:

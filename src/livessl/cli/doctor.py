@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_recordings(parser)
-    add_server(parser, "it examines its last sounds")
+    add_server(parser, "its most recent sounds are examined")
     add_json(parser, "print one JSON object per finding")
 
 
@@ -35,7 +35,7 @@ def add_recordings(parser: Any) -> None:
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
-    add_wav(parser, "recording of an array instead, WAV or FLAC; repeat for each array")
+    add_wav(parser, "recording of an array, in place of --session, WAV or FLAC; repeat for each array")
     add_joint(parser)
 
 

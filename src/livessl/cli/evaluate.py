@@ -35,8 +35,8 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"experiment of the paper; or {LOCALIZER}: compare the methods onset and srp-phat; or {REPORT}: simulate "
-        "nothing, and report the folders of --with together",
+        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} only reports on "
+        "the folders of --with",
     )
     add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
     add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
@@ -77,12 +77,12 @@ def _add_localization(group: Any) -> None:
     add = group.add_argument
     add("--grid", type=float, metavar="M", help="spacing of the search grid (default: the paper's)")
     add("--segment", choices=("longest", "peak"), default="longest", help="segment to localize (default longest)")
-    add("--no-band-limit", action="store_true", help="do not limit the band to avoid spatial aliasing")
+    add("--no-band-limit", action="store_true", help="use the full band, even where it causes spatial aliasing")
 
 
 def _add_comparison(group: Any) -> None:
     add = group.add_argument
-    add("--half", choices=HALVES, default="test", help="half of the sounds to play (default test)")
+    add("--half", choices=HALVES, default="test", help="which half of the sounds to play (default test)")
     add(
         "--scenario",
         default=ROOMS,

@@ -11,11 +11,11 @@ import numpy as np
 from livessl.calibration import Clap, HeardSound, measured_poses
 from livessl.cli.calibration_words import progress_line
 from livessl.core.commission.findings import LEAST_SHARPNESS
-from livessl.core.commission.next_place import AIM_DEG, AIM_M, proposed_place
+from livessl.core.commission.next_place import AIM_DEG, AIM_M
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp
-from livessl.core.types import FloatArray, Observation
+from livessl.core.types import Observation
 from livessl.errors import RunError
-from livessl.site.build.grid import search_grid
+from livessl.site.build.set_up import next_clap_place
 
 if TYPE_CHECKING:
     from livessl.cli.server_sounds import ServerSounds
@@ -109,12 +109,6 @@ def is_good(site: Site, measured: MeasuredSetUp) -> bool:
     )
 
 
-def next_place(site: Site, places_m: FloatArray, place_std_m: float) -> FloatArray | None:
-    """Return the place at which another clap would improve the poses most, metres; None if no place is free."""
-    microphones = {spec.name: spec.microphones_m for spec in site.processed}
-    return proposed_place(microphones, places_m, np.array(search_grid(site).bounds_m), site.c_m_s, place_std_m)
-
-
 def _places(
     site: Site, places_m: Sequence[Sequence[float]], place_std_m: float, claps: Sequence[Clap]
 ) -> Iterator[tuple[Sequence[float], str]]:
@@ -122,7 +116,7 @@ def _places(
         yield place_m, f"{number} of {len(places_m)}"
     while not places_m and len(claps) < MOST_GUIDED:
         so_far_m = np.array([clap.place_m for clap in claps]).reshape(-1, 3)
-        proposed_m = next_place(site, so_far_m, place_std_m)
+        proposed_m = next_clap_place(site, so_far_m, place_std_m)
         if proposed_m is None:
             return
         yield proposed_m.tolist(), f"{len(claps) + 1}, proposed; to another place, give --at X,Y,Z for each"

@@ -12,7 +12,9 @@ from livessl.site.draft_parts import SIZE_M
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("site", type=Path, nargs="?", default=Path("site.yaml"), help="file to write (site.yaml)")
+    parser.add_argument(
+        "site", type=Path, nargs="?", default=Path("site.yaml"), help="file to write (default site.yaml)"
+    )
     parser.add_argument("--name", type=draft_arguments.name, help="name of the site (default lab)")
     parser.add_argument("--room", type=draft_arguments.room, metavar="X,Y,Z", help="length, width and height, metres")
     parser.add_argument(
@@ -21,8 +23,8 @@ def add_arguments(parser: Any) -> None:
         type=draft_arguments.array,
         default=[],
         metavar="NAME=KIND[:SIZE[xCOUNT]][@X,Y,Z[@YAW]]",
-        help=f"an array: {', '.join(SIZE_M)}, with edge, spacing or radius in metres, centre, and yaw in degrees; "
-        "repeat it for more",
+        help=f"array to add. KIND: {', '.join(SIZE_M)}; SIZE: edge, spacing or radius in metres; X,Y,Z: centre; YAW in "
+        "degrees; repeatable",
     )
     parser.add_argument("--arrays", type=argument.positive, metavar="N", help="number of arrays (default 2)")
     parser.add_argument(
@@ -30,7 +32,7 @@ def add_arguments(parser: Any) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="audio interface, by a part of its name; repeat it for more, each with a node of its own",
+        help="audio interface, given by a part of its name; repeatable, and each gets its own node",
     )
     parser.add_argument("--rate", type=argument.above_zero, metavar="HZ", help="sampling rate (default: by interface)")
     parser.add_argument(

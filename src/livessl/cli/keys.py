@@ -35,14 +35,19 @@ def add_arguments(parser: Any) -> None:
     sub = action("server", _server, "make the server's key pair", "server --site site.yaml")
     add_json(sub, ONE_OBJECT)
     sub = action(
-        "node", _node, "make a node's key pair; run it on the node", "node lab-pc --site site.yaml --server 4f8a…"
+        "node",
+        _node,
+        "make a node's key pair (run this command on the node)",
+        "node lab-pc --site site.yaml --server 4f8a…",
     )
     sub.add_argument("name", help="name of the node in the site file; use `replay` for the key of `livessl replay`")
     sub.add_argument(
         "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` printed it"
     )
     add_json(sub, ONE_OBJECT)
-    sub = action("enrol", _enrol, "admit a node; run it on the server", "enrol lab-pc 9c01… --site site.yaml")
+    sub = action(
+        "enrol", _enrol, "admit a node (run this command on the server)", "enrol lab-pc 9c01… --site site.yaml"
+    )
     sub.add_argument("name", help="name of the node in the site file")
     sub.add_argument("key", type=argument.key, help="the node's public key, as `keys node` printed it")
     sub = action(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--device", metavar="NAME", help="name, or part of it, as `livessl devices` prints it")
-    parser.add_argument("--site", type=Path, help="site file, with --node: its device, arrays and microphones")
+    parser.add_argument("--site", type=Path, help="site file; --node chooses whose device to meter")
     parser.add_argument("--node", help="name of the node in the site file")
     parser.add_argument("--wav", type=Path, metavar="FILE", help="meter a WAV or FLAC file instead of a device")
     parser.add_argument(
@@ -32,7 +32,10 @@ def add_arguments(parser: Any) -> None:
         "--listen", type=argument.positive, metavar="CH", help="write input CH to a WAV file, to listen to it"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="new WAV file of --listen (default: input-CH.wav in this folder)"
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="new WAV file that --listen writes (default: input-CH.wav in this folder)",
     )
     add_json(parser, "print one JSON object per input and second, per tap and per problem")
 

@@ -17,7 +17,7 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     add_wav(
         parser,
-        "recording of an array, WAV or FLAC; repeat for each array; all files must begin at the same moment, or set "
+        "recording of an array, WAV or FLAC; repeat for each array. If the files do not begin at the same moment, set "
         "wav_offset_s in the site file",
         required=True,
     )

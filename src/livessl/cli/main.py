@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -11,11 +10,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
-from livessl import __version__
+from livessl import __version__, garbage
 from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctrl_c
 from livessl.cli.output import complain
 from livessl.cli.standard_streams import open_standard_streams
 from livessl.errors import RunError, UseError
+from livessl.log_format import VARIABLE, LogForm, log_form, set_up_logging
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,8 @@ class Command:
     Parameters
     ----------
     name : str
-        Name of the command and of its module in `livessl.cli`, which has `add_arguments(parser)` and `run(arguments)`.
+        Name of the command and, with underscores, of its module in `livessl.cli`, which has `add_arguments(parser)` and
+        `run(arguments)`.
     text : str
         One line of help.
     example : str
@@ -40,6 +41,7 @@ class Command:
 COMMANDS: Final = (
     Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
+    Command("events", "follow the events of a running server", "livessl events --zone door --json"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
         "locate",
@@ -60,7 +62,7 @@ COMMANDS: Final = (
     ),
     Command(
         "bench",
-        "measure how fast this machine locates, or the load that a server on it carries",
+        "measure how fast this machine locates, or how much load its server can carry",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
@@ -70,13 +72,18 @@ COMMANDS: Final = (
     ),
     Command(
         "doctor",
-        "find what is wrong with a set-up, from recordings of some sounds",
+        "find what is wrong with a set-up, from recordings or a running server's sounds",
         "livessl doctor --session session/",
     ),
     Command(
         "calibrate",
         "verify a set-up, and measure poses, by claps at places that you know",
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
+    ),
+    Command(
+        "support-bundle",
+        "collect what helps others to find a fault, without secrets",
+        "livessl support-bundle --site site.yaml",
     ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("init", "write a first site file", "livessl init --room 8,10,4 --arrays 2 --interface UMC1820"),
@@ -99,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2 means wrong use or an invalid configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by
     itself.
     """
+    garbage.collect_seldom()
     # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
     open_standard_streams()
@@ -106,10 +114,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = _parser(given).parse_args(given)
     from threadpoolctl import threadpool_limits
 
-    logging.basicConfig(
-        level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
-    )
     try:
+        if parsed.log is not None:
+            os.environ[VARIABLE] = parsed.log  # for the processes that this one starts
+        set_up_logging(parsed.command, log_form(), verbose=parsed.verbose)
         with sigterm_as_ctrl_c(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except UseError as error:
@@ -133,8 +141,12 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
+    parser.add_argument(
+        "--log", type=LogForm, choices=list(LogForm), help="form of the log lines (default: LIVESSL_LOG, or text)"
+    )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    chosen = next((word for word in given if not word.startswith("-")), None)
+    names = {command.name for command in COMMANDS}
+    chosen = next((word for word in given if word in names), None)
     for command in COMMANDS:
         sub = commands.add_parser(
             command.name,
@@ -143,7 +155,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
             epilog=f"example: {command.example}",
         )
         if command.name == chosen:
-            module = import_module(f"livessl.cli.{command.name}")
-            sub.set_defaults(run=module.run)
+            module = import_module(f"livessl.cli.{command.name.replace('-', '_')}")
+            sub.set_defaults(run=module.run, command=command.name)
             module.add_arguments(sub)
     return parser

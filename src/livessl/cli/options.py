@@ -56,7 +56,7 @@ def add_joint(parser: Any) -> None:
         type=argument.joint,
         default=[],
         metavar="NAME=ARRAY,ARRAY,…",
-        help="join arrays of one node into one array called NAME; joins of the site file stay in force",
+        help="join arrays of one node into one array called NAME, in addition to those that the site file joins",
     )
 
 
@@ -68,7 +68,7 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.assignment,
         default=[],
         metavar="ARRAY=FILE[,FILE…]",
-        help=f"{text}; several files are its channels, one after the other",
+        help=f"{text}; with several files, each is one channel of the array, in order",
         required=required,
     )
     parser.add_argument(
@@ -77,7 +77,7 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="channels of that array's files, counted from 1, in the site file's microphone order",
+        help="which channels of its files belong to ARRAY, counted from 1, in the site file's microphone order",
     )
 
 

@@ -28,7 +28,7 @@ def add_arguments(parser: Any) -> None:
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5, or the middle of a lower search volume)",
+        help="height of the sounds, metres (default 1.5, or the middle of the search volume if that ends below 1.5 m)",
     )
     parser.add_argument(
         "--calibration",
@@ -38,7 +38,7 @@ def add_arguments(parser: Any) -> None:
         help=f"standard deviation of the microphone positions, metres (default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png to DIR")
 
 
 def run(arguments: argparse.Namespace) -> int:

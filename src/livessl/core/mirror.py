@@ -1,7 +1,8 @@
 """Places that look alike to arrays, known from the geometry of the microphones alone: mirror images.
 
 Microphones in one plane receive the same from a place and from its mirror image behind the plane; microphones on one
-line receive the same from every place on a circle around it.
+line receive the same from every place on a circle around it. `core.locate.ambiguity` weighs these places by what was
+received.
 """
 
 from __future__ import annotations

@@ -83,16 +83,21 @@ class Running:
     nodes : sequence of Popen
         The capture nodes.
     clock : Clock
+    end_ns : int or None
+        Site time at which the nodes are to end, nanoseconds; None if they end by themselves, or never.
     """
 
     url: str
     start_ns: int
     nodes: Sequence[subprocess.Popen[bytes]]
     clock: Clock
+    end_ns: int | None = None
     _ended_ns: int | None = field(default=None, init=False)
 
     def silent_ns(self) -> int:
         """Return how long ago all nodes had ended, in nanoseconds; 0 while one plays."""
+        if self.end_ns is not None and self.clock.now_ns() > self.end_ns and self._ended_ns is None:
+            processes.end(self.nodes)
         if any(node.poll() is None for node in self.nodes):
             return 0
         if self._ended_ns is None:
@@ -100,7 +105,9 @@ class Running:
         return self.clock.monotonic_ns() - self._ended_ns
 
 
-def prepare(directory: Path, http_port: int, events: int, progress: Callable[[int, int], None]) -> tuple[Site, Scene]:
+def prepare(
+    directory: Path, http_port: int, events: int, progress: Callable[[int, int], None], rate_hz: float = RATE_HZ
+) -> tuple[Site, Scene]:
     """Simulate the demo's scene into a folder, with a site file on free ports."""
     _need_free("127.0.0.1", http_port)
     data = yaml.safe_load(SITE_FILE.read_text(encoding="utf-8"))
@@ -112,7 +119,7 @@ def prepare(directory: Path, http_port: int, events: int, progress: Callable[[in
         node["device"] = {"type": "wav", "files": {array: f"{array}.wav"}}
     site = parse_site(yaml.safe_dump(data), str(SITE_FILE))
     rt60_s = load_site(SITE_FILE).nodes["north-pc"].device.rt60_s  # type: ignore[union-attr]
-    scene = scene_of(site, rt60_s=rt60_s, count=events, sample_rate_hz=RATE_HZ, seed=SEED)
+    scene = scene_of(site, rt60_s=rt60_s, count=events, sample_rate_hz=rate_hz, seed=SEED)
     write_scene(directory, site, scene, seed=SEED, progress=progress)
     (directory / "site.yaml").write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
     return site, scene
@@ -160,6 +167,11 @@ def events_of(url: str, is_over: Callable[[], bool]) -> Iterator[JsonObject]:
                 raise DemoError("the server ended") from error
             if message["kind"] == "event":
                 yield message
+
+
+def is_of_scene(event: JsonObject, start_ns: int) -> bool:
+    """Return whether an event began after the scene had, at a site time in nanoseconds."""
+    return utc_ns(event["time_utc"]) >= start_ns
 
 
 def read_truth(directory: Path) -> list[dict[str, Any]]:

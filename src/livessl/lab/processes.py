@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from livessl.clock import Clock
@@ -27,9 +27,9 @@ class NotStartedError(RunError):
     """A command did not start; its own message gives the reason."""
 
 
-def start(*arguments: str) -> subprocess.Popen[bytes]:
-    """Run a livessl command."""
-    return subprocess.Popen([sys.executable, "-m", "livessl", *arguments])  # noqa: S603 - this package
+def start(*arguments: str, environment: Mapping[str, str] | None = None) -> subprocess.Popen[bytes]:
+    """Run a livessl command, with this process's environment or another one."""
+    return subprocess.Popen([sys.executable, "-m", "livessl", *arguments], env=environment)  # noqa: S603 - this package
 
 
 def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock: Clock) -> None:

@@ -130,7 +130,7 @@ def site_text(site: Site) -> str:
     """Return a site as YAML that needs no other files: positions are absolute, and keys and tokens are left out."""
     http = {"tokens", "certificate", "private_key"}
     data: dict[str, Any] = site.model_dump(
-        mode="json", exclude_defaults=True, exclude={"keys": True, "server": {"http": http}}
+        mode="json", exclude_defaults=True, exclude={"keys": True, "calibration": True, "server": {"http": http}}
     )
     for spec in site.specs:
         array = {"microphones_m": spec.microphones_m.round(6).tolist()}

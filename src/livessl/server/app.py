@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Final
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
+from livessl.garbage import collect_as_usual
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
@@ -19,29 +19,37 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
 from livessl.server.clips.service import Clips
-from livessl.server.compiling import load_kernels
+from livessl.server.compiling import KernelLoader
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
+from livessl.server.event_retention import delete_old_events
+from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
+from livessl.server.journal import Journal, also
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
+from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
-from livessl.server.retention import delete_old_events
+from livessl.server.recent_log import RecentLog
+from livessl.server.reload import Reloader
+from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
 from livessl.server.tracks import Tracks
+from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
+from livessl.traces import traces_in_use
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
@@ -49,6 +57,10 @@ releases it thousands of times a second; by Python's default it would wait 5 ms 
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
+
+RESTORED: Final = 100
+"""Newest alerts of the outbox that are put into the journal at the start: a server that was killed may have kept them
+in the outbox only."""
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +75,7 @@ def assemble(
     receiver: Inbox | None = None,
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
+    read_site: Callable[[], Site] | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -76,6 +89,8 @@ def assemble(
         Gets every event after the sinks and before `publish`; called on the fusion thread.
     url : str
         Address of the server, for the links in alerts.
+    read_site : callable or None
+        Reads the site file again; None for a server without one.
 
     Raises
     ------
@@ -94,6 +109,8 @@ def assemble(
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
         site_time = SiteTime(clock)
+        journal = Journal(store, clock)
+        journal.site(site)
         zone_book = ZoneBook(site, publish)
 
         def zones() -> ZoneMap:
@@ -103,9 +120,20 @@ def assemble(
         overload = Overload(clock)
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        array_states = ArrayStates(site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish, url, zones)
+        found = traces_in_use()
+        traces = None if found is None else EventTraces(found)
+        publish_arrays, publish_alert = also(journal.arrays, publish), also(journal.alert, publish)
+        array_states = ArrayStates(
+            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
+        )
+        kept, listeners = site.server.clips, Listeners()
+        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        alerts = Alerts(
+            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces
+        )
         undo.callback(alerts.stop)
+        for _, alert in reversed(alerts.outbox.recent(RESTORED)):
+            journal.alert(alert)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -113,18 +141,22 @@ def assemble(
             publish(change)
 
         presence = Presence(zones, publish_change)
-        tracks = Tracks(presence)
-        kept, listeners = site.server.clips, Listeners()
-        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
+        tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
+        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts, traces)
         publisher = Publisher(
             publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
+        set_up = SetUpInForce(site, clock, publish)
+        proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
+        # the engine first: if its estimator cannot be made, nothing changes
+        for follower in (engine.take_over, set_up_watch.take_over, *(() if clips is None else (clips.take_over,))):
+            set_up.follow(follower)
         floor_plan = read_floor_plan(site)
+        reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
         undo.pop_all()
     return Parts(
         site=site,
@@ -142,13 +174,18 @@ def assemble(
         maps=maps,
         latency=latency,
         overload=overload,
+        set_up=set_up,
+        proposals=proposals,
         set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
         fanout=fanout,
         zone_book=zone_book,
+        journal=journal,
         presence=presence,
         floor_plan=floor_plan,
+        reloader=reloader,
+        recent_log=RecentLog(),
     )
 
 
@@ -167,6 +204,8 @@ class Server:
         Stands in for the nodes' socket.
     stepped : bool
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
+    read_site : callable or None
+        Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
 
     Raises
     ------
@@ -187,17 +226,16 @@ class Server:
         on_event: Callable[[JsonObject], None] | None = None,
         receiver: Inbox | None = None,
         stepped: bool = False,
+        read_site: Callable[[], Site] | None = None,
     ) -> None:
-        faults = unprotected_addresses(site)
-        if faults:
-            raise ConfigError(faults)
-        if method is not None:
-            site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
+        site = _usable(site, method)
+        read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
         self._access = Access(None if http.tokens is None else site.file(http.tokens))
         certificate = certificate_of(site)
         self._clock = clock
         self._stepped = stepped
+        self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
         # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
@@ -210,11 +248,9 @@ class Server:
             undo.callback(sinks.close)
             store = Store.of(site)
             undo.callback(store.close)
-            self._compiler = load_kernels()
-            if self._compiler is not None:
-                undo.callback(self._compiler.stop)
             url = url_of(self._listener, tls=certificate is not None)
-            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
+            fanout = Fanout(first_seq)
+            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
         """The HTTP server."""
@@ -227,17 +263,18 @@ class Server:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
-        gc.collect()
-        gc.freeze()  # what exists now stays, and the collector need not look through it again
+        collect_as_usual()
         try:
-            asyncio.run(self._serve())
+            with self.parts.recent_log.attached():
+                asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
-            if self._compiler is not None:
-                self._compiler.stop()
+            self._kernel_loader.stop()
+            self.parts.reloader.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
+            self.parts.proposals.stop()
             self.parts.alerts.stop()
             if self.parts.clips is not None:
                 self.parts.clips.stop()
@@ -261,12 +298,14 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
+        self.parts.proposals.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
+        self.parts.reloader.start()
         if not self._stepped:
             self.parts.store.backlog.start()
-            self.parts.engine.start()
+            self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
         try:
@@ -279,9 +318,10 @@ class Server:
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
-        while self.parts.failure is None:
+        while self.parts.failure is None and not self.uvicorn.should_exit:
             await asyncio.sleep(WATCH_S)
         self.stop()
+        self.parts.fanout.ended.set()
 
     def _publish(self, message: JsonObject) -> None:
         """Hand a message to subscribers; on the fusion thread."""
@@ -293,3 +333,19 @@ class Server:
             loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed, and no subscriber is left
             _log.debug("a message was published after the event loop had closed")
+
+
+def _usable(site: Site, method: str | None) -> Site:
+    """Return a site with the method of the command line, if it may be served.
+
+    Raises
+    ------
+    ConfigError
+        If the server would be open to the network.
+    """
+    faults = unprotected_addresses(site)
+    if faults:
+        raise ConfigError(faults)
+    if method is None:
+        return site
+    return site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})

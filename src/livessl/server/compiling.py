@@ -1,4 +1,4 @@
-"""The first start on a machine: a process of its own compiles the kernels, and NumPy does their work meanwhile.
+"""Loads the compiled kernels. At the first start on a machine, a process of its own compiles them meanwhile.
 
 python -m livessl.server.compiling      # compile now, for example while installing
 """
@@ -30,71 +30,60 @@ NICENESS: Final = 10
 _log = logging.getLogger(__name__)
 
 
-def load_kernels(command: Sequence[str] = COMPILE) -> Compiler | None:
-    """Load the compiled kernels, or begin to compile them and use those on NumPy until that is done.
-
-    Where numba is not installed, or may keep its machine code nowhere, nothing is begun: then there is nothing to
-    compile, or it is compiled here before this returns.
+class KernelLoader:
+    """Loads the compiled kernels, or has them compiled while those on NumPy do their work.
 
     Parameters
     ----------
     command : sequence of str
         Compiles the kernels and exits with 0.
-
-    Returns
-    -------
-    Compiler or None
-        What compiles now, to be stopped with the server; None if the kernels are ready.
-    """
-    compiled = kernels.in_use
-    stamp = _stamp(compiled)
-    if stamp is None or stamp.exists():
-        warm_up()
-        return None
-    _log.info(
-        "First start: compiling kernels in the background, a minute or so; until then NumPy does their work, slower."
-    )
-    kernels.use(with_numpy)
-    compiler = Compiler(compiled, command)
-    compiler.start()
-    return compiler
-
-
-class Compiler:
-    """A process that compiles, and the thread that waits for it to use what was compiled.
-
-    Parameters
-    ----------
-    compiled : module
-        The kernels to use afterwards.
-    command : sequence of str
-        See `load_kernels`.
     """
 
-    def __init__(self, compiled: ModuleType, command: Sequence[str]) -> None:
-        self._compiled = compiled
-        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)  # noqa: S603 - this package
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._wait, name="compiling", daemon=True)
+    def __init__(self, command: Sequence[str] = COMPILE) -> None:
+        self._command = command
+        self._lock = threading.Lock()  # of the two below
+        self._compiler: subprocess.Popen[bytes] | None = None
+        self._is_stopped = False
 
-    def start(self) -> None:
-        """Wait for the process on a thread."""
-        self._thread.start()
+    def load(self) -> None:
+        """Load the compiled kernels; where there are none, begin to compile them and use those on NumPy until then.
+
+        This takes most of a second, so a server listens before. Where numba is not installed, or may keep its machine
+        code nowhere, no process is begun: then there is nothing to compile, or it is compiled here before this returns.
+        """
+        compiled = kernels.in_use
+        stamp = _stamp(compiled)
+        if stamp is None or stamp.exists():
+            warm_up()
+            return
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._compiler = subprocess.Popen(self._command, stdin=subprocess.DEVNULL)  # noqa: S603 - this package
+        _log.info(
+            "First start: compiling kernels in the background, a minute or so; "
+            "until then NumPy does their work, slower."
+        )
+        kernels.use(with_numpy)
+        wait = threading.Thread(target=self._wait, args=(self._compiler, compiled), name="compiling", daemon=True)
+        wait.start()
 
     def stop(self) -> None:
-        """End the process if it still runs; the next start begins anew."""
-        self._stopped.set()
-        self._process.terminate()
-        self._thread.join()
+        """End the compiler if it still runs; the next start begins anew."""
+        with self._lock:
+            self._is_stopped = True
+        if self._compiler is not None:
+            self._compiler.terminate()
+            self._compiler.wait()
 
-    def _wait(self) -> None:
-        code = self._process.wait()
-        if self._stopped.is_set():
+    def _wait(self, compiler: subprocess.Popen[bytes], compiled: ModuleType) -> None:
+        code = compiler.wait()
+        if self._is_stopped:
             return
         if code:
             _log.warning("compiling kernels failed with exit code %d: NumPy goes on, more slowly", code)
             return
-        kernels.use(self._compiled)
+        kernels.use(compiled)
         warm_up()
         _log.info("The kernels are compiled and in use.")
 

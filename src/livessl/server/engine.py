@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
 from livessl import wire
 from livessl.clock import Clock
+from livessl.core.stream.site_state import ArraySetUp
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_log import EventLog
+from livessl.server.event_traces import EventTraces
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parallel import Parallel
@@ -20,6 +23,7 @@ from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
 from livessl.server.site_time import SiteTime
 from livessl.server.zones.shapes import ZoneMap
+from livessl.site.build.fusion import make_array_set_up
 from livessl.site.models import Site
 
 WAIT_S: Final = 0.02
@@ -57,6 +61,8 @@ class Engine:
         Returns the zones that are in force.
     sound_takers : sequence of SoundTaker
         Get every frame: for those who listen, and for what is kept of events.
+    traces : EventTraces or None
+        Times the steps of the fusion; None if nothing is traced.
     """
 
     def __init__(
@@ -72,7 +78,9 @@ class Engine:
         overload: Overload,
         zones: Callable[[], ZoneMap],
         sound_takers: Sequence[SoundTaker] = (),
+        traces: EventTraces | None = None,
     ) -> None:
+        self._traces = traces
         self._site = site
         self._clock = clock
         self._receiver = receiver
@@ -84,8 +92,11 @@ class Engine:
         self._overload = overload
         self._zones = zones
         self._sound_takers = sound_takers
+        self._rates_hz: dict[str, float] = {}  # of the arrays whose nodes have joined
+        self._coming: deque[tuple[Site, ArraySetUp]] = deque()
         self._parallel = Parallel()
         self._stop = threading.Event()
+        self._prepare: Callable[[], None] | None = None
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
@@ -96,8 +107,9 @@ class Engine:
         """Windows of this run that were not localized because newer ones were due."""
         return self._run.fusion.updates_left_out
 
-    def start(self) -> None:
-        """Start the thread."""
+    def start(self, prepare: Callable[[], None]) -> None:
+        """Start the thread, which calls `prepare` before its first turn."""
+        self._prepare = prepare
         self._thread.start()
 
     def stop(self) -> None:
@@ -106,6 +118,17 @@ class Engine:
         if self._thread.is_alive():
             self._thread.join(timeout=3.0)
         self._parallel.stop()
+
+    def take_over(self, site: Site) -> None:
+        """Locate with the poses of this site from the next turn on; any thread may call it.
+
+        Sounds that have begun are located as before. The tables of the estimator are computed here, so that the fusion
+        thread does not wait for them.
+        """
+        set_up = make_array_set_up(site, self._parallel.for_each)
+        for array, rate_hz in tuple(self._rates_hz.items()):
+            set_up.estimator.prepare(array, rate_hz)
+        self._coming.append((site, set_up))
 
     def wait_idle(self) -> None:
         """Return when the running replay has ended and its last event is published."""
@@ -117,6 +140,9 @@ class Engine:
 
         The thread calls it for ever; without the thread, any other caller may.
         """
+        while self._coming:
+            self._site, set_up = self._coming.popleft()
+            self._run.fusion.take_over(set_up)
         batch: list[Message] = []
         began_ns = self._clock.monotonic_ns()
         items = self._receiver.take(BATCH, WAIT_S)
@@ -146,6 +172,8 @@ class Engine:
 
     def _work(self) -> None:
         try:
+            if self._prepare is not None:
+                self._prepare()
             while not self._stop.is_set():
                 self.turn()
         except BaseException as error:
@@ -188,6 +216,7 @@ class Engine:
             self._switch(live_run(self._site, self._event_log.begin_live(), self._parallel.for_each))
             self._site_time.begin_live()
         for array, rate_hz in hello.arrays.items():
+            self._rates_hz[array] = rate_hz
             self._run.fusion.prepare(array, rate_hz)
 
     def _leave(self, hello: wire.Hello) -> None:
@@ -224,6 +253,8 @@ class Engine:
         run.fusion.exclude(self._array_states.disabled)
         for taker in self._sound_takers:
             taker.take(batch, run.fusion.settled)
+        if self._traces is not None:
+            self._traces.begin_step(self._clock.now_ns())
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

@@ -149,6 +149,7 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
             _Ended(app),
             ws=_WebSocket,  # sends many small messages faster than uvicorn's other implementations
             log_level="warning",
+            log_config=None,  # its messages go where those of all others go, in the same form
             http=TimedRequests,  # h11 is the implementation that limits the head of a request
             loop="asyncio",  # another loop would not accept connections by `LimitedListener.accept`
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,

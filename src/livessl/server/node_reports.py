@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from livessl.core.commission.finding import Finding
-from livessl.core.commission.report_watch import ReportWatch
+from livessl.core.commission.report_watch import RECENT_S, ReportWatch
 from livessl.core.types import ChannelLevel, HostState, Mark
 
 
@@ -40,12 +40,14 @@ class NodeReports:
         self._lock = threading.Lock()
         self._last: dict[str, NodeFigures] = {}
         self._watch = ReportWatch()
+        self._first_ns: int | None = None
 
     def note(self, mark: Mark, now_ns: int) -> None:
         """Take in a mark; most carry no report."""
         if not mark.levels:
             return
         with self._lock:
+            self._first_ns = now_ns if self._first_ns is None else self._first_ns
             self._last[mark.array] = NodeFigures(mark.levels, mark.drift_error_ppm, mark.host, now_ns)
             self._watch.take(mark.array, mark.levels, mark.host, now_ns / 1e9)
 
@@ -58,8 +60,13 @@ class NodeReports:
         with self._lock:
             return self._watch.findings(nodes, now_ns / 1e9)
 
+    def are_complete(self, now_ns: int) -> bool:
+        """Return whether reports have come for so long that a fault which they do not show has ended."""
+        with self._lock:
+            return self._first_ns is not None and now_ns - self._first_ns >= RECENT_S * 1e9
+
     def forget(self) -> None:
         """Forget all reports: those of another run are about another set-up."""
         with self._lock:
-            self._last = {}
+            self._last, self._first_ns = {}, None
             self._watch = ReportWatch()

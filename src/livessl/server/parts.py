@@ -12,11 +12,16 @@ from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
+from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
+from livessl.server.proposals import Proposals
 from livessl.server.receiver import Inbox
+from livessl.server.recent_log import RecentLog
 from livessl.server.refusals import Refusals
+from livessl.server.reload import Reloader
+from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
@@ -30,7 +35,10 @@ from livessl.site.models import Site
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Everything that runs in a server, and everything that its parts share."""
+    """Everything that runs in a server, and everything that its parts share.
+
+    `site` is the site as it was when the server started; `set_up.site` has the poses that are in force.
+    """
 
     site: Site
     clock: Clock
@@ -47,17 +55,25 @@ class Parts:
     maps: Maps
     latency: Latency
     overload: Overload
+    set_up: SetUpInForce
+    proposals: Proposals
     set_up_watch: SetUpWatch
     store: Store
     sinks: Sinks
     fanout: Fanout
     zone_book: ZoneBook
+    journal: Journal
     presence: Presence
     floor_plan: FloorPicture | None
+    reloader: Reloader
+    recent_log: RecentLog
 
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
-        parts = (self.engine, self.receiver, self.maps, self.set_up_watch, self.alerts, self.clips, self.store.backlog)
+        parts = (
+            *(self.engine, self.receiver, self.maps, self.set_up_watch, self.proposals),
+            *(self.alerts, self.clips, self.store.backlog, self.reloader),
+        )
         failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)

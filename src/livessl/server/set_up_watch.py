@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
+from livessl.core.commission.report_watch import REPORTED
 from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation
 from livessl.server.heard_sounds import HeardSounds
@@ -41,17 +42,25 @@ class SetUpState:
         Faults of the set-up, errors first.
     errors : mapping of array to str
         The error that concerns each array, in words; arrays without one are left out.
+    are_reports_complete : bool
+        Whether the nodes have reported for long enough to show all that their reports can show.
     """
 
     sounds: int = 0
     findings: tuple[Finding, ...] = ()
     errors: Mapping[str, str] = field(default_factory=dict)
+    are_reports_complete: bool = False
+
+    def knows(self, fault: str) -> bool:
+        """Return whether a fault of this code that is no finding is known not to be there, or to have ended."""
+        return self.are_reports_complete if fault in REPORTED else self.sounds >= LEAST_SOUNDS
 
 
 class SetUpWatch:
     """Examines the set-up.
 
-    The fusion thread calls `take` and `forget`; every thread may read `state`, which is replaced as a whole.
+    The fusion thread calls `take`, `forget`, `note_reports` and `note_clocks`; every thread may read `state`, which is
+    replaced as a whole.
 
     Parameters
     ----------
@@ -76,6 +85,8 @@ class SetUpWatch:
         self._of_layout = layout_findings(site)
         self._of_sounds: tuple[Finding, ...] = ()
         self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
+        self._are_reports_complete = False
+        self._clocks_off: frozenset[str] = frozenset()  # arrays
         self.state = SetUpState(findings=self._of_layout)
         """The latest state. Read it once for values that belong together."""
         self._stop = threading.Event()
@@ -92,12 +103,28 @@ class SetUpWatch:
         if event.source == 1 and len(event.received) > 0:
             self.heard.take(event)
 
-    def note_reports(self, findings: Sequence[Finding]) -> None:
-        """Take in what the reports of the nodes show now; new faults are logged."""
+    def note_reports(self, findings: Sequence[Finding], *, are_complete: bool = False) -> None:
+        """Take in what the reports of the nodes show now, and whether that is all; new faults are logged."""
         with self._lock:
+            self._are_reports_complete = are_complete
             self._log_new(self._reported, findings)
             self._reported = tuple(findings)
             self._publish()
+
+    def note_clocks(self, arrays: Iterable[str]) -> None:
+        """Note the arrays whose clocks are known to be off.
+
+        They receive other sounds at the times of an event, which is no fault of their poses: what they received is left
+        out, and what was concluded from it so far is forgotten.
+        """
+        with self._lock:
+            known, self._clocks_off = self._clocks_off, frozenset(arrays)
+            if self._clocks_off <= known:
+                return
+            self._sounds = [self._on_time(sound) for sound in self._sounds]
+            self._run += 1
+            self._steady = SteadyFindings()
+            self._note(())
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
@@ -106,6 +133,16 @@ class SetUpWatch:
             self._sounds, self._unjudged = (), 0
             self._run += 1
             self._steady = SteadyFindings()
+            self._note(())
+
+    def take_over(self, site: Site) -> None:
+        """Examine the last sounds anew with the poses of this site: what was wrong may be mended; any thread."""
+        of_layout = layout_findings(site)
+        with self._lock:
+            self._site, self._of_layout = site, of_layout
+            self._run += 1
+            self._steady = SteadyFindings()
+            self._unjudged = len(self._sounds)
             self._note(())
 
     def start(self) -> None:
@@ -122,25 +159,31 @@ class SetUpWatch:
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
-            known, run = list(self._sounds), self._run
+            site, known, run = self._site, list(self._sounds), self._run
+            is_moved = self._unjudged > 0 and len(known) >= LEAST_SOUNDS
         new = self.heard.after(self._examined)
-        if not new:
+        if not (new or is_moved):
             return
         # imported late: scipy's optimizer takes memory, and no event needs it
         from livessl.site.build.set_up import find_set_up_faults
 
-        sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
-        findings = find_set_up_faults(self._site, sounds) if len(sounds) >= LEAST_SOUNDS else None
+        sounds = [*known, *(self._on_time(sound.observations) for sound in new)][-KEPT_SOUNDS:]
+        findings = find_set_up_faults(site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
             if run != self._run:
                 return
-            self._sounds, self._examined = sounds, new[-1].number
+            self._sounds = sounds
+            self._examined = new[-1].number if new else self._examined
             self._unjudged += len(new)
             if findings is None:
                 self._note(())
             else:
                 self._note(self._steady.note(findings, self._unjudged))
                 self._unjudged = 0
+
+    def _on_time(self, sound: Sequence[Observation]) -> Sequence[Observation]:
+        """Return what the arrays whose clocks are right received of a sound."""
+        return tuple(one for one in sound if one.array not in self._clocks_off) if self._clocks_off else sound
 
     def _note(self, findings: Sequence[Finding]) -> None:
         self._log_new(self._of_sounds, findings)
@@ -157,7 +200,7 @@ class SetUpWatch:
             for array in ([finding.array] if finding.array is not None else all_arrays)
         }
         findings = in_order([*self._of_sounds, *self._reported, *self._of_layout])
-        self.state = SetUpState(len(self._sounds), tuple(findings), errors)
+        self.state = SetUpState(len(self._sounds), tuple(findings), errors, self._are_reports_complete)
 
     @staticmethod
     def _log_new(known: Sequence[Finding], findings: Sequence[Finding]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,6 +19,16 @@ from livessl.server.history import records
 from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import CURE, Database, StoreError
 from livessl.server.history.heat_map import Cells, HeatMap, count_by_cell
+from livessl.server.history.journal import (
+    Entry,
+    JournalPage,
+    JournalQuery,
+    journal_page,
+    keep_newest_entries,
+    put_entry,
+    remove_older_entries,
+)
+from livessl.server.history.log import DURABLE, LogPage, LogPosition, log_page
 from livessl.server.history.query import Cursor, Page, Query, Row
 from livessl.server.history.search import page_statement
 from livessl.server.history.tables import disabled, events, progress
@@ -29,7 +40,7 @@ __all__ = ["CURE", "MAX_EVENTS_IN_MEMORY", "Cursor", "Finalized", "JsonObject", 
 JsonObject = dict[str, Any]
 
 MAX_EVENTS_IN_MEMORY: Final = 10_000
-"""Most events kept in memory, about 10 MB; a database on a disk has no such limit."""
+"""Most events kept in memory, about 10 MB, and most entries of the journal; a database on a disk has no such limit."""
 
 EXPIRED_AT_ONCE: Final = 1000
 """Old events that are deleted in one transaction: the longest that a new event waits for their deletion."""
@@ -79,6 +90,7 @@ class Store:
 
     def __init__(self, place: Path | str | None = None) -> None:
         self._bounded = place is None
+        self._life = secrets.randbits(63) if self._bounded else DURABLE
         self._count: int | None = None
         self._counting = threading.Lock()
         self._when_ready: deque[Callable[[], None]] = deque()
@@ -202,7 +214,9 @@ class Store:
         return [(time_ns, orjson.loads(body)) for time_ns, body in rows]
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
-        """Delete the events that began before a time, and overwrite them in an SQLite file; return their number.
+        """Delete the events and entries of before a time, and overwrite them in an SQLite file.
+
+        Returns the number of the events.
 
         `end` ends it early, between two transactions; the next call does the rest.
         """
@@ -211,9 +225,10 @@ class Store:
         while not end.is_set():
             with self._database.writing("delete old events") as connection:
                 some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
+                others = remove_older_entries(connection, before_ns, EXPIRED_AT_ONCE)
             self._counted(-some)
             gone += some
-            if some < EXPIRED_AT_ONCE:
+            if max(some, others) < EXPIRED_AT_ONCE:
                 self._database.erase()
                 break
             end.wait(PAUSE_S)
@@ -238,6 +253,13 @@ class Store:
             return Page(rows, rows[-1].cursor if rows else None, rows[0].cursor if rows else query.after)
         return Page(rows, rows[-1].cursor if has_more else None, rows[0].cursor if rows else None)
 
+    def log(self, query: Query, after: LogPosition | None) -> LogPage:
+        """Return the events that were stored after a position; see `log_page`."""
+        self.backlog.settle()
+        kept = MAX_EVENTS_IN_MEMORY if self._bounded else None
+        with self._database.reading() as connection:
+            return log_page(connection, query, after, self._life, kept)
+
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
         """Return events, newest first unless the query says otherwise, and the cursor of the next page or None."""
         page = self.page(query)
@@ -257,6 +279,19 @@ class Store:
         self.backlog.settle()
         with self._database.reading() as connection:
             return count_by_cell(connection, query, cells)
+
+    def note(self, entry: Entry) -> None:
+        """Store an entry of the journal, unless one of its key is stored."""
+        with self._database.writing(f"store entry {entry.key!r} of the journal") as connection:
+            put_entry(connection, entry)
+            if self._bounded:
+                keep_newest_entries(connection, MAX_EVENTS_IN_MEMORY)
+
+    def journal(self, query: JournalQuery) -> JournalPage:
+        """Return a page of the journal, newest first."""
+        self.backlog.settle()
+        with self._database.reading() as connection:
+            return journal_page(connection, query)
 
     def count(self) -> int | None:
         """Return the number of events; None if they could not be counted when the database was opened."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livessl.core.types import Track, TrackState
 from livessl.server.api.encode import JsonObject
+from livessl.server.trails import Trails
 from livessl.server.zones.presence import Presence
 
 
@@ -14,10 +15,13 @@ class Tracks:
     ----------
     presence : Presence
         Follows the same tracks through the zones.
+    trails : Trails
+        Puts the same tracks into the journal.
     """
 
-    def __init__(self, presence: Presence) -> None:
+    def __init__(self, presence: Presence, trails: Trails) -> None:
         self._presence = presence
+        self._trails = trails
         self._messages: dict[int, JsonObject] = {}  # replaced as a whole, never changed, so that readers need no lock
 
     def all(self) -> list[JsonObject]:
@@ -27,11 +31,13 @@ class Tracks:
     def note(self, track: Track, message: JsonObject) -> None:
         """Keep the newest message of a track; drop the track if it has ended."""
         self._presence.take(track, message)
+        self._trails.take(track, message)
         others = {number: other for number, other in self._messages.items() if number != track.id}
         self._messages = others if track.state is TrackState.END else {**others, track.id: message}
 
     def end_all(self) -> list[JsonObject]:
         """Drop all tracks; return the messages that report their end."""
         self._presence.end_all()
+        self._trails.end_all()
         ended, self._messages = self._messages.values(), {}
         return [{**message, "state": str(TrackState.END)} for message in ended]

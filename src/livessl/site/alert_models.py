@@ -25,17 +25,24 @@ T = TypeVar("T")
 
 
 def _not_empty(items: tuple[T, ...]) -> tuple[T, ...]:
-    """Return items of which there is one at least; pydantic's own check also complains where an item is wrong."""
+    """Check that there is an item. Pydantic's `min_length` would report a second fault where an item is wrong."""
     if not items:
         raise ValueError("expected at least 1 item, got none; leave the key out for the default")
     return items
 
 
+def _zones(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Check that there is a zone: this key has no default."""
+    if not names:
+        raise ValueError("expected at least 1 zone, got none; name zones of this site")
+    return names
+
+
 def _minutes(value: Any) -> int:
     """Return the minutes since midnight of a time of day.
 
-    YAML reads 22:00 without quotes as the number 1320, which is the same time in minutes. A number below 60 was meant
-    as an hour.
+    YAML reads 22:00 without quotes as the number 1320, which is the same time in minutes. A number up to 24
+    was probably meant as an hour.
     """
     if isinstance(value, int) and not isinstance(value, bool) and 60 <= value <= MINUTES_OF_DAY:
         return value
@@ -53,7 +60,7 @@ TimeOfDay = Annotated[int, BeforeValidator(_minutes)]
 
 
 class ScheduleSpan(Model):
-    """A span of the week; one that ends before it begins lasts over midnight."""
+    """A span of the week. If `end` is earlier than `begin`, it lasts until `end` on the next day."""
 
     days: Annotated[tuple[Day, ...], AfterValidator(_not_empty)] = DAYS
     begin: TimeOfDay = 0
@@ -67,7 +74,7 @@ class ScheduleSpan(Model):
 
 
 class EventCondition(Model):
-    """Which events alert."""
+    """Condition on events that raises an alert."""
 
     zones: tuple[str, ...] = ()
     probability: Annotated[float, Field(gt=0, lt=1)] = 0.5
@@ -97,14 +104,14 @@ class EventCondition(Model):
 
 
 class TrackCondition(Model):
-    """Which changes of tracks alert: what a track does in one of the zones."""
+    """Condition on tracks that raises an alert: what a track does in one of the zones."""
 
-    zones: Annotated[tuple[str, ...], AfterValidator(_not_empty)]
+    zones: Annotated[tuple[str, ...], AfterValidator(_zones)]
     changes: Annotated[tuple[Literal["enter", "leave", "loiter"], ...], AfterValidator(_not_empty)] = ("enter",)
 
 
 class ArrayCondition(Model):
-    """Which conditions of which arrays alert; no names stand for all arrays."""
+    """Condition on arrays that raises an alert. Empty `names` mean all arrays."""
 
     names: tuple[str, ...] = ()
     states: Annotated[tuple[Literal["starting", "quiet", "degraded", "lost"], ...], AfterValidator(_not_empty)] = (
@@ -115,14 +122,14 @@ class ArrayCondition(Model):
 
 
 class FindingCondition(Model):
-    """Which findings about the set-up alert: those of at least a severity; no faults stand for all codes."""
+    """Condition on findings that raises an alert: of `severity` or worse. Empty `faults` mean all codes."""
 
     severity: Severity = Severity.ERROR
     faults: tuple[str, ...] = ()
 
 
 class AlertRule(Model):
-    """When to alert, and which actions to take."""
+    """A condition that raises an alert, and the actions that deliver it."""
 
     events: EventCondition | None = None
     tracks: TrackCondition | None = None
@@ -140,7 +147,7 @@ class AlertRule(Model):
 
     @property
     def kind(self) -> Literal["events", "tracks", "arrays", "findings"]:
-        """Key of what the rule watches."""
+        """Name of the rule's condition: `events`, `tracks`, `arrays` or `findings`."""
         if self.events is not None:
             return "events"
         if self.tracks is not None:
@@ -197,10 +204,11 @@ class AppriseConfig(Model):
     """One service of those that Apprise knows; its URL holds secrets and stands in a file of its own."""
 
     url: FileName
+    attach: tuple[Literal["picture", "clip"], ...] = ("picture", "clip")
 
 
 class AlertAction(Model):
-    """One way to deliver alerts, and how patiently."""
+    """One way to deliver alerts, with its time-out and retries."""
 
     webhook: WebhookConfig | None = None
     mqtt: MqttConfig | None = None
@@ -266,5 +274,7 @@ def _http_url(url: str) -> str:
     if not is_url or not re.fullmatch(r"[\x21-\x7e]+", url):
         raise ValueError(f"expected http://HOST/PATH or https://HOST/PATH, got {url!r}")
     if parts.username is not None:
-        raise ValueError("expected an address without user and password; the signature proves who sends: set secret")
+        raise ValueError(
+            "expected an address without user and password; leave them out, and let `secret` sign what a webhook sends"
+        )
     return url

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, Final, get_args, get_origin
+from pathlib import Path
+from typing import Any, Final, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from livessl.errors import Fault
+from livessl.errors import ConfigError, Fault
 from livessl.site.place import Finding, Place
 from livessl.site.slips import slip
 
@@ -28,6 +29,8 @@ _SENTENCES: Final = {
     "too_long": "expected at most {max_length} items, got {actual_length}",
 }
 """Sentence for each type of pydantic error; other types keep pydantic's own."""
+
+Read = TypeVar("Read", bound=BaseModel)
 
 
 _FOREIGN_UNITS: Final = {
@@ -191,6 +194,31 @@ def unknown_array(name: str, known: Iterable[str]) -> str:
 def _unknown_key(model: type[BaseModel], place: Place) -> str:
     key = str(place[-1])
     return unknown_key(key, _keys_at(model, place[:-1]), places_of(model, key))
+
+
+def read_model(model: type[Read], path: Path, what: str) -> Read:
+    """Return what a YAML file holds.
+
+    Parameters
+    ----------
+    model : type
+        Model of the file.
+    path : Path
+    what : str
+        Name of such files, for messages.
+
+    Raises
+    ------
+    ConfigError
+        With every fault of the file.
+    """
+    try:
+        return model.model_validate(read_yaml(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
+        raise ConfigError([Fault(str(path), f"{what} cannot be read: {reason(error)}")]) from error
+    except ValidationError as error:
+        findings = validation_findings(model, error.errors())
+        raise ConfigError([Fault(f"{path}: {dotted(place)}", said) for place, said in findings]) from error
 
 
 def reason(error: Exception) -> str:

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from livessl.errors import ConfigError, Fault
 from livessl.site.build.arrays import build_site
+from livessl.site.calibration_file import found_name
 from livessl.site.checks import cross_faults, warnings_of
 from livessl.site.findings import (
     Locator,
@@ -65,7 +66,8 @@ def parse_site(
     source : str
         Name of the file, for messages.
     directory : Path or None
-        Folder that paths in the file are relative to; None for the current directory.
+        Folder that paths in the file are relative to, and in which a calibration is looked for if the file names none;
+        None for the current directory, and for no calibration that is not named.
     joint : mapping of name to array names, or None
         Joint arrays in addition to those of the file.
 
@@ -89,6 +91,9 @@ def parse_site(
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
     if joint and isinstance(data.setdefault("joint", {}), dict):
         data["joint"] |= {name: list(members) for name, members in joint.items()}
+    if data.get("calibration") is None and directory is not None:
+        found = found_name(data.get("site"), directory)
+        data |= {} if found is None else {"calibration": found}
     site, findings = _checked(data, directory or Path())
     findings = [*duplicate_keys(root), *slips, *findings]
     if site is None or findings:

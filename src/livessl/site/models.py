@@ -118,13 +118,13 @@ class CalibratedArray(Model):
 
 
 class CalibrationFile(Model):
-    """A file that `livessl calibrate` writes: it takes the place of the site file's positions of these arrays."""
+    """A file that `livessl calibrate` and the server write; its positions of arrays replace those of the site file."""
 
     measured_utc: str = ""
     method: str = ""
     speed_of_sound_m_s: Annotated[float, Field(ge=0)] = 0.0
     sounds: Annotated[int, Field(ge=0)] = 0
-    arrays: Annotated[dict[str, CalibratedArray], Field(min_length=1)]
+    arrays: dict[str, CalibratedArray]
 
 
 class Orientation(Model):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -41,13 +42,24 @@ def read_secret(path: Path, cure: str) -> str:
 
 
 def write_whole(path: Path, text: str, mode: int) -> None:
-    """Write a whole file or nothing; it has its final `mode` from its creation on."""
+    """Write a whole file or nothing; it has its final `mode` from its creation on.
+
+    When this returns, the file is on the disk: neither a kill nor a power failure brings the former one back.
+    """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w", encoding="utf-8") as file:
         file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     part.replace(path)
+    with suppress(OSError):  # the file is in place; some network file systems cannot do more for its name
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def check_name(name: str) -> None:

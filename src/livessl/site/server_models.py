@@ -6,7 +6,14 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
+from livessl.site.addresses import (
+    check_endpoint,
+    check_host,
+    check_network,
+    check_origin,
+    check_root_path,
+    check_trusted_host,
+)
 from livessl.site.fields import FileName, Model, Positive
 from livessl.site.history_place import check_history_place
 from livessl.site.sink_types import check_sink_type
@@ -20,6 +27,8 @@ class HttpConfig(Model):
     trusted_hosts: tuple[str, ...] = ()
     root_path: str = ""
     forwarded_allow_ips: tuple[str, ...] = ("127.0.0.1", "::1")
+    allowed_origins: tuple[str, ...] = ()
+    frame_ancestors: tuple[str, ...] = ()
     tokens: FileName | None = None
     certificate: FileName | None = None
     private_key: FileName | None = None
@@ -33,6 +42,11 @@ class HttpConfig(Model):
     @classmethod
     def _trusted(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(check_trusted_host(host) for host in hosts)
+
+    @field_validator("allowed_origins", "frame_ancestors")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_origin(origin) for origin in origins)
 
     @field_validator("root_path")
     @classmethod

@@ -364,6 +364,50 @@ def test_finding_alerts_by_severity() -> None:
     assert found == [("all", "swapped"), ("all", "temperature"), ("errors", "swapped")]
 
 
+NTP = Finding("ntp", None, None, Severity.WARNING, 0.95, "node 'a': its clock is not synchronized", "start chrony")
+CPU = Finding("cpu", None, None, Severity.WARNING, 0.95, "node 'a': 7 blocks were lost", "stop other programs")
+TURNED = Finding("turned", "north", None, Severity.ERROR, 0.9, "it is turned", "correct rotation")
+NOT_OK: dict[str, Any] = {"findings": {"severity": "warning"}, "hold_off_s": 0}
+
+
+def found_by(desk: Desk) -> list[str]:
+    return [f"{alert['finding']['fault']} {alert['finding']['message'][:8]}" for alert in desk.published]
+
+
+@pytest.mark.parametrize("sounds", [0, 1, 2])
+def test_finding_that_needs_no_sound_alerts_before_the_third_sound(sounds: int) -> None:
+    with running_desk(site(None, faults=NOT_OK)) as desk:
+        desk.findings.state = SetUpState(sounds, (NTP, CPU))
+        wait_until(lambda: len(desk.published) == 2, "the alerts")
+    assert found_by(desk) == ["ntp node 'a'", "cpu node 'a'"]
+
+
+def test_each_node_with_the_same_fault_alerts_and_its_figures_do_not_matter() -> None:
+    lost = [replace(CPU, message=message) for message in ("node 'a': 9 lost", "node 'b': 3 lost", "node 'a': 12 lost")]
+    with running_desk(site(None, faults=NOT_OK)) as desk:
+        desk.findings.state = SetUpState(0, (lost[0], lost[1]))
+        wait_until(lambda: len(desk.published) == 2, "the alerts")
+        desk.findings.state = SetUpState(0, (lost[2], lost[1], NTP))
+        wait_until(lambda: len(desk.published) == 3, "another alert")
+    assert found_by(desk) == ["cpu node 'a'", "cpu node 'b'", "ntp node 'a'"]
+    assert len({alert["key"] for alert in desk.published}) == 3
+
+
+def test_finding_that_has_alerted_does_not_alert_again_after_a_restart(tmp_path: Path) -> None:
+    """After a restart nothing is known until the nodes have reported for a while, and three sounds have come."""
+    with running_desk(site(tmp_path, faults=NOT_OK)) as desk:
+        desk.findings.state = SetUpState(3, (TURNED, NTP), are_reports_complete=True)
+        wait_until(lambda: len(desk.published) == 2, "the alerts")
+    with running_desk(site(tmp_path, faults=NOT_OK)) as desk:
+        desk.findings.state = SetUpState(0, (CPU,))
+        wait_until(lambda: found_by(desk) == ["cpu node 'a'"], "what is new")
+        desk.findings.state = SetUpState(3, (TURNED,), are_reports_complete=True)
+        wait_until(lambda: desk.alerts.states["faults"].ongoing == ("turned north None",), "the recoveries")
+        desk.findings.state = SetUpState(3, (TURNED, NTP), are_reports_complete=True)
+        wait_until(lambda: len(desk.published) == 2, "the alert about the second fault")
+    assert found_by(desk) == ["cpu node 'a'", "ntp node 'a'"]
+
+
 def test_events_in_an_excluded_zone_are_kept_flagged_and_never_alert(tmp_path: Path) -> None:
     """The fan stands in the door's zone; what comes from beside it alerts."""
     fan = {"polygon_m": [[0.7, 0.6], [1.0, 0.6], [1.0, 1.0], [0.7, 1.0]], "exclude": True}

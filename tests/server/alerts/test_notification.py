@@ -16,6 +16,7 @@ import pytest
 
 from alert_desk import PATIENT, Desk, alert_site, running_desk, sound
 from livessl.errors import ConfigError
+from livessl.site.alert_models import AppriseConfig
 from livessl.site.models import Site
 from small_site import HANG_S, wait_until
 from webhook_receiver import running_receiver
@@ -82,6 +83,46 @@ def test_mail_says_what_when_and_where_with_a_link(tmp_path: Path) -> None:
     assert part is not None
     alert = desk.published[0]
     assert part.get_content().split() == f"{alert['text']}\n{alert['time_utc']}\n{alert['link']}".split()
+
+
+class OneClip:
+    """A clip of every event, cut a little after the alert."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.looks = 0
+
+    def is_waiting(self, event_id: str) -> bool:
+        return True
+
+    def best_file(self, event_id: str) -> Path | None:
+        self.looks += 1
+        return self._path if self.looks > 2 else None
+
+
+@pytest.mark.parametrize("attach", [["picture", "clip"], ["picture"], []])
+def test_mail_has_the_picture_and_the_clip_that_are_wanted(tmp_path: Path, attach: list[str]) -> None:
+    clip = tmp_path / "enhanced.flac"
+    clip.write_bytes(b"fLaC" + bytes(range(256)))
+    with mailbox() as (port, mails):
+        url = f"mailto://127.0.0.1:{port}?from=ears@example.org&to=guard@example.org&mode=insecure&format=text"
+        site = notify_site(tmp_path, url, timeout_s=60)
+        site.alerts.actions["tell"] = site.alerts.actions["tell"].model_copy(
+            update={"apprise": AppriseConfig(url="notify.url", attach=tuple(attach))}
+        )
+        desk = Desk(site, clips=OneClip(clip))
+        desk.alerts.start()
+        desk.finish(sound(1))
+        wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+        picture = desk.alerts.evidence.picture(desk.published[0])
+        desk.close()
+    mail = message_from_string(mails[0], policy=default)
+    found = {part.get_content_type(): part.get_content() for part in mail.iter_attachments()}
+    kinds = {"picture": "image/png", "clip": "audio/"}
+    assert len(found) == len(attach)
+    for wanted in attach:
+        [content] = [content for kind, content in found.items() if kind.startswith(kinds[wanted])]
+        assert content == (picture if wanted == "picture" else clip.read_bytes())
 
 
 def test_service_that_refuses_is_tried_again(tmp_path: Path) -> None:

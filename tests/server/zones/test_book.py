@@ -93,6 +93,46 @@ def test_zone_that_cannot_be_kept_is_not_in_force(tmp_path: Path, monkeypatch: p
     assert list(book_of(tmp_path)[0].current.zones) == ["door", "desk"]
 
 
+class KilledError(BaseException):
+    """Stands for SIGKILL: nothing handles it."""
+
+
+STEPS = ("open the new file", "write it to the disk", "replace the old file", "open the folder", "write the name")
+
+
+@pytest.mark.parametrize("step", range(len(STEPS) + 1))
+def test_zones_are_the_old_or_the_new_ones_after_a_kill_at_any_step(
+    step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The change is answered only after the last step, and survives a kill from the third one on."""
+    book, _ = book_of(tmp_path)
+    book.put("desk", DESK)
+    steps = iter(range(100))
+
+    def killing(call: Any) -> Any:
+        def called(*given: Any, **named: Any) -> Any:
+            if next(steps) == step:
+                raise KilledError
+            return call(*given, **named)
+
+        return called
+
+    with monkeypatch.context() as patches:
+        for owner, name in ((os, "open"), (os, "fsync"), (Path, "replace")):
+            patches.setattr(owner, name, killing(getattr(owner, name)))
+        try:
+            book.put("fan", DESK)
+            is_answered = True
+        except KilledError:
+            is_answered = False
+    assert next(steps) == min(step + 1, len(STEPS)), "the steps are not those that the test knows"
+    assert is_answered == (step == len(STEPS))
+    after = [*book_of(tmp_path)[0].current.zones]
+    assert after == (["door", "desk", "fan"] if step > STEPS.index("replace the old file") else ["door", "desk"])
+    book_of(tmp_path)[0].put("shelf", DESK)  # what the kill left is no obstacle
+    assert [*book_of(tmp_path)[0].current.zones] == [*after, "shelf"]
+
+
 def test_number_of_drawn_zones_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("livessl.server.zones.book.MAX_DRAWN", 2)
     book, _ = book_of(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from unittest.mock import patch
 
@@ -12,16 +13,30 @@ from hypothesis import strategies as st
 from matplotlib.path import Path
 from scipy.stats import multivariate_normal
 
-from livessl.server.zones import membership
-from livessl.server.zones.membership import Prism, box_prism, probability_in
+from livessl.core.types import FloatArray
+from livessl.server.zones.membership import PreparedZones, Prism, box_prism
 
 ANYWHERE = np.array([[-1e3, 1e3]] * 3)
 ROOM = np.array([[0.0, 4.0], [0.0, 5.0], [0.0, 3.0]])
 TOLERANCE = 0.002
 """Error of the quadrature for the flattest ellipsoids below; for rounder ones it is far smaller."""
 
+UNKNOWN = np.full(1, np.nan)
+
 coordinate = st.floats(-1.5, 1.5)
 std_m = st.floats(0.02, 1.0)
+
+
+def probability_in(position_m: FloatArray, covariance_m2: FloatArray, zone: Prism, volume_m: FloatArray) -> float:
+    return float(PreparedZones([zone], volume_m).probabilities(position_m, covariance_m2)[0])
+
+
+def star(radii: Sequence[float], centre: Sequence[float] = (0.0, 0.0)) -> FloatArray:
+    """Corners at any distance around a point: a polygon that is convex or not."""
+    angles = np.arange(len(radii)) * 2.0 * np.pi / len(radii) + 0.1
+    ring: FloatArray = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    corners: FloatArray = np.asarray(centre) + np.array(radii)[:, None] * ring
+    return corners
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -116,11 +131,9 @@ def test_a_position_outside_the_volume_is_in_no_zone() -> None:
     heights=st.tuples(st.floats(-1.0, 0.0), st.floats(0.2, 1.5)),
 )
 def test_polygon_equals_the_share_of_samples_inside(mean, stds, seed, radii, heights) -> None:  # type: ignore[no-untyped-def]
-    """Corners at any distance around a point: convex or not, at its walls and away from them."""
     turn = rotation(seed)
     covariance = turn @ np.diag(np.square(stds)) @ turn.T
-    angles = np.arange(len(radii)) * 2.0 * np.pi / len(radii) + 0.1
-    corners = np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    corners = star(radii)
     volume = np.array([[-1.2, 3.0], [-3.0, 1.1], [-0.7, 3.0]])
     found = probability_in(np.array(mean), covariance, Prism(corners, *heights), volume)
     samples = np.random.default_rng(1).multivariate_normal(mean, covariance, 20_000)
@@ -165,7 +178,7 @@ def test_shortcut_of_sure_positions_agrees_with_the_integral(place, std_m: float
     axes = rotation(seed)
     covariance = axes @ np.diag([0.2 * std_m**2, 0.5 * std_m**2, std_m**2]) @ axes.T
     found = probability_in(np.array(place), covariance, zone, ROOM)
-    with patch.object(membership, "_certain", return_value=None):
+    with patch.object(PreparedZones, "_certain", return_value=UNKNOWN.copy()):
         integrated = probability_in(np.array(place), covariance, zone, ROOM)
     assert found == pytest.approx(integrated, abs=TOLERANCE)
 
@@ -173,3 +186,32 @@ def test_shortcut_of_sure_positions_agrees_with_the_integral(place, std_m: float
 def test_zone_far_from_a_sure_position_has_no_probability() -> None:
     zone = Prism(np.array([[3.0, 3.0], [4.0, 3.0], [3.5, 4.0]]), -np.inf, np.inf)
     assert probability_in(np.array([0.5, 0.5, 1.0]), 0.01 * np.eye(3), zone, ROOM) == 0.0
+
+
+@settings(max_examples=40)
+@given(
+    zones=st.lists(
+        st.tuples(
+            st.lists(st.floats(0.2, 2.5), min_size=3, max_size=8),
+            st.tuples(st.floats(-1.0, 5.0), st.floats(-1.0, 6.0)),
+            st.sampled_from([(-np.inf, np.inf), (0.5, 2.0), (-2.0, 1.0), (2.9, 9.0), (5.0, 6.0)]),
+        ),
+        min_size=2,
+        max_size=6,
+    ),
+    place=st.tuples(st.floats(-0.3, 4.3), st.floats(0.0, 5.0), st.floats(0.0, 3.0)),
+    stds=st.tuples(std_m, std_m, std_m),
+    seed=st.integers(0, 10**6),
+)
+def test_zones_together_have_the_probabilities_that_each_has_alone(zones, place, stds, seed) -> None:  # type: ignore[no-untyped-def]
+    """Zones that overlap, that lie outside the room, and that have other heights do not disturb each other."""
+    axes = rotation(seed)
+    covariance = axes @ np.diag(np.square(stds)) @ axes.T
+    prisms = [Prism(star(radii, centre), *heights) for radii, centre, heights in zones]
+    together = PreparedZones(prisms, ROOM).probabilities(np.array(place), covariance)
+    alone = [probability_in(np.array(place), covariance, prism, ROOM) for prism in prisms]
+    assert together == pytest.approx(alone, abs=1e-5)
+
+
+def test_without_zones_there_are_no_probabilities() -> None:
+    assert PreparedZones([], ROOM).probabilities(np.ones(3), np.eye(3)).shape == (0,)

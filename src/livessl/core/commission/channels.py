@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import Float32Array, FloatArray

@@ -15,7 +15,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import ComplexArray, Float32Array, FloatArray

@@ -11,6 +11,9 @@ from livessl.core.commission.channels import CLIPPING_CURE, MOST_CLIPPED, steady
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import ChannelLevel, HostState
 
+REPORTED: Final = frozenset({"clipping", "cpu", "dc", "hum", "noisy", "ntp"})
+"""Codes of the faults that reports show."""
+
 STEADY: Final = 10
 """Number of the last reports, one a second, that decide about a constant, hum and noise."""
 

@@ -207,17 +207,12 @@ def described_pose(
     filed_m: FloatArray, measured_m: FloatArray, pose: Pose, misfit_before_s: float, misfit_s: float
 ) -> MeasuredPose:
     """Describe a measured pose (K, 3) against the filed one, metres; misfits are in seconds."""
-    centre_m, filed_centre_m = measured_m.mean(axis=0), filed_m.mean(axis=0)
-    arms_m, filed_arms_m = measured_m - centre_m, filed_m - filed_centre_m
-    if line_axis(filed_m) is not None:  # its longest arm says all; more of them leave the turn about it open
-        longest = [int(np.linalg.norm(filed_arms_m, axis=1).argmax())]
-        arms_m, filed_arms_m = arms_m[longest], filed_arms_m[longest]
-    turn, _ = Rotation.align_vectors(arms_m, filed_arms_m)
+    turn = turn_between(filed_m, measured_m)
     covariance = without_spin(pose.covariance, measured_m)
     variance = np.maximum(np.diag(covariance), 0.0)
     return MeasuredPose(
         measured_m,
-        centre_m - filed_centre_m,
+        measured_m.mean(axis=0) - filed_m.mean(axis=0),
         turn,
         float(np.sqrt(variance[:3].max())),
         float(np.degrees(np.sqrt(variance[3:].max()))),
@@ -225,6 +220,16 @@ def described_pose(
         misfit_s,
         covariance,
     )
+
+
+def turn_between(filed_m: FloatArray, measured_m: FloatArray) -> Rotation:
+    """Return the turn about its centre that takes an array (K, 3) from one pose to another, metres."""
+    arms_m, filed_arms_m = measured_m - measured_m.mean(axis=0), filed_m - filed_m.mean(axis=0)
+    if line_axis(filed_m) is not None:  # its longest arm says all; more of them leave the turn about it open
+        longest = [int(np.linalg.norm(filed_arms_m, axis=1).argmax())]
+        arms_m, filed_arms_m = arms_m[longest], filed_arms_m[longest]
+    turn, _ = Rotation.align_vectors(arms_m, filed_arms_m)
+    return turn
 
 
 def _against_filed(

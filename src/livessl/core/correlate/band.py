@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.types import BoolArray, ComplexArray, Float32Array, FloatArray
 

@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.band import band_bins
 from livessl.core.correlate.band import uses_envelope as uses_envelope

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.band import band_bins
 from livessl.core.correlate.decimation import Decimator, decimation

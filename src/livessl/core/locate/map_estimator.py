@@ -120,14 +120,19 @@ class MapEstimator(ABC):
         return GCCPhat(self.arrays[array], sample_rate_hz, self.c_m_s, self.front_end)
 
     def _mapper(self, evidence: Evidence) -> SRPMapper:
-        """Return the mapper for an array's lag axis, which changes with its sampling rate."""
+        """Return the mapper for an array's lag axis, which changes with its sampling rate.
+
+        Evidence of an estimator with another set-up of the arrays is mapped as well, with a mapper of its own.
+        """
         spec, gcc = evidence.spec, evidence.gcc
-        known = self._mappers.get(spec.name)
+        is_own = spec is self.arrays.get(spec.name)
+        known = self._mappers.get(spec.name) if is_own else None
         if known is not None and np.array_equal(known[0], gcc.lags_s):
             return known[1]
         cut_offs_hz = third_octaves_below_hz(spec.band_hz)[: len(evidence.below)]
         mapper = SRPMapper(spec, self._map_grid, gcc.pairs, gcc.lags_s, self.c_m_s, cut_offs_hz)
-        self._mappers[spec.name] = (gcc.lags_s, mapper)
+        if is_own:
+            self._mappers[spec.name] = (gcc.lags_s, mapper)
         return mapper
 
 

@@ -12,7 +12,7 @@ from livessl.core.correlate.gcc_phat import LagSampling, require_band
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
-from livessl.core.locate.confidence import LEAST_CONFIDENCE, Judgement, background_power
+from livessl.core.locate.confidence import CROSSING_DEG, LEAST_CONFIDENCE, NEAR_M, Judgement, background_power
 from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.frame_gccs import BEGINNING, FrameGCCs
@@ -23,6 +23,7 @@ from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place, highest_place
 from livessl.core.locate.second_source import SecondSourceSearch
 from livessl.core.locate.srp import SRPFunctional
+from livessl.core.locate.tolerant import tolerant
 from livessl.core.methods import ONSET
 from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array
 
@@ -153,6 +154,21 @@ class Onset(MapEstimator):
         return tuple(self._onset_evidence(name, sounds[name]) for name in sorted(sounds))
 
     def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
+        """Answer by sharp evidence, unless another place is more certain when clocks inside the arrays may be apart.
+
+        Where the arrays do not determine the distance, the places of both differ along the line of sight.
+        """
+        sharp = self._answer_by(evidence, suspect, whole=whole)
+        if not sharp.contributing or sharp.judgement.features.crossing_deg < CROSSING_DEG:
+            return sharp
+        place = sharp.consensus.place
+        (peak,) = self._search.among([tolerant(part) for part in sharp.evidence])(1)
+        if np.linalg.norm(self.grid.point_m(peak.point) - place.position_m) <= NEAR_M:
+            return sharp
+        wide = self._answer_by(tuple(tolerant(part) for part in evidence), suspect, whole=whole)
+        return max(sharp, wide, key=_Answer.rank)
+
+    def _answer_by(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool) -> _Answer:
         together = self._place(evidence)
         terms = together.functional.pair_terms(together.position_m)
         kept = contributing(together.evidence, terms, self._highest_power, self.c_m_s)

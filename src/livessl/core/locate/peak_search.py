@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -77,7 +77,7 @@ class PeakSearch:
         self._cube_places = np.zeros((total, count), np.uint16)
         self._of_cubes, self._known = np.zeros(count, np.float32), np.zeros(count, np.bool_)
         self._values, self._maxima, self._reaching, self._of_cells = _Buffer(), _Buffer(), _Buffer(), _Buffer()
-        self._kernels = kernels.in_use  # what makes the tables, and searches with them
+        self._kernels: Any = None  # what makes the tables, and searches with them, once there are any
         self._lags_s: dict[str, FloatArray] = {}
         self._lags: dict[str, LagPlaces] = {}
         self._sets: dict[tuple[str, ...], _Among] = {}
@@ -95,6 +95,8 @@ class PeakSearch:
                 f"array {array!r}: expected fewer than {NO_LAG} lags, got {len(lags_s)}; "
                 "its microphones are too far apart for its sampling rate"
             )
+        if self._kernels is None:
+            self._kernels = kernels.in_use
         spec, pairs, first = self._specs[array], self._pairs[array], self._first_row[array]
         places = self._lags[array] = LagPlaces.on(lags_s, self._c_m_s)
         self._lags_s[array] = lags_s

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.special import erf
+import scipy
 
 from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
 from livessl.core.geometry import microphone_pairs, pair_weight
@@ -89,7 +89,7 @@ def probability_within(radius_m: float, covariance_m2: FloatArray) -> float:
     deviations_m = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2), 0.0))
     reach = radius_m / np.maximum(np.linalg.norm(_directions() * deviations_m, axis=1), 1e-12)
     density = np.sqrt(2.0 / np.pi) * reach * np.exp(-np.square(reach) / 2.0)
-    return float(np.mean(erf(reach / np.sqrt(2.0)) - density))
+    return float(np.mean(scipy.special.erf(reach / np.sqrt(2.0)) - density))
 
 
 def half_axis_m(covariance_m2: FloatArray) -> float:

@@ -1,8 +1,8 @@
 """Aligns the frames of all arrays on one frame index, and decides what to do with late frames. It reads no clock.
 
 A frame index closes when every array that is awaited has reached it, or at its deadline. A frame that comes later is
-counted as late, and contributes nothing to windows and events that have been located; the final pass (`final_pass`)
-uses it. An array is awaited while it sends, keeps up, and is not excluded.
+counted as late. Early results that were already computed do not include it; the final pass (`final_pass`) does. An
+array is awaited while it sends, keeps up, and is not excluded.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, Frame, Message
 
 EARLIEST_NS: Final = -30_000_000_000
-"""Least difference, in nanoseconds, of a frame's time from the server's; older sound counts only as
-backlog."""
+"""Limit, in nanoseconds, of a frame's time minus the server's: below it, 30 s in the past, a frame is backlog."""
 
 LATEST_NS: Final = 500_000_000
-"""Greatest difference, in nanoseconds, of a frame's time from the server's; two clocks set by NTP differ by less."""
+"""Limit, in nanoseconds, of a frame's time minus the server's: above it a frame is rejected. NTP is better."""
 
 JUMP_FRAMES: Final = 1200
-"""Gap, in frames, that is skipped instead of being closed one frame index after the other: a minute."""
+"""Gap, in frames, beyond which the frame indices in between are skipped and not closed one by one: a minute."""
 
 
 def is_ahead_of_clock(frame_index: int, now_ns: int) -> bool:
@@ -52,7 +51,7 @@ class Alignment:
         self._state = state
         self._deadline_s = state.parameters.deadline_s
         self._watches_health = watches_health
-        self._reached: deque[tuple[int, int]] = deque()  # frame indices that were the newest, and when they came
+        self._reached: deque[tuple[int, int]] = deque()  # each new highest frame index, and when it came
         self.streams = {
             name: ArrayStream(spec, ArrayHealth(len(spec.microphones_m))) for name, spec in state.arrays.items()
         }
@@ -64,7 +63,7 @@ class Alignment:
         self.reported_until: int | None = None
         """Frame index before which all sound has been reported; None before the first event."""
         self.unknown_arrays = 0
-        """Number of messages of arrays that the site does not have."""
+        """Number of messages from arrays that are not in the site file."""
 
     @property
     def closed(self) -> int | None:
@@ -72,7 +71,7 @@ class Alignment:
         return None if self.next is None else self.next - 1
 
     def pre_roll_start(self, start: int) -> int:
-        """Return the first frame index, pre-roll included, of a sound that became active at `start`."""
+        """Return where the pre-roll of a sound that became active at `start` begins: after what has been reported."""
         first = start - self._state.parameters.activity.pre_roll_frames
         return first if self.reported_until is None else max(first, self.reported_until)
 
@@ -168,7 +167,7 @@ class Alignment:
             stream.fall_behind()
 
     def is_everyone_silent(self) -> bool:
-        """Return whether no array has sent anything for a deadline and a hang-over."""
+        """Return whether no array has sent anything for longer than the deadline and the hang-over together."""
         quiet_ns = self._deadline_s * 1e9 + self._state.parameters.activity.hang_over_s * 1e9
         last_ns = (stream.last_message_ns for stream in self.streams.values())
         return all(at_ns is None or self.now_ns - at_ns > quiet_ns for at_ns in last_ns)
@@ -218,8 +217,8 @@ class Alignment:
     def correct_clocks(self) -> bool:
         """Align the arrays by the known offsets of their clocks from here on; return whether any frame index moved.
 
-        Call it only between sounds: it would tear one. If an array's frame indices grow, sound that was already
-        reported is not reported again.
+        Call it only between sounds: in the middle of one it would split the sound. If an array's frame indices grow,
+        sound that was already reported is not reported again.
         """
         clocks, moved, onward = self._state.clock_offsets, False, 0
         if clocks is None:

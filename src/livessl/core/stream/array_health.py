@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.band import band_bins, dead_channels
 from livessl.core.stream.clock_offsets import ClockOffset, clock_is_off

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.onset_gcc import OnsetGCC, summed
 from livessl.core.geometry import microphone_pairs

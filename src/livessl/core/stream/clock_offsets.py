@@ -14,7 +14,7 @@ from dataclasses import astuple, dataclass
 from typing import Any, Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
 

@@ -43,7 +43,7 @@ class EvidenceCollector:
 
     def __init__(self, state: SiteState, alignment: Alignment, *, correlates_ahead: bool) -> None:
         self._state = state
-        self._cache = state.cache
+        self._cache = state.cache  # that of the event that goes on, or of the last one
         self._votes = state.votes
         self._channel_faults = state.channel_faults
         self._parameters = state.parameters
@@ -108,7 +108,8 @@ class EvidenceCollector:
         self._postponed.clear()
         self._begin = self._alignment.pre_roll_start(start)
         span = range(self._begin, start)
-        goes_on = start == self._alignment.reported_until
+        goes_on = start == self._alignment.reported_until and self._cache is self._state.cache
+        self._cache = self._state.cache
         if not goes_on:
             self._clearest = Clearest()
         self._choose([*span, start])
@@ -164,7 +165,8 @@ class EvidenceCollector:
                 stream.begin_upcoming()
         elif self._ahead != range(begin, frame_index):
             return
-        self._cache.extend(((stream.spec.name, stream.upcoming, stream.frames) for stream in streams), [frame_index])
+        followed = ((stream.spec.name, stream.upcoming, stream.frames) for stream in streams)
+        self._state.cache.extend(followed, [frame_index])
         self._ahead = range(begin, frame_index + 1)
 
     def discard_ahead(self) -> None:
@@ -220,8 +222,8 @@ class EvidenceCollector:
 
     def whole_sounds(self, arrays: Iterable[str], span: range) -> list[tuple[ArraySpec, list[Frame]]]:
         """Return each array's longest segment of frames in a span; without arrays whose samples were released."""
-        streams = [self._alignment.streams[name] for name in arrays]
-        return [(s.spec, max(s.segments(span)[0], key=len)) for s in streams if s.has_samples(span)]
+        specs, streams = self._state.arrays, [self._alignment.streams[name] for name in arrays]
+        return [(specs[s.spec.name], max(s.segments(span)[0], key=len)) for s in streams if s.has_samples(span)]
 
     def event(self, span: range) -> Excerpt:
         """Return the active frames, by the exact rule, of an event that spans these frame indices with its pre-roll."""

@@ -19,7 +19,7 @@ from livessl.core.stream.fusion import Fusion, Role
 from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
 from livessl.core.stream.load_policy import Relief
 from livessl.core.stream.reception import FinalReception, earlier, later
-from livessl.core.stream.site_state import SiteState
+from livessl.core.stream.site_state import ArraySetUp, SiteState
 from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Mark, Message, Output, Window
 
 STRIDE: Final = 40
@@ -65,7 +65,7 @@ class TwoPassFusion:
         hold_ns: int = HOLD_NS,
         hold_bytes: int = HOLD_BYTES,
     ) -> None:
-        self._state = state
+        self._state, self._final_state = state, state.for_another_pass()
         self._limits = hold_ns, hold_bytes
         self._early = Fusion(state, Role(newest_only=newest_only, learns_clocks=False))
         self._receptions = {name: FinalReception() for name in arrays}
@@ -110,6 +110,16 @@ class TwoPassFusion:
     def relieve(self, relief: Relief) -> None:
         """Shed this from now on: see `load_policy`."""
         self._state.relieve(relief)
+
+    def take_over(self, set_up: ArraySetUp) -> None:
+        """Locate with another set-up of the same arrays from now on.
+
+        Events that have begun are located as before in both passes; those that begin later, with the other set-up.
+        """
+        closed = self._early.closed
+        for state in (self._state, self._final_state):
+            state.follow(set_up, None if closed is None else closed + 1)
+        self._state.votes.clear()
 
     @property
     def held_bytes(self) -> int:
@@ -192,7 +202,8 @@ class TwoPassFusion:
         return outputs
 
     def _begin(self, settled: int | None) -> None:
-        self._final = Fusion(self._state, FINAL)
+        self._final_state.use_newest()
+        self._final = Fusion(self._final_state, FINAL)
         if settled is not None:
             self._final.begin(settled)
         self._settled = settled

@@ -118,7 +118,7 @@ class Fusion:
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute what an array's sound will need, so that its first event does not wait for it."""
-        self._state.estimator.prepare(array, sample_rate_hz)
+        self._state.prepare(array, sample_rate_hz)
 
     def begin(self, frame_index: int) -> None:
         """Record that all sound before a frame index has been reported."""
@@ -212,6 +212,7 @@ class Fusion:
         self._alignment.start_over()
         self._collector.discard_ahead()
         self._reporter.start_over()
+        self._state.use_newest()
         self._state.cache.clear()
         self._state.votes.clear()
         self._state.channel_faults.clear()
@@ -239,6 +240,8 @@ class Fusion:
 
     def _close(self, frame_index: int) -> list[Output]:
         active = any(stream.has_active(frame_index) for stream in self._alignment.streams.values())
+        if self._event is None and self._state.advance(frame_index):
+            self._collector.discard_ahead()
         if active and self._event is None:
             self._collector.begin_event(frame_index)
             self._event = PendingEvent(frame_index)

@@ -6,7 +6,7 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.band import spectrum_power
 from livessl.core.stream.activity import ActivityParameters, CausalActivity

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import Final
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from typing import Final, Self
 
 from livessl.core.locate.estimator import Estimator
 from livessl.core.stream.channel_faults import ChannelFaults
@@ -20,8 +22,39 @@ MOST_CORRELATED: Final = 32
 method locates with. Correlating the others costs most of what an array costs, and does not move the position."""
 
 
+@dataclass(frozen=True, slots=True)
+class ArraySetUp:
+    """The arrays at their places, and what locates with them.
+
+    Parameters
+    ----------
+    arrays : mapping of array to ArraySpec
+    estimator : Estimator
+    cache : CorrelationCache
+        Correlations by the estimator's front ends.
+    """
+
+    arrays: Mapping[str, ArraySpec]
+    estimator: Estimator
+    cache: CorrelationCache
+
+    @classmethod
+    def of(cls, arrays: Sequence[ArraySpec], estimator: Estimator, for_each: ForEach | None = None) -> Self:
+        """Return the set-up of some arrays, with an empty cache."""
+        return cls({spec.name: spec for spec in arrays}, estimator, CorrelationCache(estimator, for_each))
+
+
+@dataclass(slots=True)
+class _Conditions:
+    """What changes while a site runs, and all passes share."""
+
+    answering: set[str] = field(default_factory=set)
+    excluded: Collection[str] = ()
+    relief: Relief = NOTHING_SHED
+
+
 class SiteState:
-    """State of a site that does not depend on the pass.
+    """State of a site. All but the set-up of the arrays is shared by its passes.
 
     Parameters
     ----------
@@ -52,21 +85,73 @@ class SiteState:
     ) -> None:
         self.site = site
         self.free_axes = free_axes
-        self.arrays = {spec.name: spec for spec in arrays}
-        self.estimator = estimator
         self.parameters = parameters or FusionParameters()
         self.clock_offsets = clock_offsets
-        self.cache = CorrelationCache(estimator, for_each)
+        self._set_up = ArraySetUp.of(arrays, estimator, for_each)
+        self._following: deque[tuple[int, ArraySetUp]] = deque()  # and the frame indices from which they apply
         self.votes = OutlierVotes(self.arrays)
         self.channel_faults = ChannelFaults(self.arrays)
-        self._answering: set[str] = set()
-        self._excluded: Collection[str] = ()
-        self.relief = NOTHING_SHED
+        self._conditions = _Conditions()
+
+    # --- the set-up of the arrays, which each pass follows by itself
+
+    def for_another_pass(self) -> SiteState:
+        """Return the state for another pass over the same messages: it follows the set-up of the arrays by itself."""
+        other = copy(self)
+        other._following = deque(self._following)
+        return other
+
+    @property
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The arrays by name."""
+        return self._set_up.arrays
+
+    @property
+    def estimator(self) -> Estimator:
+        """What locates."""
+        return self._set_up.estimator
+
+    @property
+    def cache(self) -> CorrelationCache:
+        """The correlations of the arrays' frames."""
+        return self._set_up.cache
+
+    def follow(self, set_up: ArraySetUp, first: int | None) -> None:
+        """Use another set-up of the same arrays from a frame index on; None for at once."""
+        if first is None:
+            self._set_up = set_up
+            self._following.clear()
+        else:
+            self._following.append((first, set_up))
+
+    def advance(self, frame_index: int) -> bool:
+        """Use the set-up that applies at a frame index before which all events are reported; return if it changed."""
+        before = self._set_up
+        while self._following and self._following[0][0] <= frame_index:
+            self._set_up = self._following.popleft()[1]
+        return self._set_up is not before
+
+    def use_newest(self) -> None:
+        """Use the set-up that was given last: the frame indices from which others were to apply are void."""
+        if self._following:
+            self._set_up = self._following[-1][1]
+            self._following.clear()
+
+    def prepare(self, array: str, sample_rate_hz: float) -> None:
+        """Compute what an array's sound will need, with every set-up that is to be used."""
+        for set_up in (self._set_up, *(following for _, following in self._following)):
+            set_up.estimator.prepare(array, sample_rate_hz)
+
+    # --- conditions
+
+    @property
+    def relief(self) -> Relief:
         """The work that is shed while the server is overloaded."""
+        return self._conditions.relief
 
     def relieve(self, relief: Relief) -> None:
         """Shed this from now on."""
-        self.relief = relief
+        self._conditions.relief = relief
 
     @property
     def most_arrays(self) -> int:
@@ -80,29 +165,30 @@ class SiteState:
 
         No frame of an excluded array is active, awaited or requested.
         """
-        self._excluded = arrays
+        self._conditions.excluded = arrays
 
     def is_excluded(self, array: str) -> bool:
         """Return whether an array is excluded."""
-        return array in self._excluded
+        return array in self._conditions.excluded
 
     def without_excluded(self, message: Message) -> Message:
         """Return a message as it is used: no frame of an excluded array is active."""
-        if message.array in self._excluded and isinstance(message, Frame) and message.active:
+        if message.array in self._conditions.excluded and isinstance(message, Frame) and message.active:
             return replace(message, active=False)
         return message
 
     def set_answers(self, array: str, answers: bool) -> None:
         """Record whether the node of an array answers backfill requests; at first none does."""
-        (self._answering.add if answers else self._answering.discard)(array)
+        answering = self._conditions.answering
+        (answering.add if answers else answering.discard)(array)
 
     def stop_answers(self) -> None:
         """Record that no node answers backfill requests any more."""
-        self._answering.clear()
+        self._conditions.answering.clear()
 
     def answers(self, array: str) -> bool:
         """Return whether the node of an array answers backfill requests."""
-        return array in self._answering
+        return array in self._conditions.answering
 
     def may_request(self, array: str) -> bool:
         """Return whether frames may be requested from an array: its node answers, and its sound would be used."""

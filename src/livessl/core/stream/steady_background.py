@@ -14,7 +14,7 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.correlate.band import band_bins
 from livessl.core.types import FRAME_S, BoolArray, ComplexArray, Float32Array, FloatArray

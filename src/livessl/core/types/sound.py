@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
+from livessl.core.states import ClockState
 from livessl.core.types.arrays import BoolArray, Float32Array, FloatArray, IntArray, RealArray, read_only
 from livessl.core.types.report import ChannelLevel, HostState
 
 FRAME_NS: Final = 50_000_000
-"""Length of a frame, and step of the grid of frames in site time, in nanoseconds: the paper's 50 ms."""
+"""Length of a frame, and step of the frame index, in nanoseconds: the paper's 50 ms."""
 
 FRAME_S: Final = FRAME_NS / 1e9
 """Length of a frame in seconds."""
@@ -28,14 +28,6 @@ MAX_SAMPLE: Final = 1e6
 file or sender, and one such sample would mask every other array."""
 
 
-class ClockState(StrEnum):
-    """Reliability of a node's mapping from sample index to site time."""
-
-    SETTLING = "settling"
-    LOCKED = "locked"
-    STEPPED = "stepped"
-
-
 @dataclass(frozen=True, slots=True)
 class Block:
     """Samples that a device delivers at once.
@@ -45,7 +37,7 @@ class Block:
     first_index : int
         Index of the first sample, counted by the device from the start of the stream.
     samples : (channels, n) float32
-        Samples in [-1, 1). An empty block means that no samples are there yet: a device never blocks.
+        Samples in [-1, 1). An empty block means that no samples are available yet; reading never waits.
     stamp_ns : int
         Site time at which the first sample was seen to arrive, in nanoseconds since the epoch; it jitters.
     overflow : bool
@@ -121,7 +113,7 @@ class Frame:
         read_only(self.samples)
 
     def without_samples(self) -> Frame:
-        """Return this frame with no samples, for what is known of it without them."""
+        """Return a copy without samples that keeps name, times, power and activity."""
         return Frame(
             self.array,
             self.sequence,
@@ -153,7 +145,8 @@ class Mark:
     channel_power : tuple of float
         In-band mean power of each channel, full scale squared; 0 for a dead channel.
     overflows, lost_frames : int
-        Counts since the node started: blocks that followed a loss of samples; frames dropped for a gap or a full spool.
+        Counts since the node started. `overflows` counts blocks that follow lost samples; `lost_frames` counts frames
+        that were dropped because of a gap or a full spool.
     drift_ppm : float
         Rate of the device's clock against site time, parts per million; 0 until it is known.
     clock : ClockState
@@ -219,7 +212,7 @@ class GCC:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Standard deviations of what is known of an array's set-up.
+    """How exactly an array's set-up is known, as standard deviations.
 
     Parameters
     ----------
@@ -228,7 +221,7 @@ class Uncertainty:
     orientation_deg : float
         Angle by which it may be turned, degrees.
     clock_s : float
-        Delay between two channels of the array, seconds: 0 if one converter samples them all.
+        Standard deviation of the delay between two channels, seconds; 0 if one converter samples them all.
     temperature_c : float
         Air temperature, degrees Celsius.
     """
@@ -254,12 +247,14 @@ class ArraySpec:
     uncertainty : Uncertainty
         How well its set-up is known.
     parts : tuple of int
-        Numbers of microphones that stand on one frame each, in the order of the channels; empty if all do.
+        Number of microphones on each rigid part of a joint array, in the order of the channels; empty if all are on
+        one part.
 
     Raises
     ------
     ValueError
-        If the number of microphones or the band is out of range, or the parts are not all microphones.
+        If the number of microphones or the band is out of range, or the parts do not add up to the number of
+        microphones.
     """
 
     name: str
@@ -335,7 +330,7 @@ class Observation:
     delays_s : (K,) float64
         Delay of each channel against the mean of all that have one, seconds; NaN for a channel without sound.
     inverted : (K,) bool
-        Channels of opposite polarity to most.
+        True for channels whose polarity is opposite to that of most channels.
     coherence : (K,) float64
         Mean height of the correlations of each channel with the others at these delays: about 1 for a single direct
         sound, about 0 for a channel that received something else.
@@ -344,7 +339,7 @@ class Observation:
     sharpness : float
         Mean height of all pairs' correlations at these delays over their root mean square; noise gives 1 to 3.
     closure_s : float
-        Root mean square by which the pairs' own peaks differ from the delays, seconds.
+        Root mean square difference between each pair's peak lag and the lag that `delays_s` implies, seconds.
     """
 
     array: str

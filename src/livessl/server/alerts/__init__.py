@@ -1,4 +1,4 @@
-"""Alerts: rules are judged, what they raise is kept in an outbox, and actions deliver it.
+"""Alerts: `judge` applies the rules, `outbox` keeps what they raise, and `courier` delivers it by the `actions`.
 
 Nothing here is awaited by the fusion thread, and no module but `service` starts a thread.
 """

@@ -14,6 +14,7 @@ from typing import Any, Final, Protocol, TypeVar, cast
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError, Fault
+from livessl.server.alerts.evidence import Evidence
 from livessl.server.api.encode import JsonObject
 from livessl.site.alert_models import AlertAction
 from livessl.site.models import Site
@@ -84,6 +85,8 @@ class ActionSetting:
         Names of rules that no action of its type takes, those included that the site file no longer has.
     url : str
         Address of the server for people.
+    evidence : Evidence
+        Makes what can be attached to alerts.
     """
 
     name: str
@@ -93,6 +96,7 @@ class ActionSetting:
     rules: Sequence[str]
     other_rules: Sequence[str]
     url: str
+    evidence: Evidence
 
     @property
     def place(self) -> str:

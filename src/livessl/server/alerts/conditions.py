@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final, NamedTuple
 
 from livessl.core.commission.finding import Finding, Severity
+from livessl.core.commission.report_watch import REPORTED
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.rules import NS_PER_S, RuleState, Verdict, judge
 from livessl.server.api.encode import JsonObject
+from livessl.server.set_up_watch import SetUpState
 from livessl.site.alert_models import AlertRule
 
 _WEIGHT: Final = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
@@ -46,17 +48,34 @@ def observe_arrays(name: str, rule: AlertRule, arrays: Sequence[JsonObject], mes
     return Observed(bad, frozenset(unknown - set(bad)))
 
 
-def observe_findings(name: str, rule: AlertRule, findings: Sequence[Finding], messages: AlertMessages) -> Observed:
-    """Return the findings that a rule watches."""
+def observe_findings(
+    name: str, rule: AlertRule, set_up: SetUpState, ongoing: Collection[str], messages: AlertMessages
+) -> Observed:
+    """Return the findings that a rule watches.
+
+    Most need some sounds, and some need reports of the nodes. Until these have come, nothing is known of the `ongoing`
+    ones, which have alerted before a restart; what is found without them alerts at once.
+    """
     condition = rule.findings
     assert condition is not None
     bad = {
-        f"{finding.fault} {finding.array} {finding.channel}": partial(messages.of_finding, name, finding)
-        for finding in findings
+        subject_of(finding): partial(messages.of_finding, name, finding, subject_of(finding))
+        for finding in set_up.findings
         if _WEIGHT[finding.severity] >= _WEIGHT[condition.severity]
         and (not condition.faults or finding.fault in condition.faults)
     }
-    return Observed(bad)
+    unknown = {subject for subject in ongoing if not set_up.knows(subject.partition(" ")[0])}
+    return Observed(bad, frozenset(unknown - set(bad)))
+
+
+def subject_of(finding: Finding) -> str:
+    """Return what names a finding in the state of a rule and in a key: its code, array and channel.
+
+    A report about a node's machine names no array; the node is at the head of its message, before the figures.
+    """
+    has_no_name = finding.array is None and finding.fault in REPORTED
+    place = finding.message.partition(":")[0] if has_no_name else finding.array
+    return f"{finding.fault} {place} {finding.channel}"
 
 
 class ConditionWatch:

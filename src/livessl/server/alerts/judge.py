@@ -3,18 +3,40 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 from livessl.clock import Clock
-from livessl.core.commission.finding import Finding
 from livessl.server.alerts.conditions import ConditionWatch, Observed, observe_arrays, observe_findings
 from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.outbox import Outbox, Raised
-from livessl.server.alerts.rules import RuleState, Verdict, judge, judge_event, match
+from livessl.server.alerts.rules import RuleState, Verdict, judge_and_note, judge_event, match
 from livessl.server.api.encode import JsonObject
+from livessl.server.set_up_watch import SetUpState
 from livessl.server.zones.shapes import ZoneMap
 from livessl.site.models import Site
+
+
+class _Case(NamedTuple):
+    """Something that a rule must decide about.
+
+    Parameters
+    ----------
+    rule : str
+    keys : sequence of str
+        Key of its alert, then further keys under which it may have alerted before.
+    decide : callable
+        From the rule's state to the verdict and the state after it.
+    make : callable
+        Makes the alert at a time, in nanoseconds.
+    """
+
+    rule: str
+    keys: Sequence[str]
+    decide: Callable[[RuleState], tuple[Verdict, RuleState]]
+    make: Callable[[int], JsonObject]
 
 
 class Judge:
@@ -98,26 +120,20 @@ class Judge:
             If nothing could be kept; then nothing has happened, and the events can be judged again.
         """
         zones = self._zones()
-        with self._lock:
-            states: dict[str, RuleState] = {}
-            raised: dict[str, Raised] = {}
-            for event, time_ns in events:
-                for name, rule in self._rules.items():
-                    if rule.events is None or (early and not rule.events.early):
-                        continue
-                    found = match(rule.events, event, zones)
-                    if found is None:
-                        continue
-                    key, *older = (self._messages.key(name, each) for each in (event["id"], *event["replaces"]))
-                    if not raised.keys().isdisjoint((key, *older)) or self._outbox.has((key, *older)):
-                        continue  # this sound has alerted already, as an early event or before a restart
-                    state = states.get(name, self._states[name])
-                    verdict, states[name] = judge_event(rule, state, event, time_ns, self._zone)
-                    if verdict is Verdict.ALERT:
-                        now_ns = self._clock.now_ns()
-                        alert = self._messages.of_event(name, event, found, rule.events.count, now_ns)
-                        raised[key] = Raised(alert, time_ns, rule.actions)
-            return self._commit(list(raised.values()), states, until_ns)
+
+        def cases(event: JsonObject, time_ns: int) -> Iterator[_Case]:
+            for name, rule in self._rules.items():
+                if rule.events is None or (early and not rule.events.early):
+                    continue
+                found = match(rule.events, event, zones)
+                if found is not None:
+                    # any of these keys says that this sound has alerted, as an early event or before a restart
+                    keys = [self._messages.key(name, each) for each in (event["id"], *event["replaces"])]
+                    decide = partial(judge_event, rule, event=event, time_ns=time_ns, zone=self._zone)
+                    make = partial(self._messages.of_event, name, event, found, rule.events.count)
+                    yield _Case(name, keys, decide, make)
+
+        return self._judge(events, cases, until_ns)
 
     def judge_changes(self, changes: Sequence[tuple[JsonObject, int]]) -> list[JsonObject]:
         """Judge what tracks do in zones, each with its site time in nanoseconds; return the new alerts.
@@ -127,30 +143,20 @@ class Judge:
         OutboxError
             If nothing could be kept.
         """
-        with self._lock:
-            states: dict[str, RuleState] = {}
-            raised: list[Raised] = []
-            for change, time_ns in changes:
-                for name, rule in self._rules.items():
-                    watched = rule.tracks
-                    if (
-                        watched is None
-                        or change["zone"] not in watched.zones
-                        or change["change"] not in watched.changes
-                    ):
-                        continue
-                    state = states.get(name, self._states[name])
-                    verdict = judge(rule, state, time_ns, self._zone)
-                    states[name] = state.noting(verdict, time_ns)
-                    if verdict is Verdict.ALERT:
-                        alert = self._messages.of_change(name, change, time_ns, self._clock.now_ns())
-                        raised.append(Raised(alert, time_ns, rule.actions))
-            return self._commit(raised, states)
 
-    def judge_conditions(
-        self, arrays: Sequence[JsonObject], findings: Sequence[Finding] | None, now_ns: int
-    ) -> list[JsonObject]:
-        """Judge the states of the arrays, and the findings if they are known; return the new alerts.
+        def cases(change: JsonObject, time_ns: int) -> Iterator[_Case]:
+            for name, rule in self._rules.items():
+                watched = rule.tracks
+                if watched is None or change["zone"] not in watched.zones or change["change"] not in watched.changes:
+                    continue
+                key = self._messages.key_of_change(name, change, time_ns)
+                decide = partial(judge_and_note, rule, time_ns=time_ns, zone=self._zone)
+                yield _Case(name, [key], decide, partial(self._messages.of_change, name, change, time_ns))
+
+        return self._judge(changes, cases)
+
+    def judge_conditions(self, arrays: Sequence[JsonObject], set_up: SetUpState, now_ns: int) -> list[JsonObject]:
+        """Judge the states of the arrays, and the findings about the set-up; return the new alerts.
 
         Raises
         ------
@@ -161,9 +167,7 @@ class Judge:
             states: dict[str, RuleState] = {}
             raised: list[Raised] = []
             for name, watch in self._watches.items():
-                observed = self._observed(name, arrays, findings)
-                if observed is None:
-                    continue
+                observed = self._observed(name, arrays, set_up)
                 alerts, state = watch.look(observed, self._states[name], now_ns)
                 if state != self._states[name]:
                     states[name] = state
@@ -181,11 +185,31 @@ class Judge:
         with self._lock:
             self._commit([], {}, until_ns)
 
-    def _observed(self, name: str, arrays: Sequence[JsonObject], findings: Sequence[Finding] | None) -> Observed | None:
+    def _judge(
+        self,
+        given: Sequence[tuple[JsonObject, int]],
+        cases: Callable[[JsonObject, int], Iterable[_Case]],
+        until_ns: int | None = None,
+    ) -> list[JsonObject]:
+        """Judge what has happened, each with its site time, by the rules that it concerns; return the new alerts."""
+        with self._lock:
+            states: dict[str, RuleState] = {}
+            raised: dict[str, Raised] = {}
+            for happened, time_ns in given:
+                for case in cases(happened, time_ns):
+                    if not raised.keys().isdisjoint(case.keys) or self._outbox.has(case.keys):
+                        continue
+                    verdict, states[case.rule] = case.decide(states.get(case.rule, self._states[case.rule]))
+                    if verdict is Verdict.ALERT:
+                        actions = self._rules[case.rule].actions
+                        raised[case.keys[0]] = Raised(case.make(self._clock.now_ns()), time_ns, actions)
+            return self._commit(list(raised.values()), states, until_ns)
+
+    def _observed(self, name: str, arrays: Sequence[JsonObject], set_up: SetUpState) -> Observed:
         rule = self._rules[name]
         if rule.arrays is not None:
             return observe_arrays(name, rule, arrays, self._messages)
-        return None if findings is None else observe_findings(name, rule, findings, self._messages)
+        return observe_findings(name, rule, set_up, self._states[name].ongoing, self._messages)
 
     def _commit(
         self, raised: Sequence[Raised], states: dict[str, RuleState], until_ns: int | None = None

@@ -32,6 +32,7 @@ class AlertMessages:
     def __init__(self, site: Site, url: str) -> None:
         self._site = site.site
         self._url = url
+        self._has_clips = site.server.clips is not None
 
     def key(self, rule: str, subject: str) -> str:
         """Return the key of a rule's alert about an event, or about something else that a text names.
@@ -41,6 +42,10 @@ class AlertMessages:
         digest = hashlib.sha256("\0".join((self._site, rule, subject)).encode()).hexdigest()
         return KEY_PREFIX + digest[:KEY_DIGITS]
 
+    def key_of_change(self, rule: str, change: JsonObject, time_ns: int) -> str:
+        """Return the key of a rule's alert about what a track did in a zone at some site time."""
+        return self.key(rule, _change_subject(change, time_ns))
+
     def of_event(self, rule: str, event: JsonObject, match: Match, count: int, raised_ns: int) -> JsonObject:
         """Return the alert about an event, the last of `count` that the rule asks for."""
         zones = [{"name": name, "probability": round(value, 4)} for name, value in match.zones.items()]
@@ -49,6 +54,8 @@ class AlertMessages:
             "time_utc": event["time_utc"],
             "text": _event_text(event, match.zones, count),
             "link": f"{self._url}/#event={event['id']}",
+            "picture": self._picture(rule, event["id"]),
+            "clips": f"{self._url}/api/v1/events/{event['id']}/clips" if self._has_clips else None,
             "zones": [zone["name"] for zone in zones],
             "membership": zones,
             "count": count,
@@ -60,10 +67,11 @@ class AlertMessages:
 
     def of_change(self, rule: str, change: JsonObject, time_ns: int, raised_ns: int) -> JsonObject:
         """Return the alert about a track that enters, leaves, or loiters in a zone."""
-        subject = f"track {change['track_id']} {change['change']} {change['zone']} {time_ns}"
+        subject = _change_subject(change, time_ns)
         inside = {"name": change["zone"], "probability": change["probability"]}
         return {
             **self._of_condition(rule, subject, time_ns, raised_ns, _change_text(change)),
+            "picture": self._picture(rule, subject),
             "zones": change["zones"],
             "membership": [inside],
             "change": change,
@@ -77,9 +85,9 @@ class AlertMessages:
         seen = {"name": name, "state": state, "reason": reason}
         return self._of_condition(rule, subject, since_ns, raised_ns, text, array=seen)
 
-    def of_finding(self, rule: str, finding: Finding, since_ns: int, raised_ns: int) -> JsonObject:
-        """Return the alert about a fault of the set-up that has shown since some site time."""
-        subject = f"finding {finding.fault} {finding.array} {finding.channel} {since_ns}"
+    def of_finding(self, rule: str, finding: Finding, about: str, since_ns: int, raised_ns: int) -> JsonObject:
+        """Return the alert about a fault of the set-up, which a text names, that has shown since some site time."""
+        subject = f"finding {about} {since_ns}"
         text = f"{finding.message}; {finding.cure}"
         seen = {"kind": "finding", **asdict(finding)}
         return self._of_condition(rule, subject, since_ns, raised_ns, text, finding=seen)
@@ -92,6 +100,8 @@ class AlertMessages:
             "time_utc": utc_text(since_ns),
             "text": text,
             "link": f"{self._url}/",
+            "picture": None,
+            "clips": None,
             "zones": [],
             "membership": [],
             "count": 1,
@@ -100,6 +110,9 @@ class AlertMessages:
             "finding": seen.get("finding"),
             "change": None,
         }
+
+    def _picture(self, rule: str, subject: str) -> str:
+        return f"{self._url}/api/v1/alerts/{self.key(rule, subject)}/picture.png"
 
     def _head(self, rule: str, subject: str, raised_ns: int) -> JsonObject:
         return {
@@ -132,6 +145,11 @@ def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> st
     inside = "".join(f", in zone {name!r} with probability {value:.2f}" for name, value in zones.items())
     level = "" if event["level_dbfs"] is None else f", {event['level_dbfs']:.1f} dBFS"
     return f"{what}{where}{inside}, confidence {event['confidence']:.2f}{level}, {event['duration_s']:.2f} s long"
+
+
+def _change_subject(change: JsonObject, time_ns: int) -> str:
+    """Return what names a change of a track for ever: two of one track, zone and time are one."""
+    return f"track {change['track_id']} {change['change']} {change['zone']} {time_ns}"
 
 
 def _change_text(change: JsonObject) -> str:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from livessl.server.alerts.actions import ActionSetting, DeliveryError, in_daemon_thread, optional_library
 from livessl.server.alerts.message import body, title
@@ -34,7 +37,10 @@ class Notification:
         service = apprise.Apprise.instantiate(lines[0]) if len(lines) == 1 else None
         if service is None:  # the text may hold a password, and is not repeated
             raise fault(path, "expected one URL of a service that Apprise knows; see docs/alerts.md")
+        self._apprise = apprise
         self._service = service
+        self._attached = config.attach if service.attachment_support else ()
+        self._evidence = setting.evidence
         self._timeout_s = setting.config.timeout_s
 
     @asynccontextmanager
@@ -50,16 +56,26 @@ class Notification:
         DeliveryError
             If the service does not accept it in time.
         """
-
-        def send() -> bool:
-            return bool(self._service.notify(title=title(alert), body=body(alert)))
-
+        picture = self._evidence.picture(alert) if "picture" in self._attached else None
+        clip = await self._evidence.clip(alert) if "clip" in self._attached else None
         try:
             async with asyncio.timeout(self._timeout_s):
-                accepted = await in_daemon_thread(send)
+                accepted = await in_daemon_thread(partial(self._send, alert, picture, clip))
         except TimeoutError as error:
             raise DeliveryError(f"no answer within {self._timeout_s:g} s") from error
         except Exception as error:
             raise DeliveryError(f"{type(error).__name__}: {error}") from error
         if not accepted:
             raise DeliveryError("the service did not accept it; the log of Apprise says why")
+
+    def _send(self, alert: JsonObject, picture: bytes | None, clip: Path | None) -> bool:
+        """Send an alert with what is attached to it; return whether the service has accepted it."""
+        with TemporaryDirectory(prefix="livessl-alert-") as folder:
+            files = []
+            if picture is not None:
+                files.append(Path(folder) / "map.png")
+                files[-1].write_bytes(picture)
+            if clip is not None and clip.is_file():  # it may have been deleted meanwhile
+                files.append(clip)
+            attached = self._apprise.AppriseAttachment([str(file) for file in files]) if files else None
+            return bool(self._service.notify(title=title(alert), body=body(alert), attach=attached))

@@ -1,7 +1,8 @@
 """The outbox: alerts, their deliveries and the rules' states, in SQLite, so that none is lost in a restart.
 
 What a batch of events raises is written in one transaction with how far the events are judged. A server that is killed
-judges the others again, and the keys of alerts prevent a second entry.
+judges the others again, and the keys of alerts prevent a second entry. `courier` delivers what is in it, and says when
+to try again.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from livessl.errors import RunError
+from livessl.schema.alerts import DeliveryState as DeliveryState
 from livessl.server.alerts.rules import RuleState
 from livessl.server.api.encode import JsonObject
 
@@ -33,18 +34,6 @@ NO_ACTION: Final = "the site file no longer has this action"
 """Why an alert was given up whose action was removed."""
 
 CURE: Final = "free space on its disk, or close the program that locks the file"
-
-
-class DeliveryState(StrEnum):
-    """Progress of one alert to one action.
-
-    It waits for the next attempt, arrived, was given up (a dead letter), or was dismissed by an operator after that.
-    """
-
-    WAITING = "waiting"
-    DELIVERED = "delivered"
-    DEAD = "dead"
-    DISMISSED = "dismissed"
 
 
 class Raised(NamedTuple):
@@ -95,6 +84,7 @@ class Outbox:
     """
 
     def __init__(self, path: Path | None = None) -> None:
+        self.path = path
         self._lock = threading.Lock()
         try:
             self._db = sqlite3.connect(path or ":memory:", timeout=BUSY_S, check_same_thread=False)
@@ -172,6 +162,11 @@ class Outbox:
     def has(self, keys: Iterable[str]) -> bool:
         """Return whether there is an alert with one of these keys."""
         return any(self._rows("SELECT 1 FROM alerts WHERE key = ?", (key,)) for key in keys)
+
+    def get(self, key: str) -> JsonObject | None:
+        """Return the alert of a key; None if there is none, or none any more."""
+        rows = self._rows("SELECT json FROM alerts WHERE key = ?", (key,))
+        return dict(json.loads(rows[0][0])) if rows else None
 
     def states(self) -> dict[str, RuleState]:
         """Return the states of all rules that have one."""

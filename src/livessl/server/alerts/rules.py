@@ -138,23 +138,26 @@ def match(condition: EventCondition, event: JsonObject, zones: ZoneMap) -> Match
     level = event["level_dbfs"]
     if condition.min_level_dbfs is not None and (level is None or level < condition.min_level_dbfs):
         return None
-    position_m, covariance_m2 = event["position_m"], event["covariance_m2"]
+    found = zones.probabilities(event["position_m"], event["covariance_m2"])
     # a rule can be older than a zone: one that was deleted holds nothing
-    named = [zone for zone in condition.zones if zone in zones.zones]
-    found = {zone: zones.probability(zone, position_m, covariance_m2) for zone in named}
-    inside = {zone: probability for zone, probability in found.items() if probability >= condition.probability}
-    if (condition.zones and not inside) or _is_excluded(event, zones):
+    inside = {zone: found[zone] for zone in condition.zones if found.get(zone, 0.0) >= condition.probability}
+    if (condition.zones and not inside) or _is_excluded(event, zones, found):
         return None
     return Match(inside)
 
 
-def _is_excluded(event: JsonObject, zones: ZoneMap) -> bool:
-    """Return whether an event was excluded when it was located, or is by the zones now, as for a dry run."""
-    if event.get("excluded", False):
-        return True
-    fans = [name for name, zone in zones.zones.items() if zone.exclude]
-    found = {name: zones.probability(name, event["position_m"], event["covariance_m2"]) for name in fans}
-    return bool(zones.excluding(zones.holding(event["position_m"]) if fans else [], found))
+def _is_excluded(event: JsonObject, zones: ZoneMap, found: Mapping[str, float]) -> bool:
+    """Return whether an event was excluded when it was located, or is by the zones now, as for a dry run.
+
+    `found` has the probability of each zone.
+    """
+    return bool(event.get("excluded", False) or zones.excluding(zones.holding(event["position_m"]), found))
+
+
+def judge_and_note(rule: AlertRule, state: RuleState, time_ns: int, zone: str | None) -> tuple[Verdict, RuleState]:
+    """Decide whether a rule alerts about something that began at this site time; return the state after it, too."""
+    verdict = judge(rule, state, time_ns, zone)
+    return verdict, state.noting(verdict, time_ns)
 
 
 def judge_event(

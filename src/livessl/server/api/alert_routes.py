@@ -10,21 +10,25 @@ from typing import Annotated, Final
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 
 from livessl.clock import utc_text
+from livessl.schema import alerts as alert_schema
+from livessl.schema.answers import errors
 from livessl.server.alerts.history import DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
+from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
 from livessl.server.alerts.schedule import is_open
-from livessl.server.api import alert_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.routes import as_json
 from livessl.server.parts import Parts
+from livessl.site.alert_models import AlertsConfig
 
 DAY_NS: Final = 86_400_000_000_000
 
 DRY_RUN_RETRY_S: Final = 5
 """Wait, in seconds, that is asked of a client whose dry run found another one under way."""
 
+_BINARY: Final = {"type": "string", "format": "binary"}
+_NO_PICTURE: Final = "There is no alert of that key, or it is about no place."
 _NO_RULE: Final = "There is no rule of that name."
 _NOT_ON_EVENTS: Final = "There is no rule of that name on events: only events are stored."
 _NO_LETTER: Final = "There is no dead letter of that number, or the site file does not have its action."
@@ -58,11 +62,32 @@ def alert_routes(parts: Parts) -> APIRouter:
         next_before = rows[limit - 1][0] if len(rows) > limit else None
         return as_json({"v": API_VERSION, "alerts": found, "next_before": next_before})
 
+    @router.get(
+        "/{key}/picture.png",
+        response_class=Response,
+        responses={
+            200: {"description": "The picture.", "content": {"image/png": {"schema": _BINARY}}},
+            **errors(404, 503, texts={404: _NO_PICTURE, 503: _OUTBOX}),
+        },
+    )
+    def get_picture(
+        key: str,
+        size: Annotated[int, Query(ge=64, le=MAX_PX, description="length of the longer side in pixels")] = DEFAULT_PX,
+    ) -> Response:
+        """The floor plan with arrays, zones, and the place of an alert with its ellipse of 95 %."""
+        with _outbox_errors():
+            alert = alerts.outbox.get(key)
+        picture = None if alert is None else alerts.evidence.picture(alert, size)
+        if picture is None:
+            raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
+        return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
+
     @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
-        states = alerts.states
-        return as_json({"v": API_VERSION, "rules": [_rule(parts, name, state) for name, state in states.items()]})
+        config, states, now_ns = alerts.config, alerts.states, parts.clock.now_ns()
+        found = [_rule(config, name, states[name], now_ns) for name in config.rules if name in states]
+        return as_json({"v": API_VERSION, "rules": found})
 
     @router.put(
         "/rules/{name}/armed",
@@ -74,7 +99,9 @@ def alert_routes(parts: Parts) -> APIRouter:
         _check_rule(parts, name)
         with _outbox_errors():
             alerts.arm(name, switch.armed)
-        _log.info("%r has %s rule %r", request.scope["client_name"], "armed" if switch.armed else "disarmed", name)
+        who, done = request.scope["client_name"], "armed" if switch.armed else "disarmed"
+        _log.info("%r has %s rule %r", who, done, name)
+        parts.journal.configuration(f"rule {name}", who, f"{who!r} has {done} rule {name!r}", switch.model_dump())
         return as_json({"v": API_VERSION, "name": name, "armed": switch.armed})
 
     @router.get(
@@ -87,7 +114,7 @@ def alert_routes(parts: Parts) -> APIRouter:
     ) -> Response:
         """Try a rule on the stored events: how often it would have alerted."""
         _check_rule(parts, name)
-        if parts.site.alerts.rules[name].events is None:
+        if alerts.config.rules[name].events is None:
             raise HTTPException(404, f"rule {name!r} is not on events, and only events are stored")
         now_ns = parts.clock.now_ns()
         since_ns = now_ns - round(days * DAY_NS)
@@ -182,7 +209,7 @@ def dead_letter_routes(parts: Parts) -> APIRouter:
 
 
 def _check_rule(parts: Parts, name: str) -> None:
-    rules = parts.site.alerts.rules
+    rules = parts.alerts.config.rules
     if name not in rules:
         raise HTTPException(404, f"no rule {name!r}; rules are {', '.join(rules) or 'none'}")
 
@@ -208,13 +235,13 @@ def _delivery(delivery: Delivery) -> JsonObject:
     }
 
 
-def _rule(parts: Parts, name: str, state: RuleState) -> JsonObject:
-    rule, config = parts.site.alerts.rules[name], parts.site.alerts
+def _rule(config: AlertsConfig, name: str, state: RuleState, now_ns: int) -> JsonObject:
+    rule = config.rules[name]
     return {
         "name": name,
         "watches": rule.kind,
         "armed": state.armed,
-        "open_now": is_open(rule.schedule, parts.clock.now_ns(), config.timezone),
+        "open_now": is_open(rule.schedule, now_ns, config.timezone),
         "actions": list(rule.actions),
         "alerts": state.alerts,
         "last_utc": None if state.last_ns is None else utc_text(state.last_ns),

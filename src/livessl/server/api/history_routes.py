@@ -16,8 +16,8 @@ from pydantic import WithJsonSchema
 
 from livessl.clock import utc_text
 from livessl.core.types import Status
-from livessl.server.api import answers
-from livessl.server.api.answers import errors
+from livessl.schema import answers
+from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.png import map_png
 from livessl.server.api.queries import array_names, instant, page_cursor, unprocessable
@@ -75,6 +75,9 @@ def _filters(parts: Parts) -> Callable[..., EventQuery]:
                 description="only events with this text in id, status, reason, method, zones or arrays, in any case",
             ),
         ] = None,
+        excluded: Annotated[
+            bool | None, Query(description="only events in excluded zones, or only events elsewhere")
+        ] = None,
     ) -> EventQuery:
         zones = parts.zone_book.current.zones
         if zone is not None and zone not in zones:
@@ -93,6 +96,7 @@ def _filters(parts: Parts) -> Callable[..., EventQuery]:
             min_level_dbfs=min_level_dbfs,
             array=array,
             text=text,
+            excluded=excluded,
         )
 
     return filters

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from livessl.core.types import Float32Array
+from livessl.core.types import Float32Array, RealArray
 
 _ANCHORS: Final = np.array(
     [[10, 8, 30], [66, 20, 108], [140, 42, 115], [214, 72, 82], [248, 142, 60], [252, 246, 176]], dtype=np.float64
@@ -20,12 +20,16 @@ _ANCHORS: Final = np.array(
 def map_png(image: Float32Array) -> bytes:
     """Draw a map (rows, columns) as a PNG with the first row at the bottom, dark up to the median, light at the top."""
     low, high = float(np.median(image)), float(image.max())
-    level = np.clip((image - low) / max(high - low, 1e-12), 0.0, 1.0)[::-1]
+    return encode_png(map_colours(np.clip((image - low) / max(high - low, 1e-12), 0.0, 1.0)[::-1]))
+
+
+def map_colours(level: RealArray) -> NDArray[np.uint8]:
+    """Return the colours (RGB) of levels from 0 to 1, (..., 3)."""
     place = level * (len(_ANCHORS) - 1)
     left = np.minimum(place.astype(np.int64), len(_ANCHORS) - 2)
     fraction = (place - left)[..., None]
-    colours = _ANCHORS[left] * (1.0 - fraction) + _ANCHORS[left + 1] * fraction
-    return encode_png(colours.astype(np.uint8))
+    colours: NDArray[np.uint8] = (_ANCHORS[left] * (1.0 - fraction) + _ANCHORS[left + 1] * fraction).astype(np.uint8)
+    return colours
 
 
 def encode_png(pixels: NDArray[np.uint8]) -> bytes:

@@ -1,4 +1,4 @@
-"""Prometheus metrics of what nodes report of their channels and machines."""
+"""Prometheus metrics of nodes' channels and machines, as the nodes report them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LEVELS: Final = {
     "peak_dbfs": ("livessl_channel_peak_dbfs", "Largest magnitude of a sample since the report before, in dBFS."),
     "rms_dbfs": ("livessl_channel_rms_dbfs", "Level of the channel over the whole band, in dBFS."),
     "noise_dbfs": ("livessl_channel_noise_dbfs", "Noise floor of the channel, in dBFS."),
-    "hum_dbfs": ("livessl_channel_hum_dbfs", "Level of hum of the mains in the channel, in dBFS; absent without hum."),
+    "hum_dbfs": ("livessl_channel_hum_dbfs", "Level of mains hum in the channel, in dBFS; absent without hum."),
     "mean": ("livessl_channel_mean", "Mean of the channel's samples, full scale 1."),
 }
 
@@ -44,7 +44,9 @@ def _host_metrics(arrays: Iterable[JsonObject]) -> Iterator[Metric]:
         labels=["array"],
     )
     error = GaugeMetricFamily(
-        "livessl_node_clock_error_seconds", "Largest error of that clock by its own account.", labels=["array"]
+        "livessl_node_clock_error_seconds",
+        "Largest error of the node's system clock, in seconds, as its time service reports it.",
+        labels=["array"],
     )
     load = GaugeMetricFamily("livessl_node_load", "Load of the node's machine per processor.", labels=["array"])
     lost = CounterMetricFamily(

@@ -15,8 +15,8 @@ from pydantic import WithJsonSchema
 from livessl import __version__
 from livessl.clock import utc_text
 from livessl.core.types import FRAME_S
-from livessl.server.api import answers
-from livessl.server.api.answers import errors
+from livessl.schema import answers
+from livessl.schema.answers import errors
 from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 _DATE_TIME: Final = {"type": "string", "format": "date-time"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
-_MAP_HEADERS: Final = {
+MAP_HEADERS: Final = {
     name: {"description": description, "schema": schema, "example": example}
     for name, schema, example, description in (
         ("X-Map-Shape", {"type": "string"}, "200,160", "Lengths of the axes: rows and columns, or x, y and z."),
@@ -47,7 +47,7 @@ Time = Annotated[str, WithJsonSchema(_DATE_TIME)]
 
 
 def as_json(found: JsonObject, status: int = 200) -> Response:
-    """An answer as JSON. The models in `answers.py` describe it and are not run."""
+    """An answer as JSON. The models in `schema/answers.py` describe it and are not run."""
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
@@ -62,19 +62,12 @@ def describe_site(parts: Parts) -> JsonObject:
         "mode": parts.site_time.mode,
         "room": {"size_m": list(site.room.size_m)},
         "grid": {"bounds_m": [list(b) for b in grid.bounds_m], "spacing_m": grid.spacing_m, "shape": list(grid.shape)},
-        "speed_of_sound_m_s": site.c_m_s,
+        "speed_of_sound_m_s": parts.set_up.site.c_m_s,
         "band_hz": list(site.band_hz),
         "method": site.fusion.method,
         "frame_s": FRAME_S,
         "activity": {"threshold": site.activity.threshold, "floor_factor": site.activity.floor_factor},
-        "arrays": {
-            spec.name: {
-                "position_m": spec.centre_m.round(4).tolist(),
-                "microphones_m": spec.microphones_m.round(4).tolist(),
-                "band_hz": list(spec.band_hz),
-            }
-            for spec in site.processed
-        },
+        "arrays": parts.set_up.describe_arrays(),
         "joint": {name: list(members) for name, members in site.joint.items()},
         "zones": parts.zone_book.describe(),
         "can_draw": site.zones_file is not None,
@@ -106,9 +99,13 @@ def state_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/arrays", tags=["state"], response_model=answers.Arrays)
     def get_arrays() -> Response:
-        """State, age of the last message, levels, drift and counters of every array."""
-        now_utc = utc_text(parts.site_time.now_ns())
-        return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": parts.array_states.describe()})
+        """State, age of the last message, levels, drift and counters of every array, and where it is."""
+        now_utc, places = utc_text(parts.site_time.now_ns()), parts.set_up.describe_arrays()
+        arrays = [
+            {**array, **{key: places[array["name"]][key] for key in ("position_m", "microphones_m")}}
+            for array in parts.array_states.describe()
+        ]
+        return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": arrays})
 
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
@@ -199,7 +196,9 @@ def switch_route(parts: Parts) -> APIRouter:
         except StoreError as error:
             raise HTTPException(503, str(error)) from error
         done = "enabled" if switch.enabled else "disabled"
-        _log.info("%r has %s array %r", request.scope["client_name"], done, name)
+        who = request.scope["client_name"]
+        _log.info("%r has %s array %r", who, done, name)
+        parts.journal.configuration(f"array {name}", who, f"{who!r} has {done} array {name!r}", switch.model_dump())
         return as_json({"v": API_VERSION, "name": name, "enabled": switch.enabled})
 
     return router
@@ -238,7 +237,7 @@ def map_route(parts: Parts) -> APIRouter:
             200: {
                 "description": "The map: a picture, or little-endian float32 numbers, row by row.",
                 "content": {"image/png": _BINARY, "application/octet-stream": _BINARY},
-                "headers": _MAP_HEADERS,
+                "headers": MAP_HEADERS,
             },
             204: {"description": "No window has been localized yet."},
             **errors(404, texts={404: "There is no array of that name, or it has no part in the newest map."}),

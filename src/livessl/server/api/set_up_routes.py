@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from fastapi import APIRouter, HTTPException, Query, Response
@@ -12,12 +12,15 @@ from fastapi import APIRouter, HTTPException, Query, Response
 from livessl.clock import utc_text
 from livessl.core.commission.verification import set_up_verdict
 from livessl.core.types import FloatArray, Observation
+from livessl.schema.answers import errors
 from livessl.server.api import set_up_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject, where
 from livessl.server.api.routes import as_json
 from livessl.server.heard_sounds import HeardSound
 from livessl.server.parts import Parts
+
+PLACE_STD_M: Final = 0.03
+"""How exactly the places of claps are taken to be known where nobody says it, metres."""
 
 _TEXTS = {
     404: "One of the sounds is not kept: the last 64 are.",
@@ -49,7 +52,10 @@ def set_up_routes(parts: Parts) -> APIRouter:
 
         One sound shows that something is wrong; four usually show what.
         """
-        from livessl.site.build.set_up import verify_set_up  # scipy's optimizer takes memory, and no event needs it
+        from livessl.site.build.set_up import (
+            next_clap_place,
+            verify_set_up,
+        )  # scipy's optimizer takes memory, and no event needs it
 
         try:
             sounds = heard.numbered([clap.number for clap in request.claps])
@@ -59,7 +65,9 @@ def set_up_routes(parts: Parts) -> APIRouter:
         if not one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
             raise HTTPException(409, "another verification is running; try again in some seconds")
         try:
-            findings = verify_set_up(parts.site, [sound.observations for sound in sounds], places_m)
+            site = parts.set_up.site
+            findings = verify_set_up(site, [sound.observations for sound in sounds], places_m)
+            next_m = next_clap_place(site, places_m, PLACE_STD_M)
         finally:
             one_at_a_time.release()
         claps = [_clap(sound, place_m) for sound, place_m in zip(sounds, places_m, strict=True)]
@@ -69,6 +77,7 @@ def set_up_routes(parts: Parts) -> APIRouter:
                 "verdict": str(set_up_verdict(findings, [clap["error_m"] for clap in claps])),
                 "claps": claps,
                 "findings": [{"kind": "finding", **asdict(finding)} for finding in findings],
+                "next_place_m": None if next_m is None else next_m.round(3).tolist(),
             }
         )
 

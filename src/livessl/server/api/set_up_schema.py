@@ -1,15 +1,15 @@
-"""Models of the routes for setting up: the last sounds with their delays, and the verification by known places."""
+"""Models of the routes for setting up: sounds with their delays, verification, and proposals for the poses."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from livessl.core.commission.verification import SetUpVerdict
 from livessl.core.types import Status
-from livessl.server.api.answers import Finding
-from livessl.server.api.schema import PositionM, UtcTime, Version
+from livessl.schema.answers import Finding
+from livessl.schema.values import PositionM, UtcTime, Version
 
 MOST_CLAPS = 64
 """Most known places of one verification."""
@@ -107,3 +107,181 @@ class Verified(BaseModel):
     verdict: SetUpVerdict
     claps: list[VerifiedClap]
     findings: list[Finding] = Field(description="What explains the errors.")
+    next_place_m: PlaceM | None = Field(description="Where another clap would tell most; null if no place is free.")
+
+
+class MeasureRequest(VerifyRequest):
+    """Request to measure the poses of the arrays by sounds at measured places."""
+
+    place_std_m: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = Field(
+        default=0.03, description="How exactly the places are known along each axis: standard deviation in metres."
+    )
+
+
+class RefineRequest(BaseModel):
+    """Request to refine the poses of the arrays by the last sounds, wherever these were made."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    known: Annotated[
+        list[str], Field(min_length=1, description="Arrays that are where the site has them.", examples=[["north"]])
+    ]
+    position_std_m: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = Field(
+        default=0.1,
+        description="How exactly the positions of the other arrays are known: standard deviation in metres.",
+    )
+
+
+class TypedPose(BaseModel):
+    """Pose of an array that somebody typed or dragged."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    position_m: PlaceM
+    turn_deg: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = Field(
+        default=[0.0, 0.0, 0.0],
+        description="Turn from the present orientation about the array's centre: angles about x, then y, then z, in "
+        "degrees; the one about z counts counter-clockwise, seen from above.",
+        examples=[[0.0, 0.0, 15.0]],
+    )
+
+
+class MoveRequest(BaseModel):
+    """Request to propose poses that somebody typed or dragged."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    arrays: Annotated[dict[str, TypedPose], Field(min_length=1, description="Poses by the names of the arrays.")]
+
+
+class AcceptRequest(BaseModel):
+    """Request to bring a proposal into force."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str = Field(description="Id of the proposal.", examples=["poses-1767225600000-1"])
+
+
+class PlacedMicrophones(BaseModel):
+    """Where an array is."""
+
+    position_m: PositionM = Field(description="Mean position of the microphones [x, y, z] in metres.")
+    microphones_m: list[PositionM] = Field(description="Position of each microphone in channel order, in metres.")
+
+
+class ProposedPose(BaseModel):
+    """The pose of an array before and after a proposal."""
+
+    array: str = Field(description="Name of the array.", examples=["south"])
+    before: PlacedMicrophones
+    after: PlacedMicrophones
+    shift_m: PositionM = Field(description="Shift of its centre, in metres.")
+    turn_deg: PositionM = Field(
+        description="Turn about its centre: a vector along the axis, whose length is the angle in degrees."
+    )
+    position_std_m: float | None = Field(
+        ge=0,
+        description="Largest standard deviation of the position along any axis, in metres; null for a typed pose.",
+        examples=[0.015],
+    )
+    orientation_std_deg: float | None = Field(
+        ge=0,
+        description="Largest standard deviation of the orientation about any axis, in degrees; null for a typed pose.",
+        examples=[0.4],
+    )
+    misfit_us: list[float] | None = Field(
+        description="Root mean square of what the poses before and after leave unexplained of the delays, in "
+        "microseconds; null for a typed pose.",
+        examples=[[310.2, 11.8]],
+    )
+    determined: bool | None = Field(
+        description="Whether the sounds determine the pose; null for a typed pose.", examples=[True]
+    )
+
+
+class MeasuredSpeed(BaseModel):
+    """The speed of sound that sounds say."""
+
+    speed_of_sound_m_s: float = Field(gt=0, description="Metres a second.", examples=[344.2])
+    std_m_s: float = Field(ge=0, description="Its standard deviation, in metres a second.", examples=[0.6])
+    in_force_m_s: float = Field(gt=0, description="The one that positions are computed with.", examples=[343.0])
+
+
+class FittedClap(BaseModel):
+    """How far a sound was found from where it was made, by its delays alone."""
+
+    number: Number
+    place_m: PlaceM
+    before_m: float | None = Field(
+        ge=0,
+        description="With the poses before, in metres; null if fewer than two arrays received it.",
+        examples=[0.84],
+    )
+    after_m: float | None = Field(ge=0, description="With the proposed poses, in metres.", examples=[0.03])
+    agrees: bool | None = Field(description="Whether it agrees with the proposed poses.", examples=[True])
+
+
+class Proposal(BaseModel):
+    """Poses that somebody may accept; they are not in force."""
+
+    id: str = Field(description="Id to accept it by.", examples=["poses-1767225600000-1"])
+    method: Literal["poses", "refine", "typed"] = Field(
+        description="`poses`: measured by claps at known places; `refine`: from unknown sounds; `typed`: by a person."
+    )
+    made_utc: UtcTime
+    sounds: int = Field(ge=0, description="Number of sounds that it rests on.", examples=[8])
+    known: list[str] = Field(description="Arrays that were taken to be right.", examples=[[]])
+    arrays: list[ProposedPose]
+    speed: MeasuredSpeed | None = Field(description="Null for typed poses.")
+    claps: list[FittedClap]
+    next_place_m: PlaceM | None = Field(description="Where another clap would improve the poses most; null if nowhere.")
+    enough: bool = Field(description="Whether another clap would hardly improve the poses.", examples=[False])
+    refusal: str | None = Field(description="Why it cannot be accepted; null if it can.", examples=[None])
+
+
+class OneProposal(Proposal):
+    """A proposal."""
+
+    v: Version
+
+
+class Calibration(BaseModel):
+    """The calibration file of the site, and what is in it."""
+
+    file: str = Field(description="Its name, from the folder of the site file.", examples=["calibration/lab.yaml"])
+    arrays: list[str] = Field(description="Arrays whose poses it holds; the others are where the site file says.")
+    method: str | None = Field(description="How the last change was measured; null if nothing is calibrated.")
+    measured_utc: str | None = Field(description="When; null if nothing is calibrated.")
+    sounds: int = Field(ge=0, description="Number of sounds that it rests on.")
+    can_undo: bool = Field(description="Whether there is a calibration before it to go back to.")
+    problem: str | None = Field(
+        description="Why the file cannot be read now; the poses in force stay.", examples=[None]
+    )
+
+
+class Refinement(BaseModel):
+    """What the sounds that were located so far say of the poses in force."""
+
+    sounds: int = Field(ge=0, description="Number of kept sounds that two arrays received.", examples=[24])
+    needed: int = Field(ge=0, description="Number from which poses are refined.", examples=[20])
+    agrees: bool | None = Field(description="Whether they agree with the poses; null if they leave it open.")
+    proposal: Proposal | None = Field(description="The poses that they say, if these differ; null otherwise.")
+
+
+class SetUp(BaseModel):
+    """The set-up in force."""
+
+    v: Version
+    calibration: Calibration
+    arrays: dict[str, PlacedMicrophones]
+    next_place_m: PlaceM | None = Field(description="Where to clap first; null if no place is free.")
+    refinement: Refinement
+
+
+class Changed(BaseModel):
+    """What a change of the set-up has changed."""
+
+    v: Version
+    changed: list[str] = Field(description="Arrays whose poses are other ones now.", examples=[["south"]])
+    calibration: Calibration
+    arrays: dict[str, PlacedMicrophones]

@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from livessl.server.api import zone_schema
-from livessl.server.api.answers import errors
+from livessl.schema import zones as zone_schema
+from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
@@ -49,7 +49,9 @@ def zone_routes(parts: Parts) -> APIRouter:
         """Draw a zone, or change a drawn one; it is in force at once; for operators."""
         with _refusals():
             book.put(name, zone)
-        _log.info("%r has drawn zone %r", request.scope["client_name"], name)
+        who, drawn = request.scope["client_name"], zone.model_dump(mode="json")
+        _log.info("%r has drawn zone %r", who, name)
+        parts.journal.configuration(f"zone {name}", who, f"{who!r} has drawn zone {name!r}", {"zone": drawn})
         return as_json({"v": API_VERSION, "name": name, "zone": book.describe()[name]})
 
     @router.delete(
@@ -61,7 +63,9 @@ def zone_routes(parts: Parts) -> APIRouter:
         """Delete a drawn zone; for operators."""
         with _refusals():
             book.delete(name)
-        _log.info("%r has deleted zone %r", request.scope["client_name"], name)
+        who = request.scope["client_name"]
+        _log.info("%r has deleted zone %r", who, name)
+        parts.journal.configuration(f"zone {name}", who, f"{who!r} has deleted zone {name!r}", {"zone": None})
         return as_json({"v": API_VERSION, "name": name})
 
     @router.get("/api/v1/zone-changes", response_model=zone_schema.Changes)

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
@@ -17,7 +18,7 @@ from livessl.core.types import FRAME_NS, FRAME_S, Event, Message, Status
 from livessl.server.api.encode import JsonObject
 from livessl.server.clips.cut import Cut, cut
 from livessl.server.clips.folder import ClipFolder
-from livessl.server.clips.record import Recipe, write_clip
+from livessl.server.clips.record import ENHANCED, Recipe, write_clip
 from livessl.server.clips.ring import FrameRing
 from livessl.server.overload import Overload
 from livessl.server.site_time import SiteTime
@@ -122,6 +123,10 @@ class Clips:
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
+    def take_over(self, site: Site) -> None:
+        """Take the arrays to be where this site has them, from the next clip on; any thread may call it."""
+        self._site, self._specs = site, {spec.name: spec for spec in site.processed}
+
     # --- for the fusion thread
 
     def take(self, messages: Iterable[Message], settled: int | None) -> None:
@@ -184,6 +189,13 @@ class Clips:
             return any(job.event.id == event_id for job in self._waiting)
 
     # --- the thread
+
+    def best_file(self, event_id: str) -> Path | None:
+        """Return the recording that people listen to first: the enhanced one, or that of the first array."""
+        about = self.folder.about(event_id)
+        names = [] if about is None else [each["name"] for each in about["files"]]
+        name = ENHANCED if ENHANCED in names else next(iter(names), None)
+        return None if name is None else self.folder.file(event_id, name)
 
     def start(self) -> None:
         """Begin to cut clips."""

@@ -9,7 +9,7 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,7 @@ from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault, RunError
 from livessl.server.history.tables import metadata
 
-HEAD: Final = "0002"
+HEAD: Final = "0003"
 """The newest revision in `migrations/`; a database that has it needs no Alembic."""
 
 BUSY_S: Final = 0.2
@@ -179,7 +179,10 @@ class Database:
         """
         self._check()
         try:
-            with self._reading.connect() as connection:
+            with (
+                self._reading.connect() as connection,
+                nullcontext() if self.is_remote else _ending_in_time(connection),
+            ):
                 yield connection
         except PoolTimeoutError as error:
             what = f"server.events_db: all {READERS} connections for reading are taken by other searches"
@@ -319,19 +322,25 @@ def _sqlite(name: str, connections: int, *, writes: bool) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        if not writes:
-            _end_in_time(connection)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     return engine
 
 
-def _end_in_time(connection: Connection) -> None:
-    """Have SQLite interrupt what the connection still does after `STATEMENT_S`."""
+@contextmanager
+def _ending_in_time(connection: Connection) -> Iterator[None]:
+    """Have SQLite interrupt what the connection still does after `STATEMENT_S`.
+
+    A history in memory has one connection for everything, so what is written afterwards has no such limit.
+    """
     driver: Any = connection.connection.dbapi_connection
     clock = SystemClock()
     end_ns = clock.monotonic_ns() + round(1e9 * STATEMENT_S)
     driver.set_progress_handler(lambda: clock.monotonic_ns() > end_ns, STEPS)
+    try:
+        yield
+    finally:
+        driver.set_progress_handler(None, STEPS)
 
 
 def _on_connect(engine: Engine, set_up: Callable[[Any], None]) -> None:

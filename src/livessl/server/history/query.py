@@ -63,6 +63,8 @@ class Query:
         Array that detected the event or contributed to it.
     text : str or None
         Part of the event's id, status, reason, method, zones or arrays, in any case.
+    excluded : bool or None
+        Whether the event lies in an excluded zone.
     """
 
     since_ns: int | None = None
@@ -77,6 +79,7 @@ class Query:
     min_level_dbfs: float | None = None
     array: str | None = None
     text: str | None = None
+    excluded: bool | None = None
 
 
 class Row(NamedTuple):

@@ -17,9 +17,11 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
     -------
     Select, FromClause
         The statement, and the table that has `time_ns` and `number` in the order of the index that is searched: with
-        a zone or an array that of the tags, else that of the events.
+        a zone, an array or a flag that of the tags, else that of the events.
     """
-    wanted = [(kind, name) for kind, name in (("zone", query.zone), ("array", query.array)) if name is not None]
+    flag = "excluded" if query.excluded else None
+    named = (("flag", flag), ("zone", query.zone), ("array", query.array))
+    wanted = [(kind, name) for kind, name in named if name is not None]
     searched: FromClause = tags if wanted else events
     statement = select(*columns)
     if wanted:
@@ -27,9 +29,9 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
         statement = statement.select_from(tags.join(events, events.c.number == tags.c.number))
         statement = statement.where(tags.c.kind == kind, tags.c.name == name)
     for kind, name in wanted[1:]:
-        other = tags.alias()
-        here = (other.c.kind == kind, other.c.name == name, other.c.time_ns == searched.c.time_ns)
-        statement = statement.where(exists().where(and_(*here, other.c.number == searched.c.number)))
+        statement = statement.where(_is_tagged(searched, kind, name))
+    if query.excluded is False:
+        statement = statement.where(~_is_tagged(searched, "flag", "excluded"))
     compared = searched.c
     if query.since_ns is not None:
         statement = statement.where(compared.time_ns >= query.since_ns)
@@ -44,6 +46,13 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
     if query.text is not None:
         statement = statement.where(events.c.words.contains(query.text.lower(), autoescape=True))
     return statement, searched
+
+
+def _is_tagged(searched: FromClause, kind: str, name: str) -> ColumnElement[bool]:
+    """Return the condition that an event has a tag; the key of the tags answers it."""
+    other = tags.alias()
+    here = (other.c.kind == kind, other.c.name == name, other.c.time_ns == searched.c.time_ns)
+    return exists().where(and_(*here, other.c.number == searched.c.number))
 
 
 def page_statement(query: Query, most: int) -> Select[Any]:

@@ -74,7 +74,8 @@ tags: Final = Table(
     PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
     sqlite_with_rowid=False,
 )
-"""Zones and arrays of the events: rows of kind `zone` and `array`, with what a search compares besides."""
+"""Zones, arrays and flags of the events: rows of kind `zone`, `array` and `flag`, with what a search compares besides.
+The only flag is `excluded`."""
 
 Index("event_tags_number", tags.c.number)
 
@@ -100,6 +101,27 @@ disabled: Final = Table(
 )
 """Arrays that an operator has disabled."""
 
+journal: Final = Table(
+    "journal",
+    metadata,
+    Column("number", ROW_NUMBER, autoincrement=True),
+    Column("kind", String, nullable=False),
+    Column("name", String, nullable=False),
+    Column("key", String, nullable=False),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("text", Text, nullable=False),
+    Column("words", Text, nullable=False),
+    Column("body", Text, nullable=False),
+    PrimaryKeyConstraint("number"),
+    UniqueConstraint("key"),
+    sqlite_autoincrement=True,
+)
+"""Alerts, tracks, and changes of arrays and of the configuration: see `history.journal`. `words` is what a text is
+searched in, in lower case; `body` is the JSON of the details."""
+
+Index("journal_time", journal.c.time_ns, journal.c.number)
+Index("journal_kind", journal.c.kind, journal.c.time_ns, journal.c.number)
+
 
 def event_row(event: JsonObject, time_ns: int) -> dict[str, Any]:
     """Return an event's columns, without its number."""
@@ -122,9 +144,10 @@ def event_row(event: JsonObject, time_ns: int) -> dict[str, Any]:
 
 
 def tag_rows(event: JsonObject, row: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
-    """Yield the rows of an event's zones and arrays, each once."""
+    """Yield the rows of an event's zones, arrays and flags, each once."""
     arrays = [*(event.get("arrays") or ()), *(event.get("heard_by") or ())]
     compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
-    for kind, names in (("zone", event.get("zones") or ()), ("array", arrays)):
+    flags = ("excluded",) if event.get("excluded") else ()
+    for kind, names in (("zone", event.get("zones") or ()), ("array", arrays), ("flag", flags)):
         for name in dict.fromkeys(names):
             yield {"kind": kind, "name": name, "number": number, **compared}

@@ -127,6 +127,10 @@ const HANDLERS = {
     model.site.zones = zones;
     zoneEditor.show(zones, model.site.can_draw);
   },
+  poses({ arrays }) {
+    if (model.site !== null) model.site.arrays = arrays; // else it is loaded with them
+    setUp.posesChanged();
+  },
   gap(message) {
     header.showGap(message);
     loadAlerts();
@@ -144,7 +148,7 @@ const live = new Live(liveUrl(), {
 });
 
 function liveUrl() {
-  const url = new URL("live?kinds=update,event,track,arrays,alert,zones", API);
+  const url = new URL("live?kinds=update,event,track,arrays,alert,zones,poses", API);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   return url;
 }
@@ -183,12 +187,17 @@ async function getJson(path) {
 /** Send `value` for an answer that may take long; the error's `told` is what the server says is in its way. */
 async function postJson(path, value) {
   const response = await postLong(new URL(path, API), value);
-  if (response.status === 409) {
-    const { detail } = await response.json();
-    throw Object.assign(new Error(detail), { told: detail });
-  }
-  if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
-  return response.json();
+  if (response.ok) return response.json();
+  const error = new Error(`${path}: the server answered ${response.status}`);
+  const isJson = response.headers.get("Content-Type")?.startsWith("application/json") ?? false;
+  if (isJson && response.status !== 401) error.told = told((await response.json()).detail);
+  throw error;
+}
+
+/** A refusal as a sentence: the server's text, or what is wrong with each part of the request. */
+function told(detail) {
+  const parts = typeof detail === "string" ? [detail] : (detail ?? []).map(({ msg }) => msg.replace(/^Value error, /, ""));
+  return parts.length === 0 ? undefined : parts.join("; ");
 }
 
 /** Run `load`; if it fails, try again a few times. */

@@ -1,4 +1,4 @@
-// The guided verification: a place on the plan, a clap there, where it was found, and what explains the error.
+// Claps at measured places: where livessl found them, what explains the errors, and the poses that they say.
 
 import { el, find, write } from "./dom.js";
 import { number } from "./format.js";
@@ -8,17 +8,27 @@ import { findingItem } from "./set-up-findings.js";
 const POLL_MS = 300;
 /** Wait, in milliseconds, after which the page says that no sound came. */
 const LONG_MS = 15000;
-/** Claps from which on the cause of an error is told. */
+/** Claps from which on the cause of an error is told, and poses are measured. */
 const ENOUGH = 4;
+/** Claps that are usual for measuring poses. */
+const USUAL = 8;
 /** Sharpness below which no array received a sound clearly. */
 const LEAST_SHARPNESS = 3.5;
 const AXES = ["x", "y", "z"];
 
 export class ClapTest {
-  constructor({ load, send, plan, isOpen }) {
+  /** `onProposal(proposal)` is called with the poses that the claps say, and null where they say none any more. */
+  constructor({ load, send, plan, isOpen, onProposal, redraw }) {
     this.load = load;
     this.send = send;
     this.plan = plan;
+    this.onProposal = onProposal;
+    this.redraw = redraw;
+    /** The place that is proposed for the next clap, or null. */
+    this.next = null;
+    /** Whether the page proposes each place and measures the poses. */
+    this.guided = false;
+    this.may = false;
     /** Objects { number, place, found }: the claps so far. */
     this.claps = [];
     /** Counts the waits, so that an answer to one that was cancelled is ignored. */
@@ -34,14 +44,28 @@ export class ClapTest {
       else this.#wait();
     });
     find("clap-form").addEventListener("input", () => this.place());
-    find("clap-again").addEventListener("click", () => this.#restart());
+    find("clap-again").addEventListener("click", () => this.restart());
+    find("clap-use").addEventListener("click", () => this.#use());
+    find("clap-measure").addEventListener("click", () => this.#guide());
     this.marks = el("div", { className: "clap-marks", "aria-hidden": "true" });
     plan.canvas.after(this.marks);
   }
 
   set mayChange(may) {
+    this.may = may;
     find("clap-button").disabled = !may;
     find("clap-role").hidden = may;
+    this.#showGuide();
+  }
+
+  /** Propose a place for the next clap, or none. */
+  suggest(place) {
+    this.next = place;
+    const line = find("clap-suggest");
+    line.hidden = place === null;
+    if (place !== null) write(find("clap-suggest-where"), `Next place that helps most: ${words(place)}`);
+    if (this.guided && this.#isEmpty()) this.#use();
+    this.redraw();
   }
 
   /** Stop waiting for a clap. */
@@ -69,6 +93,57 @@ export class ClapTest {
       mark.style.left = `${left}px`;
       mark.style.top = `${top}px`;
     });
+  }
+
+  #isEmpty() {
+    return ["x", "y"].every((axis) => find(`clap-${axis}`).value === "");
+  }
+
+  /** Fill in the proposed place. */
+  #use() {
+    if (this.next === null) return;
+    AXES.forEach((axis, index) => { find(`clap-${axis}`).value = Number(this.next[index].toFixed(2)); });
+    this.place();
+  }
+
+  /** Begin to measure the poses: with the claps so far, and with each one from now on. */
+  async #guide() {
+    this.guided = true;
+    this.#showGuide();
+    if (this.#isEmpty()) this.#use();
+    if (this.claps.length < ENOUGH) this.#say("Go to the place that is filled in, or type another one; then press Clap here.");
+    else await this.#measure(this.waits);
+  }
+
+  /** Have the server measure the poses by the claps so far; nothing is applied. */
+  async #measure(wait) {
+    const stdM = find("clap-std").valueAsNumber / 100;
+    this.#say("Measuring…");
+    try {
+      const proposal = await this.send("set-up/measure", {
+        ...this.#request(), ...(stdM > 0 ? { place_std_m: stdM } : {}),
+      });
+      if (wait !== this.waits) return;
+      this.onProposal(proposal);
+      this.suggest(proposal.next_place_m);
+      this.#say("");
+    } catch (error) {
+      if (wait === this.waits) this.#say(error.told ?? `The server did not answer (${error.message}). Try again.`);
+    }
+  }
+
+  #request() {
+    return { claps: this.claps.map(({ sound, place }) => ({ number: sound, place_m: place })) };
+  }
+
+  #showGuide() {
+    const more = ENOUGH - this.claps.length;
+    const button = find("clap-measure");
+    button.hidden = this.guided && more > 0;
+    button.disabled = !this.may;
+    write(button, this.claps.length < ENOUGH ? "Guide me to measure the poses" : "Measure the poses with these claps");
+    const told = more > 0 ? `${more} more for a first result` : `${Math.max(0, USUAL - this.claps.length)} more are usual`;
+    write(find("clap-progress"), this.guided && this.claps.length < USUAL ? `${this.claps.length} of ${USUAL} claps: ${told}.` : "");
   }
 
   #choose([x, y]) {
@@ -118,12 +193,12 @@ export class ClapTest {
     this.claps.push({ sound, place, found });
     for (const axis of ["x", "y"]) find(`clap-${axis}`).value = "";
     this.#say("Comparing…");
+    this.#showGuide();
     this.place();
   }
 
   async #judge(wait) {
-    const request = { claps: this.claps.map(({ sound, place }) => ({ number: sound, place_m: place })) };
-    const answer = await this.send("set-up/verify", request);
+    const answer = await this.send("set-up/verify", this.#request());
     if (wait !== this.waits) return;
     find("claps").replaceChildren(...answer.claps.map(clapItem));
     find("clap-findings").replaceChildren(...answer.findings.map(findingItem));
@@ -133,6 +208,9 @@ export class ClapTest {
     verdict.dataset.verdict = answer.verdict;
     write(verdict, verdictText(answer));
     this.#end("");
+    this.#showGuide();
+    this.suggest(answer.next_place_m);
+    if (this.guided && this.claps.length >= ENOUGH) await this.#measure(this.waits);
   }
 
   #end(text) {
@@ -143,13 +221,18 @@ export class ClapTest {
     this.place();
   }
 
-  #restart() {
+  /** Forget the claps: they were for other poses. */
+  restart() {
     this.cancel();
     this.claps = [];
+    this.guided = false;
+    for (const axis of ["x", "y"]) find(`clap-${axis}`).value = "";
     find("claps").replaceChildren();
     find("clap-findings").replaceChildren();
     find("clap-verdict").hidden = true;
     find("clap-again").hidden = true;
+    this.onProposal(null);
+    this.#showGuide();
     this.place();
   }
 

@@ -1,14 +1,17 @@
-// The set-up view: arrays with the level of each input, findings with cures, and the guided verification by claps.
+// The set-up view: levels of the inputs, findings with cures, claps, proposed poses, and arrays that are moved by hand.
 
 import { el, find, write } from "./dom.js";
 import { counted, number } from "./format.js";
 import { shownState } from "./model.js";
 import { ClapTest } from "./set-up-claps.js";
 import { findingItem } from "./set-up-findings.js";
+import { ArrayMover } from "./set-up-move.js";
+import { PoseOverlay } from "./set-up-overlay.js";
+import { PosesPanel } from "./set-up-poses.js";
 
 /** The part of the page's address that opens the view. */
 export const SET_UP = "#set-up";
-/** How often, in milliseconds, findings are loaded while the view is open. */
+/** How often, in milliseconds, findings and the set-up in force are loaded while the view is open. */
 const FINDINGS_MS = 3000;
 /** Level at the left end of the level bars, in dBFS. */
 const LEAST_DBFS = -96;
@@ -21,7 +24,16 @@ export class SetUp {
   constructor({ load, send, plan, redraw }) {
     this.load = load;
     this.redraw = redraw;
-    this.claps = new ClapTest({ load, send, plan, isOpen: () => this.open });
+    this.overlay = new PoseOverlay(plan);
+    this.poses = new PosesPanel({ load, send, redraw });
+    this.mover = new ArrayMover({
+      plan, redraw: () => this.place(), propose: async (request) => this.poses.show(await send("set-up/move", request)),
+    });
+    this.claps = new ClapTest({
+      load, send, plan, redraw,
+      isOpen: () => this.open && this.mover.draft === null,
+      onProposal: (proposal) => this.poses.show(proposal),
+    });
     this.rows = new Map();
     this.timer = null;
     addEventListener("hashchange", () => this.#show());
@@ -35,6 +47,15 @@ export class SetUp {
   /** Whether the user may run the verification: it takes the server's time. */
   set mayChange(may) {
     this.claps.mayChange = may;
+    this.poses.mayChange = may;
+    this.mover.mayChange = may;
+  }
+
+  /** Other poses have come into force, by this page or by anybody else: claps and drafts were for those before. */
+  posesChanged() {
+    this.claps.restart();
+    this.mover.cancel();
+    if (this.open) this.#loadSetUp();
   }
 
   /** Show arrays as described by the server: objects { array }, see `Model.arrays`. */
@@ -51,7 +72,9 @@ export class SetUp {
 
   /** Move the marks of the claps to where the plan shows their places now. */
   place() {
-    if (this.open) this.claps.place();
+    if (!this.open) return;
+    this.claps.place();
+    this.overlay.draw(this.poses.proposal, this.mover.draft, this.mover.arrays, this.claps.next);
   }
 
   #show() {
@@ -61,14 +84,32 @@ export class SetUp {
     find("view-set-up").ariaCurrent = this.open ? "page" : null;
     clearInterval(this.timer);
     if (this.open) {
-      this.#loadFindings();
-      this.timer = setInterval(() => this.#loadFindings(), FINDINGS_MS);
-    } else this.claps.cancel();
+      this.#load();
+      this.timer = setInterval(() => this.#load(), FINDINGS_MS);
+    } else {
+      this.claps.cancel();
+      this.mover.cancel();
+    }
     this.redraw();
   }
 
-  async #loadFindings() {
+  #load() {
     if (document.hidden) return;
+    this.#loadFindings();
+    this.#loadSetUp();
+  }
+
+  async #loadSetUp() {
+    try {
+      await this.poses.refresh();
+      this.mover.show(this.poses.setUp.arrays);
+      if (this.claps.claps.length === 0) this.claps.suggest(this.poses.setUp.next_place_m);
+    } catch (error) {
+      console.warn("livessl:", error.message);
+    }
+  }
+
+  async #loadFindings() {
     try {
       const { sounds, findings } = await this.load("findings");
       write(find("set-up-sounds"), sounds === 0 ? "no sound yet" : `from the last ${counted(sounds, "sound")}`);

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.server.zones.membership import Prism, probability_in
+from livessl.server.zones.membership import PreparedZones, Prism
 from livessl.site.build.grid import search_grid
 from livessl.site.models import Site
 from livessl.site.zone_models import Zone
@@ -36,30 +36,34 @@ class ZoneMap:
         """All zones."""
         self.height_m = site.room.size_m[2]
         """Height of the room, up to which zones reach that give none."""
-        self._volume_m = np.array(search_grid(site).bounds_m, dtype=np.float64)
-        self._prisms = {name: _prism(zone) for name, zone in self.zones.items()}
+        volume_m = np.array(search_grid(site).bounds_m, dtype=np.float64)
+        self._prepared = PreparedZones([_prism(zone) for zone in self.zones.values()], volume_m)
+        self._last: tuple[bytes, dict[str, float]] = (b"", {})  # each rule asks about the same event
 
     def holding(self, position_m: Sequence[float] | None) -> list[str]:
         """Return the names of the zones in which a position lies."""
         return [] if position_m is None else [name for name, zone in self.zones.items() if zone.contains(position_m)]
 
-    def probability(self, zone: str, position_m: Any, covariance_m2: Any) -> float:
-        """Return the probability that a source is in a zone.
+    def probabilities(self, position_m: Any, covariance_m2: Any) -> dict[str, float]:
+        """Return the probability of each zone that a source is in it.
 
         Parameters
         ----------
-        zone : str
         position_m : (3,) array_like
             In metres.
         covariance_m2 : (3, 3) array_like
             Its covariance, in square metres.
         """
-        mean_m = np.asarray(position_m, dtype=np.float64)
-        return probability_in(mean_m, np.asarray(covariance_m2, dtype=np.float64), self._prisms[zone], self._volume_m)
+        mean_m, spread_m2 = np.array(position_m, dtype=np.float64), np.array(covariance_m2, dtype=np.float64)
+        asked, (known, found) = mean_m.tobytes() + spread_m2.tobytes(), self._last
+        if asked != known:
+            found = dict(zip(self.zones, self._prepared.probabilities(mean_m, spread_m2).tolist(), strict=True))
+            self._last = asked, found  # as a whole: every thread may ask
+        return found
 
     def memberships(self, position_m: Any, covariance_m2: Any) -> dict[str, float]:
         """Return the zones in which a source may be, each with its probability of at least `NAMED`."""
-        found = {name: self.probability(name, position_m, covariance_m2) for name in self.zones}
+        found = self.probabilities(position_m, covariance_m2)
         return {name: probability for name, probability in found.items() if probability >= NAMED}
 
     def excluding(self, holding: Sequence[str], memberships: Mapping[str, float]) -> list[str]:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, TypeVar
-
-import yaml
-from pydantic import BaseModel, ValidationError
+from typing import Final
 
 from livessl.core.geometry import as_positions_m, circle, line, posed, speed_of_sound_m_s, tetrahedron
 from livessl.core.joint_array import joined
 from livessl.core.types import ArraySpec, FloatArray, Uncertainty
 from livessl.errors import ConfigError, Fault
-from livessl.site.findings import dotted, read_yaml, reason, unknown_array, validation_findings
+from livessl.site.findings import read_model, unknown_array
 from livessl.site.models import (
     ArrayConfig,
     CalibratedArray,
@@ -26,8 +23,6 @@ from livessl.site.models import (
     UncertaintyConfig,
 )
 from livessl.site.place import Finding, Place
-
-Read = TypeVar("Read", bound=BaseModel)
 
 DEFAULT_SPEED_OF_SOUND_M_S: Final = 343.0
 """Speed of sound in m/s where the site file gives neither speed nor temperature: that of air at 20 degrees Celsius."""
@@ -42,7 +37,8 @@ def build_site(file: SiteFile, directory: Path) -> tuple[Site, list[Finding]]:
     directory : Path
         Folder that the names of geometry files are relative to.
     """
-    specs, faults = _array_specs(file, directory)
+    measured, strangers = _measured(file, directory)
+    specs, faults = _array_specs(file, directory, measured)
     processed, joint_faults = _processed_specs(file, specs)
     site = Site.model_construct(
         **dict(iter(file)),
@@ -52,7 +48,15 @@ def build_site(file: SiteFile, directory: Path) -> tuple[Site, list[Finding]]:
         processed=processed,
         drawn_zones={},
     )
-    return site, [*faults, *joint_faults]
+    return site, [*strangers, *faults, *joint_faults]
+
+
+def recalibrated(site: Site, calibration: CalibrationFile) -> tuple[Site, list[Finding]]:
+    """Return a site with the arrays as a calibration has them, and the faults of those that cannot be built."""
+    specs, faults = _array_specs(site, site.directory, calibration.arrays)
+    processed, joint_faults = _processed_specs(site, specs)
+    changed = site.model_copy(update={"specs": specs, "processed": processed})
+    return changed, [*_strangers(calibration, site), *faults, *joint_faults]
 
 
 def _speed_of_sound_m_s(file: SiteFile) -> float:
@@ -63,9 +67,11 @@ def _speed_of_sound_m_s(file: SiteFile) -> float:
     return DEFAULT_SPEED_OF_SOUND_M_S
 
 
-def _array_specs(file: SiteFile, directory: Path) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
+def _array_specs(
+    file: SiteFile, directory: Path, measured: Mapping[str, CalibratedArray]
+) -> tuple[tuple[ArraySpec, ...], list[Finding]]:
     specs: list[ArraySpec] = []
-    measured, faults = _measured(file, directory)
+    faults: list[Finding] = []
     for name, array in file.arrays.items():
         try:
             positions = _microphones_m(array, directory)
@@ -158,13 +164,16 @@ def _measured(file: SiteFile, directory: Path) -> tuple[dict[str, CalibratedArra
     if file.calibration is None:
         return {}, []
     try:
-        calibrated = _read_model(CalibrationFile, directory / file.calibration, "calibration file")
+        calibrated = read_model(CalibrationFile, directory / file.calibration, "calibration file")
     except ConfigError as error:
         return {}, [(("calibration",), str(fault)) for fault in error.faults]
-    strangers: list[Finding] = [
-        (("calibration",), unknown_array(name, file.arrays)) for name in calibrated.arrays.keys() - file.arrays
-    ]
-    return dict(calibrated.arrays), strangers
+    return dict(calibrated.arrays), _strangers(calibrated, file)
+
+
+def _strangers(calibrated: CalibrationFile, file: SiteFile) -> list[Finding]:
+    """Return a fault for each array of a calibration that the site does not have."""
+    unknown = sorted(calibrated.arrays.keys() - file.arrays)
+    return [(("calibration",), unknown_array(name, file.arrays)) for name in unknown]
 
 
 def _replaced(name: str, filed_m: FloatArray, measured_m: FloatArray) -> FloatArray:
@@ -186,14 +195,4 @@ def _shape_m(shape: Shape) -> FloatArray:
 
 
 def _geometry_file(path: Path) -> GeometryFile:
-    return _read_model(GeometryFile, path, "geometry file")
-
-
-def _read_model(model: type[Read], path: Path, what: str) -> Read:
-    try:
-        return model.model_validate(read_yaml(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError([Fault(str(path), f"{what} cannot be read: {reason(error)}")]) from error
-    except ValidationError as error:
-        findings = validation_findings(model, error.errors())
-        raise ConfigError([Fault(f"{path}: {dotted(place)}", said) for place, said in findings]) from error
+    return read_model(GeometryFile, path, "geometry file")

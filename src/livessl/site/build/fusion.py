@@ -11,7 +11,7 @@ from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.core.stream.fusion import Fusion, Role
 from livessl.core.stream.parameters import BACKFILL_WAIT_S, FusionParameters
 from livessl.core.stream.segmenter import RECENT_S
-from livessl.core.stream.site_state import SiteState
+from livessl.core.stream.site_state import ArraySetUp, SiteState
 from livessl.errors import ConfigError, Fault
 from livessl.site.build.grid import search_grid
 from livessl.site.build.pipeline import activity_parameters
@@ -93,6 +93,11 @@ def make_two_pass_fusion(
         clock_offsets = make_clock_offsets(site)
     state = _site_state(site, None, BACKFILL_WAIT_S if live else RECENT_S, clock_offsets, for_each)
     return TwoPassFusion(state, arrays, settled, newest_only=live)
+
+
+def make_array_set_up(site: Site, for_each: ForEach | None = None) -> ArraySetUp:
+    """Return the arrays of a site and their estimator, for a fusion that goes on with them."""
+    return ArraySetUp.of(site.processed, make_estimator(site), for_each)
 
 
 def _site_state(

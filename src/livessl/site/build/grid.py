@@ -1,4 +1,4 @@
-"""The search grid of a site."""
+"""The search grid of a site; `core.geometry.Grid` makes its points."""
 
 from __future__ import annotations
 

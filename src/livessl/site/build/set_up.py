@@ -1,14 +1,18 @@
-"""Faults of a site's set-up that sounds show: the findings of the core, with the inputs of the site's devices."""
+"""What sounds say of a site's set-up: faults, with the inputs of the site's devices, and the poses of the arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.finding import Finding
 from livessl.core.commission.findings import channel_findings, find_faults, set_up_findings, sharp_delays
+from livessl.core.commission.next_place import proposed_place
+from livessl.core.commission.places import Delays, Microphones, PlaceSearch
+from livessl.core.commission.refine import refine
+from livessl.core.commission.resection import MeasuredSetUp, measure_poses
 from livessl.core.types import FloatArray, Observation
 from livessl.site.build.grid import search_grid
 from livessl.site.build.inputs import with_inputs
@@ -40,3 +44,81 @@ def verify_set_up(site: Site, sounds: Sequence[Sequence[Observation]], places_m:
         return with_inputs(site, of_channels)
     diagnosis = verify({name: microphones[name] for name in delays}, delays, places_m, site.c_m_s)
     return with_inputs(site, [*of_channels, *set_up_findings(diagnosis)])
+
+
+def observed_delays(site: Site, sounds: Sequence[Sequence[Observation]]) -> tuple[Microphones, Delays]:
+    """Return the microphones, and the delays of the arrays that clearly received any of some sounds."""
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    return microphones, sharp_delays(microphones, sounds, [])
+
+
+def measure_set_up(
+    site: Site, sounds: Sequence[Sequence[Observation]], places_m: FloatArray, place_std_m: float
+) -> MeasuredSetUp:
+    """Measure the poses of the arrays and the speed of sound by sounds at measured places.
+
+    Parameters
+    ----------
+    site : Site
+    sounds : sequence of sequences of Observation
+    places_m : (S, 3) float64
+        Where the sounds were made, metres.
+    place_std_m : float
+        How exactly the places are known along each axis, metres.
+
+    Raises
+    ------
+    ValueError
+        If no array received enough of the sounds.
+    """
+    microphones, delays = observed_delays(site, sounds)
+    return measure_poses(microphones, delays, places_m, site.c_m_s, place_std_m)
+
+
+def refine_set_up(
+    site: Site, sounds: Sequence[Sequence[Observation]], known: Collection[str], position_std_m: float
+) -> MeasuredSetUp:
+    """Measure the poses of all arrays but the known ones, and the speed of sound, by sounds at unknown places.
+
+    Parameters
+    ----------
+    site : Site
+    sounds : sequence of sequences of Observation
+    known : collection of str
+        Arrays that are where the site has them.
+    position_std_m : float
+        How exactly the positions of the others are known along each axis, metres.
+
+    Raises
+    ------
+    ValueError
+        If there are too few sounds, or no array to refine.
+    """
+    microphones, delays = observed_delays(site, sounds)
+    return refine(microphones, delays, np.array(search_grid(site).bounds_m), site.c_m_s, known, None, position_std_m)
+
+
+def place_sounds(site: Site, sounds: Sequence[Sequence[Observation]]) -> FloatArray:
+    """Return where sounds (S, 3) were by their delays alone, metres; NaN where fewer than two arrays received one."""
+    microphones, delays = observed_delays(site, sounds)
+    if not delays:
+        return np.full((len(sounds), 3), np.nan)
+    counts = np.sum([np.isfinite(measured).sum(axis=1) > 1 for measured in delays.values()], axis=0)
+    found = PlaceSearch(np.array(search_grid(site).bounds_m), site.c_m_s)
+    positions_m = found.fit({name: microphones[name] for name in delays}, delays).positions_m
+    return np.where((counts > 1)[:, None], positions_m, np.nan)
+
+
+def next_clap_place(site: Site, places_m: FloatArray, place_std_m: float) -> FloatArray | None:
+    """Return the place (3,) at which another clap would improve the poses most, metres; None if no place is free.
+
+    Parameters
+    ----------
+    site : Site
+    places_m : (S, 3) float64
+        Places of the claps so far, metres; S may be 0.
+    place_std_m : float
+        How exactly places are known along each axis, metres.
+    """
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    return proposed_place(microphones, places_m, np.array(search_grid(site).bounds_m), site.c_m_s, place_std_m)

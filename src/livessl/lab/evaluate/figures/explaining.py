@@ -52,7 +52,7 @@ def gcc() -> Figure:
 
 
 def angle_error() -> Figure:
-    """Draw the angular error of lags rounded to whole samples against the spacing of a pair."""
+    """Draw the angular error that rounding lags to whole samples causes, against the spacing of a pair."""
     figure, axes = panels()
     spacing_m = np.geomspace(0.05, 5.0, 200)
     for colour, theta_deg in zip(COLOURS, (0.0, 30.0, 60.0, 80.0), strict=False):
@@ -118,7 +118,7 @@ def _recorded(microphones_m: FloatArray, rt60_s: float) -> Float32Array:
 
 
 def _power(specs: tuple[ArraySpec, ...]) -> list[FloatArray]:
-    """Maps of arrays on the paper's grid at the source's height, reverberant: (x, y) each."""
+    """Compute each array's map at the source's height, with reverberation: one of shape (x, y) for each array."""
     experiment = EXPERIMENTS["one-array"]
     grid = experiment.grid(experiment.spacing_m)
     mapper = PairMatrices(grid, RATE_HZ, C_M_S, band_limit=True)

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: a model of every message of the live WebSocket. See `schema.py`."""
+"""The contract of the API, continued: a model of every message of the live WebSocket. See `values.py`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, Field
 
-from livessl.core.types import Status
-from livessl.server.api.alert_schema import Alert
-from livessl.server.api.schema import (
+from livessl.core.states import Status
+from livessl.schema.alerts import Alert
+from livessl.schema.answers import ArrayGeometry
+from livessl.schema.base import Model
+from livessl.schema.values import (
     Array,
     ArrayNames,
     Candidates,
@@ -30,7 +32,7 @@ from livessl.server.api.schema import (
     Version,
     Zones,
 )
-from livessl.server.api.zone_schema import ZoneChange, ZoneShape
+from livessl.schema.zones import ZoneChange, ZoneShape
 
 Overloaded = Annotated[
     str | None,
@@ -41,7 +43,7 @@ Overloaded = Annotated[
 ]
 
 
-class _Numbered(BaseModel):
+class _Numbered(Model):
     v: Version
     seq: Seq
 
@@ -114,7 +116,15 @@ class ZonesMessage(_Numbered):
     by_name: dict[str, ZoneShape] = Field(description="All zones by name.")
 
 
-class Gap(BaseModel):
+class PosesMessage(_Numbered):
+    """Where the arrays are, after other poses have come into force."""
+
+    kind: Literal["poses"]
+    arrays: dict[str, ArrayGeometry] = Field(description="All arrays by name.")
+    changed: list[str] = Field(description="Names of the arrays that changed.", examples=[["south"]])
+
+
+class Gap(Model):
     """Notice of messages that this client will not get; it has no number of its own."""
 
     kind: Literal["gap"]
@@ -137,6 +147,7 @@ MESSAGES: Final[tuple[type[BaseModel], ...]] = (
     AlertMessage,
     ZoneMessage,
     ZonesMessage,
+    PosesMessage,
     Gap,
 )
 """Every message of the live WebSocket."""
@@ -150,6 +161,7 @@ Message = Annotated[
     | AlertMessage
     | ZoneMessage
     | ZonesMessage
+    | PosesMessage
     | Gap,
     Field(discriminator="kind"),
 ]

@@ -1,0 +1,78 @@
+"""Attachments of alerts: the picture, and the clip of the event once it is cut."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Protocol
+
+from livessl.server.alerts.picture import picture_of
+from livessl.server.api.encode import JsonObject
+from livessl.server.zones.shapes import ZoneMap
+from livessl.site.models import Site
+
+CLIP_WAIT_S: Final = 15.0
+"""Longest wait, in seconds, for the clip of an alert that is to be sent: it is cut seconds after the event's end."""
+
+QUEUED_S: Final = 3.0
+"""Time, in seconds, after which an event that waits for no clip gets none."""
+
+LOOK_S: Final = 0.25
+"""Interval, in seconds, at which the clip is looked for."""
+
+MAX_CLIP_BYTES: Final = 8_000_000
+"""Largest clip that is attached: many mail servers refuse more."""
+
+
+class ClipSource(Protocol):
+    """Finds the clips of events; every thread may call it."""
+
+    def best_file(self, event_id: str) -> Path | None:
+        """Return the recording that people listen to first; None if there is none, or none yet."""
+        ...
+
+    def is_waiting(self, event_id: str) -> bool:
+        """Return whether the clip of an event is still to be cut."""
+        ...
+
+
+class Evidence:
+    """Makes the attachments of alerts, on any thread.
+
+    Parameters
+    ----------
+    site : Site
+    zones : callable
+        Returns the zones that are in force.
+    clips : ClipSource or None
+        None if the site keeps no clips.
+    """
+
+    def __init__(self, site: Site, zones: Callable[[], ZoneMap], clips: ClipSource | None) -> None:
+        self._site = site
+        self._zones = zones
+        self._clips = clips
+
+    def picture(self, alert: JsonObject, size_px: int | None = None) -> bytes | None:
+        """Return the picture of an alert as PNG; None for one that is about no place."""
+        size = {} if size_px is None else {"size_px": size_px}
+        return picture_of(alert, self._site, self._zones(), **size)
+
+    async def clip(self, alert: JsonObject) -> Path | None:
+        """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.
+
+        None if the site keeps no clips, the alert is about no event, there is none by then, or it is larger than
+        `MAX_CLIP_BYTES`.
+        """
+        if self._clips is None or alert["event"] is None:
+            return None
+        event_id = alert["event"]["id"]
+        for look in range(round(CLIP_WAIT_S / LOOK_S)):
+            path = self._clips.best_file(event_id)
+            if path is not None:
+                return path if path.stat().st_size <= MAX_CLIP_BYTES else None
+            if look * LOOK_S >= QUEUED_S and not self._clips.is_waiting(event_id):
+                break
+            await asyncio.sleep(LOOK_S)
+        return None
