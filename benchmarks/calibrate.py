@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from doctor import POSITIONS_M, RATE_HZ, RT60_S, built, site_of
+from careful_set_up import POSITIONS_M, RATE_HZ, RT60_S, built, site_of
 from livessl.arrival_times import arrival_times
 from livessl.calibration import HeardSound, sounds_of
 from livessl.core.commission.diagnosis import verify

@@ -6,7 +6,7 @@ so is the speed of sound.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -131,12 +131,16 @@ def site_of(name: str, specs: Sequence[ArraySpec], size_m: Sequence[float], rng:
     )
 
 
-def simulated(clips: Clips, half: str, seed: int, numbers: range) -> Iterator[tuple[dict[str, Any], Case]]:
+def turn(number: int) -> tuple[str, str]:
+    """Return the kind of sound and the layout of a case."""
+    return TURNS[number % len(TURNS)], LAYOUTS[(number // 8 + number) % 4]
+
+
+def simulated(clips: Clips, half: str, seed: int, numbers: Iterable[int]) -> Iterator[tuple[dict[str, Any], Case]]:
     """Simulate cases; room, layout and kind take turns, so that any stretch of numbers has all of them."""
     for number in numbers:
         rng = np.random.default_rng([seed, number, HALVES.index(half)])
-        kind = TURNS[number % len(TURNS)]
-        name = LAYOUTS[(number // 8 + number) % 4]
+        kind, name = turn(number)
         size_m, rt60_s = ROOMS[half][(number // 32 + number // 8 + number) % 3]
         exact = bool((number // 3) % 2)
         specs = layout(name, np.array(size_m))

@@ -2,8 +2,9 @@
 
     python benchmarks/set_up_error.py --rooms 30
 
-Rooms, arrays and sounds are those of `benchmarks/doctor.py`. Each array is shifted along each axis and turned about
-each axis at random, by as much as the site file says that it may be. Each room has ten sounds, which share its errors.
+Rooms, arrays and sounds are those of `benchmarks/careful_set_up.py`. Each array is shifted along each axis and turned
+about each axis at random, by as much as the site file says that it may be. Each room has ten sounds, which share its
+errors.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-import doctor
+import careful_set_up as rooms
 import livessl
 from livessl.clock import UnpacedClock
 from livessl.core.types import Event, FloatArray, Status
@@ -32,19 +33,19 @@ FAR_M: Final = 0.5
 
 
 def site_of(arrays: int, seed: int, position_m: float, orientation_deg: float) -> Site:
-    """A site of `benchmarks/doctor.py` whose set-up is known so well."""
+    """A site of `benchmarks/careful_set_up.py` whose set-up is known so well."""
     known = {"position_m": position_m, "orientation_deg": orientation_deg, "temperature_c": 0.0}
-    return doctor.site_of(arrays, seed, uncertainty=known)
+    return rooms.site_of(arrays, seed, uncertainty=known)
 
 
 def errors(arrays: int, seed: int, position_m: float, orientation_deg: float) -> Iterator[tuple[float, float, float]]:
     """Yield the error of each sound in metres, and squared in units of the covariance, whole and of the sound alone."""
     site = site_of(arrays, seed, position_m, orientation_deg)
-    placed = doctor.built(site, seed, position_m, orientation_deg, 0.0)
+    placed = rooms.built(site, seed, position_m, orientation_deg, 0.0)
     specs = tuple(replace(spec, microphones_m=placed[spec.name]) for spec in site.specs)
-    rt60_s = doctor.RT60_S[seed % len(doctor.RT60_S)]
-    scene = livessl.simulate(site, rt60_s=rt60_s, count=doctor.SOUNDS, sample_rate_hz=doctor.RATE_HZ, seed=seed).scene
-    loaded, parts = assigned(site, doctor.recorded(site, specs, seed), doctor.RATE_HZ)
+    rt60_s = rooms.RT60_S[seed % len(rooms.RT60_S)]
+    scene = livessl.simulate(site, rt60_s=rt60_s, count=rooms.SOUNDS, sample_rate_hz=rooms.RATE_HZ, seed=seed).scene
+    loaded, parts = assigned(site, rooms.recorded(site, specs, seed), rooms.RATE_HZ)
     for output in run(loaded, parts, UnpacedClock()):
         if not isinstance(output, Event) or output.status is not Status.LOCATED or output.estimate is None:
             continue
@@ -79,7 +80,7 @@ def main() -> None:
             inside, alone = (100.0 * np.mean(each[near] <= NINETY_PERCENT) for each in (whole, sound))
             print(
                 f"| {arrays} | {100 * position_m:.0f} cm, {orientation_deg:g}° | {near.sum()} of "
-                f"{given.rooms * doctor.SOUNDS} | {np.median(error_m[near]):.3f} m | {inside:.0f} % | {alone:.0f} % |",
+                f"{given.rooms * rooms.SOUNDS} | {np.median(error_m[near]):.3f} m | {inside:.0f} % | {alone:.0f} % |",
                 flush=True,
             )
 

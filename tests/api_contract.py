@@ -18,11 +18,11 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as Sent
 
-from livessl.server.api.answers import Error, HTTPValidationError
+from livessl.schema.answers import Error, HTTPValidationError
+from livessl.schema.messages import Message
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.live import LIVE
-from livessl.server.api.messages import Message
 from livessl.server.fanout import Fanout
 from livessl.server.parts import Parts
 

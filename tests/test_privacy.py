@@ -16,7 +16,7 @@ from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.errors import ConfigError
-from livessl.server import retention
+from livessl.server import event_retention
 from livessl.server.store import Query, Store
 from messages import event_message
 from small_site import HANG_S, running_server, scene_recordings, site_of, wait_until, write_site
@@ -108,7 +108,7 @@ def test_database_file_holds_no_trace_of_deleted_events(tmp_path: Path) -> None:
 
 
 def test_running_server_deletes_old_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retention, "EXPIRE_S", 0.05)
+    monkeypatch.setattr(event_retention, "EXPIRE_S", 0.05)
     path = tmp_path / "events.db"
     site = site_of({"store": {"retention_days": 2.0}, "server.events_db": str(path)})
     now_ns = CLOCK.now_ns()
@@ -141,7 +141,7 @@ def test_deletion_is_told_to_end_when_it_is_cancelled() -> None:
             return 0
 
     async def cancel() -> None:
-        task = asyncio.create_task(retention.delete_old_events(Endless(), CLOCK, 1e6))
+        task = asyncio.create_task(event_retention.delete_old_events(Endless(), CLOCK, 1e6))
         await asyncio.to_thread(begun.wait, HANG_S)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

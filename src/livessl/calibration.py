@@ -151,7 +151,7 @@ def refined(
             return measured
         arrivals = arrival_times(
             together,
-            microphones | {name: pose.microphones_m for name, pose in measured.poses.items()},
+            {**microphones, **{name: pose.microphones_m for name, pose in measured.poses.items()}},
             [sound.start_s for sound in sounds],
             measured.places_m,
             measured.c_m_s,

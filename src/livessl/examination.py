@@ -10,8 +10,9 @@ import numpy as np
 from livessl import offline
 from livessl.clock import UnpacedClock
 from livessl.core.commission.channels import ChannelMeter
-from livessl.core.commission.clocks import find_clock_faults
+from livessl.core.commission.clocks import Rises, find_clock_faults
 from livessl.core.commission.crosstalk import CrosstalkMeter
+from livessl.core.commission.envelopes import EnvelopeMeter
 from livessl.core.commission.finding import Finding, Severity, in_order
 from livessl.core.commission.findings import OF_SET_UP
 from livessl.core.commission.observe import observe
@@ -107,8 +108,10 @@ def gather(site: Site, parts: Sequence[AssignedRecording], progress: Callable[[i
         if event.received:
             sounds.append(observe(event.received))
         events.append(replace(event, received=()))
-    of_samples = (finding for part in parts for finding in _of_samples(site, part))
-    return Gathered(tuple(events), tuple(sounds), (*of_samples, *_of_clocks(site, events)))
+    metered = [_metered(site, part) for part in parts]
+    of_samples = (finding for findings, _ in metered for finding in findings)
+    of_clocks = _of_clocks(site, {part.array: rises for part, (_, rises) in zip(parts, metered, strict=True)})
+    return Gathered(tuple(events), tuple(sounds), (*of_samples, *of_clocks))
 
 
 def conclude(site: Site, gathered: Gathered) -> Examination:
@@ -137,20 +140,24 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
     ]
 
 
-def _of_clocks(site: Site, events: Sequence[Event]) -> Iterator[Finding]:
-    """Compare when the clocks of the nodes, or of arrays without a node, show the sounds."""
-    starts_s: dict[str, list[float]] = {}
-    for event in (event for event in events if event.source == 1):
-        for clock in {site.node_of(array) or array for array in event.heard_by}:
-            starts_s.setdefault(clock, []).append(event.start_ns / 1e9)
-    return find_clock_faults(starts_s)
+def _of_clocks(site: Site, rises: Mapping[str, Rises]) -> Iterator[Finding]:
+    """Compare what the recordings by the clocks of the nodes, or of arrays without a node, show of the sounds."""
+    by_clock: dict[str, Rises] = {}
+    for array, one in rises.items():
+        by_clock.setdefault(site.node_of(array) or array, one)
+    return find_clock_faults(by_clock)
 
 
-def _of_samples(site: Site, part: AssignedRecording) -> list[Finding]:
+def _metered(site: Site, part: AssignedRecording) -> tuple[list[Finding], Rises]:
+    """Find the faults that the samples of an array show, and when its sound rises."""
     rate_hz, rows = part.recording.sample_rate_hz, np.array(part.channels) - 1
     microphones_m = next(spec.microphones_m for spec in site.specs if spec.name == part.array)
     meters = ChannelMeter(len(rows), rate_hz), CrosstalkMeter(microphones_m, rate_hz, site.c_m_s)
+    envelope = EnvelopeMeter(rate_hz)
     for block in part.recording.blocks(0):
+        samples = block.samples[rows]
+        envelope.push(block.first_index, samples)
         for meter in meters:
-            meter.push(block.samples[rows])
-    return [finding for meter in meters for finding in meter.faults(part.array)]
+            meter.push(samples)
+    findings = [finding for meter in meters for finding in meter.faults(part.array)]
+    return findings, Rises(part.start_ns / 1e9, envelope.rises())

@@ -185,12 +185,11 @@ def test_ctrl_c_and_sigterm_stop_servers_and_nodes_cleanly(recorded: Recorded, t
             node.wait_for("connected to the server")
         for url in urls:
             assert httpx.get(f"{url}/api/v1/health", timeout=HANG_S).status_code == 200
-        ends = [
-            process.end(number)
-            for process, number in zip((*nodes, *servers), 2 * (signal.SIGTERM, signal.SIGINT), strict=True)
-        ]
+        numbers = (signal.SIGTERM, signal.SIGINT)
+        ends = [process.end(number) for process, number in zip(nodes, numbers, strict=True)]
+        servers[0].wait_for("node 'north-pc' has ended")
+        ends += [process.end(number) for process, number in zip(servers, numbers, strict=True)]
         for (code, seconds), process in zip(ends, (*nodes, *servers), strict=True):
             assert code == 0, process.output
             assert seconds < STOP_S
             assert "Traceback" not in process.output
-        assert "node 'north-pc' has ended" in servers[0].output

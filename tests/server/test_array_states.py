@@ -168,6 +168,9 @@ def test_a_clock_that_is_behind_is_named_and_only_then() -> None:
         if named:
             assert "clock is 2.0 s behind the server's" in north["reason"]
             assert "NTP" in north["reason"]
+        desk.states.watch()
+        found = [(one.fault, one.array) for one in desk.watch.state.findings]
+        assert found == ([("clock", "north")] if named else [])
 
 
 def test_levels_and_machine_that_a_node_reports_are_described() -> None:

@@ -8,9 +8,11 @@ import tracemalloc
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from livessl.server.api.encode import API_VERSION, JsonObject
-from livessl.server.fanout import BACKLOG, LAGGING, PAST, Fanout, Filter, Subscription
+from livessl.server.fanout import BACKLOG, LAGGING, PAST, Fanout, Filter, Numbered, Pace, Subscription
 
 
 def update(n: int = 0, confidence: float = 0.5, zones: tuple[str, ...] = (), sound: int | None = None) -> JsonObject:
@@ -50,6 +52,65 @@ def test_messages_are_numbered_without_holes() -> None:
         assert [message["n"] for message in got] == [0, 1, 2, 3, 4]
         assert {message["v"] for message in got} == {API_VERSION}
     assert fanout.last_seq == 6
+
+
+def test_filter_by_track_admits_its_states_and_changes_only() -> None:
+    messages: list[JsonObject] = [
+        {"kind": "track", "id": 7},
+        {"kind": "track", "id": 8},
+        {"kind": "zone", "track_id": 7},
+        {"kind": "zone", "track_id": 8},
+        {"kind": "event", "id": "lab-7"},
+        {"kind": "arrays"},
+    ]
+    wanted = Filter(track=7)
+    assert [wanted.passes(message) for message in messages] == [True, False, True, False, True, True]
+    fanout = Fanout()
+    for message in messages:
+        fanout.publish(message)
+    assert [message["seq"] for message in drained(fanout.subscribe(wanted, since_seq=0))] == [1, 3, 5, 6]
+
+
+STATES = st.lists(
+    st.tuples(
+        st.floats(0.0, 0.2),
+        st.sampled_from(["event", "update 1", "update 2", "track new", "track update", "track end", "arrays", "alert"]),
+    ),
+    max_size=60,
+)
+
+
+@given(steps=STATES, rate_hz=st.sampled_from([0.5, 2.0, 5.0, 30.0]))
+def test_pace_limits_states_and_nothing_else(steps: list[tuple[float, str]], rate_hz: float) -> None:
+    pace, now_s = Pace(rate_hz), 0.0
+    passed: dict[str, list[float]] = {}
+    for wait_s, name in steps:
+        now_s += wait_s
+        kind, _, which = name.partition(" ")
+        fields = {"event_id": which} if kind == "update" else {"id": 3, "state": which}
+        limited = kind in ("update", "arrays") or name == "track update"
+        admitted = pace.admits(Numbered({"kind": kind, **fields}), now_s)
+        before = passed.get(name, [])
+        if not limited:
+            assert admitted
+        elif admitted:
+            assert not before or now_s - before[-1] >= 1 / rate_hz
+            passed[name] = [*before, now_s]
+        else:  # nothing is left out without need
+            assert before
+            assert now_s - before[-1] < 1 / rate_hz
+
+
+def test_rate_of_a_subscriber_is_its_own() -> None:
+    async def received() -> list[list[int]]:
+        fanout = Fanout()
+        subscriptions = [fanout.subscribe(Filter(max_rate_hz=rate_hz)) for rate_hz in (None, 0.001)]
+        for k in range(5):
+            fanout.publish(update(k, sound=1))
+        fanout.publish(event(5))
+        return [[message["n"] for message in await waiting(one)] for one in subscriptions]
+
+    assert asyncio.run(received()) == [[0, 1, 2, 3, 4, 5], [0, 5]]
 
 
 def test_nothing_arrives_after_unsubscribing() -> None:

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from world import HandClock
 
 from alert_desk import sound
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.commission.steady import MOST_CONFIRMING
+from livessl.core.types import Observation
 from livessl.server import heard_sounds
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import KEPT_SOUNDS, SetUpWatch
@@ -24,6 +26,12 @@ TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turne
 CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
 WEAK = Finding("level", "north", 2, Severity.WARNING, 0.9, "channel 2 of 'north' is weaker", "set the gains alike")
 SOUND = replace(sound(), received=cast(Any, ("north", "south")))  # what was received is not looked at
+
+
+def observed(array: str) -> Observation:
+    """What an array of two channels observed of a sound."""
+    zeros = np.zeros(2)
+    return Observation(array, zeros, zeros > 0.0, zeros + 1.0, zeros + 1.0, 9.0, 0.0)
 
 
 class Desk:
@@ -93,6 +101,35 @@ def test_contradiction_without_a_culprit_concerns_all_arrays_and_a_warning_none(
     desk.hear([CONTRADICTION, WEAK], LEAST_SOUNDS)
     assert desk.watch.state.findings == (CONTRADICTION, WEAK)
     assert set(desk.watch.state.errors) == {"north", "south"}
+
+
+def test_array_with_a_wrong_clock_has_no_part_in_the_examination(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such an array receives another sound at the time of an event, which looks as if it were turned."""
+    both = replace(SOUND, received=cast(Any, (observed("north"), observed("south"))))
+    examined: list[set[str]] = []
+
+    def hear(sounds: int = 1) -> None:
+        for _ in range(sounds):
+            desk.watch.take(both)
+            desk.watch.examine()
+
+    def found() -> list[Finding]:
+        return list(desk.watch.state.findings)
+
+    def find(_site: object, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
+        examined.append({one.array for sound in sounds for one in sound})
+        return [TURNED] if "south" in examined[-1] else []
+
+    monkeypatch.setattr(set_up, "find_set_up_faults", find)
+    hear(LEAST_SOUNDS)
+    assert found() == [TURNED]
+    desk.watch.note_clocks(["south"])
+    assert found() == []
+    hear()
+    assert (examined[-1], found()) == ({"north"}, [])
+    desk.watch.note_clocks([])
+    hear(KEPT_SOUNDS)
+    assert (examined[-1], found()) == ({"north", "south"}, [TURNED])
 
 
 def test_another_run_begins_without_findings(desk: Desk) -> None:

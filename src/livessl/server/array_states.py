@@ -17,7 +17,7 @@ from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import JsonObject, array_status
 from livessl.server.api.encode_reports import node_report
 from livessl.server.ingest import Ingest
-from livessl.server.node_clocks import clock_is_behind
+from livessl.server.node_clocks import clock_finding, clock_is_behind
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
@@ -142,9 +142,7 @@ class ArrayStates:
             if all(state == self._reported.get(name) for name, state in states.items()):
                 return
         self._reported_ns = now_ns
-        reports = self._ingest.node_reports
-        reported = with_inputs(self._site, reports.findings(self._nodes, now_ns))
-        self._set_up_watch.note_reports(reported, are_complete=reports.are_complete(now_ns))
+        self._note_findings(now_ns)
         arrays = self.describe()
         for array in arrays:
             before = self._reported.get(array["name"])
@@ -187,12 +185,25 @@ class ArrayStates:
             finding=self._clock_fault(array) or self._set_up_watch.finding_of(array),
         )
 
+    def _note_findings(self, now_ns: int) -> None:
+        """Pass on what the nodes report and what their clocks show, with or without sounds."""
+        behind = {name: behind_s for name in self._nodes if (behind_s := self._behind_s(name)) is not None}
+        self._set_up_watch.note_clocks(behind)
+        reports = self._ingest.node_reports
+        reported = with_inputs(self._site, reports.findings(self._nodes, now_ns))
+        of_clocks = (clock_finding(array, behind_s) for array, behind_s in behind.items())
+        self._set_up_watch.note_reports([*reported, *of_clocks], are_complete=reports.are_complete(now_ns))
+
     def _clock_fault(self, array: str) -> str | None:
-        """Return in words that an array's clock is behind; delays of a replay or of an overload say nothing."""
+        """Return in words that an array's clock is behind."""
+        behind_s = self._behind_s(array)
+        return None if behind_s is None else clock_is_behind(behind_s)
+
+    def _behind_s(self, array: str) -> float | None:
+        """Return by how much an array's clock is behind; delays of a replay or of an overload say nothing."""
         if self._site_time.mode != "live" or self._overload.message is not None:
             return None
-        behind_s = self._ingest.node_clocks.behind_s(array)
-        return None if behind_s is None else clock_is_behind(behind_s)
+        return self._ingest.node_clocks.behind_s(array)
 
     def _counters(self, status: ArrayStatus, fusion: TwoPassFusion) -> dict[str, int]:
         name = status.name

@@ -15,6 +15,9 @@ REQUEST_S: Final = 10.0
 """Longest time, in seconds, in which a client must send a whole request: from the start of its connection or, later,
 from the request's first byte. Requests are short, and a client that sends one byte a second would keep a place."""
 
+STALLED_S: Final = 30.0
+"""Longest time, in seconds, in which a client may accept no byte of an answer, as long as a WebSocket's."""
+
 RELIEVED: Final = 0.9
 """Share of the most connections below which the limit is left; near it, lines would be logged again and again."""
 
@@ -64,9 +67,13 @@ class LimitedListener(socket.socket):
 
 
 class TimedRequests(H11Protocol):
-    """uvicorn's HTTP/1.1, which closes a connection that takes longer than `REQUEST_S` to send a request."""
+    """uvicorn's HTTP/1.1, which closes connections that keep a place for nothing.
+
+    These take longer than `REQUEST_S` to send a request, or accept no byte of an answer for `STALLED_S`.
+    """
 
     _deadline: asyncio.TimerHandle | None = None
+    _stalled: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start to wait for the first request."""
@@ -76,7 +83,34 @@ class TimedRequests(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop to wait."""
         self._stop_waiting()
+        self._resumed()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Have the application wait, because the client does not read what was sent; but not for ever."""
+        super().pause_writing()
+        self._watch_reading(self.transport.get_write_buffer_size())
+
+    def resume_writing(self) -> None:
+        """Let the application go on."""
+        self._resumed()
+        super().resume_writing()
+
+    def _watch_reading(self, unread: int) -> None:
+        self._stalled = self.loop.call_later(STALLED_S, self._check_reading, unread)
+
+    def _check_reading(self, unread: int) -> None:
+        left = self.transport.get_write_buffer_size()
+        if left < unread:
+            self._watch_reading(left)
+            return
+        _log.info("HTTP: %s has accepted nothing of an answer for %g s", self.client, STALLED_S)
+        self.transport.abort()  # closing would wait until the client has read the rest
+
+    def _resumed(self) -> None:
+        if self._stalled is not None:
+            self._stalled.cancel()
+            self._stalled = None
 
     def data_received(self, data: bytes) -> None:
         """Take in a part of a request, and wait for the rest of it or no longer."""

@@ -22,7 +22,7 @@ PAST: Final = 2048
 """Messages kept for clients that reconnect: one minute or more of a sound that never ends. They are kept as compressed
 text, because as objects those of 64 arrays would take about 50 MB."""
 
-_FILTERED_BY: Final = ("seq", "kind", "confidence", "zones")
+_FILTERED_BY: Final = ("seq", "kind", "confidence", "zones", "id", "track_id")
 """Fields of a kept message that decide whether a client gets it."""
 
 
@@ -38,11 +38,17 @@ class Filter:
         Least confidence of events and updates.
     zone : str or None
         Only events, updates and tracks inside this zone.
+    track : int or None
+        Of tracks and their changes in zones, only those of the track of this number.
+    max_rate_hz : float or None
+        Most messages a second on the state of one subject: a sound, a track, or the arrays. See `Pace`.
     """
 
     kinds: frozenset[str] | None = None
     min_confidence: float = 0.0
     zone: str | None = None
+    track: int | None = None
+    max_rate_hz: float | None = None
 
     def passes(self, message: Mapping[str, Any]) -> bool:
         """Return whether a message passes the filter."""
@@ -50,7 +56,43 @@ class Filter:
             return False
         if message.get("confidence", 1.0) < self.min_confidence:
             return False
+        if self.track is not None and self.track != _track_of(message, self.track):
+            return False
         return self.zone is None or "zones" not in message or self.zone in message["zones"]
+
+
+def _track_of(message: Mapping[str, Any], otherwise: int) -> Any:
+    """Return the number of the track that a message is about; `otherwise` if it is about none."""
+    return {"track": message.get("id"), "zone": message.get("track_id")}.get(message["kind"], otherwise)
+
+
+class Pace:
+    """Leaves out states of a subject that follow too soon after another one.
+
+    A state that is left out is replaced by the next one. The first and the last state of a track always pass, as do
+    events, alerts and changes in zones.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Most states of a subject a second.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._interval_s = 1.0 / rate_hz
+        self._sent_s: OrderedDict[Hashable, float] = OrderedDict()
+
+    def admits(self, numbered: Numbered, now_s: float) -> bool:
+        """Return whether a message is sent, at a time in seconds by any clock that does not go back."""
+        subject = numbered.subject
+        if subject is None or numbered.message.get("state") in ("new", "end"):
+            return True
+        while self._sent_s and now_s - next(iter(self._sent_s.values())) >= self._interval_s:
+            self._sent_s.popitem(last=False)
+        if subject in self._sent_s:
+            return False
+        self._sent_s[subject] = now_s
+        return True
 
 
 class Numbered:
@@ -109,10 +151,17 @@ class Subscription:
     _newest: dict[Hashable, int] = field(default_factory=dict)
     _news: asyncio.Event = field(default_factory=asyncio.Event)
     _missed: int = 0
+    _pace: Pace | None = None
+
+    def __post_init__(self) -> None:
+        if self.wanted.max_rate_hz is not None:
+            self._pace = Pace(self.wanted.max_rate_hz)
 
     def offer(self, seq: int, numbered: Numbered) -> bool:
         """Queue a message if it passes the filter; return whether another one was dropped for it."""
         if not self.wanted.passes(numbered.message):
+            return False
+        if self._pace is not None and not self._pace.admits(numbered, asyncio.get_running_loop().time()):
             return False
         gone = len(self._waiting) >= LAGGING and self._make_room(numbered.subject)
         self._waiting[seq] = numbered
@@ -176,6 +225,8 @@ class Fanout:
         self.last_seq = first_seq
         self.superseded = 0
         """Messages dropped from the queues of slow clients."""
+        self.ended = asyncio.Event()
+        """Set when the server stops: streams that would last for ever end then."""
 
     @property
     def clients(self) -> int:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from livessl.core.commission.finding import Finding, Severity
+
 WINDOW_NS: Final = 5_000_000_000
 """Time, in nanoseconds, of which the least delay is taken. Sounds are located at the latest after two of these."""
 
@@ -66,9 +68,19 @@ class NodeClocks:
         return behind_s if behind_s > MOST_BEHIND_S else None
 
 
+CURE: Final = "set both clocks by NTP"
+
+
 def clock_is_behind(behind_s: float) -> str:
     """Return the reason why an array whose clock is so far behind, in seconds, is degraded."""
-    return (
-        f"its node's clock is {behind_s:.1f} s behind the server's, or its network is never faster than that; set both "
-        "clocks by NTP"
-    )
+    return f"its node's clock is {_behind(behind_s)}; {CURE}"
+
+
+def clock_finding(array: str, behind_s: float) -> Finding:
+    """Return the finding about an array whose clock is so far behind, in seconds."""
+    message = f"the clock of the node of {array!r} is {_behind(behind_s)}"
+    return Finding("clock", array, None, Severity.ERROR, 0.99, message, CURE)
+
+
+def _behind(behind_s: float) -> str:
+    return f"{behind_s:.1f} s behind the server's, or its network is never faster than that"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -59,7 +59,8 @@ class SetUpState:
 class SetUpWatch:
     """Examines the set-up.
 
-    The fusion thread calls `take` and `forget`; every thread may read `state`, which is replaced as a whole.
+    The fusion thread calls `take`, `forget`, `note_reports` and `note_clocks`; every thread may read `state`, which is
+    replaced as a whole.
 
     Parameters
     ----------
@@ -85,6 +86,7 @@ class SetUpWatch:
         self._of_sounds: tuple[Finding, ...] = ()
         self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
         self._are_reports_complete = False
+        self._clocks_off: frozenset[str] = frozenset()  # arrays
         self.state = SetUpState(findings=self._of_layout)
         """The latest state. Read it once for values that belong together."""
         self._stop = threading.Event()
@@ -108,6 +110,21 @@ class SetUpWatch:
             self._log_new(self._reported, findings)
             self._reported = tuple(findings)
             self._publish()
+
+    def note_clocks(self, arrays: Iterable[str]) -> None:
+        """Note the arrays whose clocks are known to be off.
+
+        They receive other sounds at the times of an event, which is no fault of their poses: what they received is left
+        out, and what was concluded from it so far is forgotten.
+        """
+        with self._lock:
+            known, self._clocks_off = self._clocks_off, frozenset(arrays)
+            if self._clocks_off <= known:
+                return
+            self._sounds = [self._on_time(sound) for sound in self._sounds]
+            self._run += 1
+            self._steady = SteadyFindings()
+            self._note(())
 
     def forget(self) -> None:
         """Forget all sounds: those of another run are about another set-up."""
@@ -150,7 +167,7 @@ class SetUpWatch:
         # imported late: scipy's optimizer takes memory, and no event needs it
         from livessl.site.build.set_up import find_set_up_faults
 
-        sounds = [*known, *(sound.observations for sound in new)][-KEPT_SOUNDS:]
+        sounds = [*known, *(self._on_time(sound.observations) for sound in new)][-KEPT_SOUNDS:]
         findings = find_set_up_faults(site, sounds) if len(sounds) >= LEAST_SOUNDS else None
         with self._lock:
             if run != self._run:
@@ -163,6 +180,10 @@ class SetUpWatch:
             else:
                 self._note(self._steady.note(findings, self._unjudged))
                 self._unjudged = 0
+
+    def _on_time(self, sound: Sequence[Observation]) -> Sequence[Observation]:
+        """Return what the arrays whose clocks are right received of a sound."""
+        return tuple(one for one in sound if one.array not in self._clocks_off) if self._clocks_off else sound
 
     def _note(self, findings: Sequence[Finding]) -> None:
         self._log_new(self._of_sounds, findings)

@@ -65,6 +65,20 @@ def check_trusted_host(name: str) -> str:
     return lower
 
 
+def check_origin(text: str) -> str:
+    """Return the origin of pages, such as `https://site.example`, in lower case.
+
+    Raises
+    ------
+    ValueError
+        If it is none: with a path, without a scheme, or a pattern.
+    """
+    origin = text.lower()
+    if re.fullmatch(r"https?://([a-z0-9._-]+|\[[0-9a-f:]+\])(:[0-9]{1,5})?", origin) is None:
+        raise ValueError(f"expected the origin of a page without a path, such as https://site.example, got {text!r}")
+    return origin
+
+
 def check_root_path(path: str) -> str:
     """Return the path under which a reverse proxy serves the site, without a slash at its end; empty for none.
 

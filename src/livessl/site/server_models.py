@@ -6,9 +6,17 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from livessl.site.addresses import check_endpoint, check_host, check_network, check_root_path, check_trusted_host
+from livessl.site.addresses import (
+    check_endpoint,
+    check_host,
+    check_network,
+    check_origin,
+    check_root_path,
+    check_trusted_host,
+)
 from livessl.site.fields import FileName, Model, Positive
 from livessl.site.history_place import check_history_place
+from livessl.site.hub_models import HubLinkConfig
 from livessl.site.sink_types import check_sink_type
 
 
@@ -20,6 +28,8 @@ class HttpConfig(Model):
     trusted_hosts: tuple[str, ...] = ()
     root_path: str = ""
     forwarded_allow_ips: tuple[str, ...] = ("127.0.0.1", "::1")
+    allowed_origins: tuple[str, ...] = ()
+    frame_ancestors: tuple[str, ...] = ()
     tokens: FileName | None = None
     certificate: FileName | None = None
     private_key: FileName | None = None
@@ -33,6 +43,11 @@ class HttpConfig(Model):
     @classmethod
     def _trusted(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(check_trusted_host(host) for host in hosts)
+
+    @field_validator("allowed_origins", "frame_ancestors")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_origin(origin) for origin in origins)
 
     @field_validator("root_path")
     @classmethod
@@ -81,6 +96,7 @@ class ServerConfig(Model):
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
     listen: bool = False
+    hub: HubLinkConfig | None = None
 
     @field_validator("bind")
     @classmethod

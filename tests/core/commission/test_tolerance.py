@@ -9,16 +9,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
-from livessl.core.commission.places import PlaceSearch
-from livessl.core.commission.tolerance import Explained, careful, explained
+from livessl.core.commission.places import PlaceSearch, contradictions_s, degrees_of_freedom
+from livessl.core.commission.set_up import SetUp, Stacked, careful, inverse
+from livessl.core.commission.tolerance import Explained, explained
+from livessl.core.types import FloatArray
 
 seeds = st.integers(0, 10_000)
 few = settings(deadline=None, max_examples=5)
 
 
 def explaining(filed: Arrays, delays: Arrays) -> Explained:
-    starts_m = PlaceSearch(BOUNDS_M, C_M_S).fit(filed, delays).positions_m
-    return explained(filed, delays, starts_m, BOUNDS_M, C_M_S, careful(filed))
+    return explained([SetUp(filed, delays, C_M_S, careful(filed))], found_m(filed, delays)[None], BOUNDS_M)[0]
+
+
+def found_m(filed: Arrays, delays: Arrays) -> FloatArray:
+    """Places of the sounds, with the set-up exactly as filed."""
+    return PlaceSearch(BOUNDS_M, C_M_S).fit(filed, delays).positions_m
 
 
 def built(filed: Arrays, rng: np.random.Generator) -> Arrays:
@@ -81,3 +87,51 @@ def test_missing_channels_and_sounds_are_left_out() -> None:
     found = explaining(true, delays)
     assert np.isfinite(found.deviance)
     assert np.isfinite(found.places_m).all()
+
+
+@few
+@given(seed=seeds)
+def test_set_ups_that_are_fitted_together_do_not_influence_each_other(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = set_up(rng, 3)
+    delays = delays_of(true, sources(rng), rng)
+    delays["west"][3] = np.nan
+    given_ones = [
+        SetUp(true, delays, C_M_S, careful(true)),
+        SetUp(true | {"south": turned(true["south"], 9.0)}, delays, C_M_S + 3.0, careful(true), speed_std_m_s=20.0),
+        SetUp(
+            true, delays | {"north": delays["north"] + [0.0, 1e-4, 0.0, 0.0]}, C_M_S, careful(true), late=("north", 1)
+        ),
+    ]
+    starts_m = np.stack([found_m(true, delays)] * 3)
+    together = explained(given_ones, starts_m, BOUNDS_M)
+    for one, found in zip(given_ones, together, strict=True):
+        [alone] = explained([one], starts_m[:1], BOUNDS_M)
+        assert found.deviance == pytest.approx(alone.deviance, abs=0.1)
+    assert together[2].late_s == pytest.approx(1e-4, abs=2e-5)
+    assert together[2].deviance < together[0].deviance + 10.0
+
+
+@few
+@given(seed=seeds, array=st.sampled_from(["north", "west"]))
+def test_places_that_are_refined_together_are_those_that_are_refined_alone(seed: int, array: str) -> None:
+    rng = np.random.default_rng(seed)
+    true = set_up(rng, 3)
+    delays = delays_of(true, sources(rng), rng)
+    delays[array][2:4, 1] = np.nan
+    filed = true | {array: turned(true[array], 5.0)}
+    search = PlaceSearch(BOUNDS_M, C_M_S)
+    starts_m = search.fit(true, delays).positions_m
+    both = [SetUp(one, delays, C_M_S, careful(one)) for one in (true, filed)]
+    together = Stacked(both, BOUNDS_M).placed(np.stack([starts_m, starts_m]))
+    for one, places_m in zip(both, together, strict=True):
+        alone = search.refine(one.microphones, delays, starts_m)
+        off_s = contradictions_s(one.microphones, delays, places_m, C_M_S)
+        assert (off_s**2).sum(axis=1) == pytest.approx(alone.misfits_s**2 * degrees_of_freedom(delays), rel=0.1)
+
+
+@given(seed=seeds)
+def test_inverses_of_small_matrices_are_those_of_numpy(seed: int) -> None:
+    slopes = np.random.default_rng(seed).normal(0.0, 1e-3, (5, 4, 3, 7)) * np.logspace(0, -3, 3)[:, None]
+    matrices = slopes @ slopes.swapaxes(-1, -2)
+    assert inverse(matrices) @ matrices == pytest.approx(np.broadcast_to(np.eye(3), matrices.shape), abs=1e-5)

@@ -70,7 +70,7 @@ def test_uncertain_position_is_in_the_zone_only_with_enough_probability(std_m: f
     condition = rule({"zones": ["door"], "probability": threshold}).events
     assert condition is not None
     event = encoded(sound(std_m=std_m))
-    probability = ZONES.probability("door", event["position_m"], event["covariance_m2"])
+    probability = ZONES.probabilities(event["position_m"], event["covariance_m2"])["door"]
     found = match(condition, event, ZONES)
     assert (found is not None) is (probability >= threshold)
     assert found is None or found.zones == {"door": probability}

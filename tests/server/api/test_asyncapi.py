@@ -89,7 +89,7 @@ def test_queries_are_described(described: dict[str, Any]) -> None:
         found: dict[str, Any] = described["channels"][channel]["bindings"]["ws"]["query"]["properties"]
         return found
 
-    assert list(query("live")) == ["kinds", "min_confidence", "zone", "since_seq"]
+    assert list(query("live")) == ["kinds", "min_confidence", "zone", "track", "max_rate_hz", "since_seq"]
     assert list(query("map")) == ["array", "views"]
     assert (query("live")["min_confidence"]["minimum"], query("live")["min_confidence"]["maximum"]) == (0, 1)
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
-from scene_server import CLOCK, capture_scene, live, located_scene
 from websockets.exceptions import ConnectionClosed
 
 from livessl.clock import utc_ns
 from livessl.server import http
 from livessl.server.app import Server
+from scene_server import CLOCK, capture_scene, live, located_scene
 from small_site import HANG_S, running_server, site_of, wait_until
 
 
@@ -62,6 +62,9 @@ def test_client_that_returns_gets_what_it_missed(server: Server) -> None:
         ("?since_seq=-1", "since_seq: expected the seq of a message, got '-1'"),
         ("?since_seq=x", "since_seq: expected the seq of a message, got 'x'"),
         ("?zone=hall", "zone: no zone 'hall'; zones are door, room"),
+        ("?track=one", "track: expected the number of a track, got 'one'"),
+        ("?max_rate_hz=-1", "max_rate_hz: expected a number above 0, at most 1000, got '-1'"),
+        ("?kind=event", "unknown parameter 'kind'; did you mean 'kinds'?"),
         ("?min_confidence=2", "min_confidence: expected a number from 0 to 1, got '2'"),
     ],
 )

@@ -96,7 +96,10 @@ def test_every_unknown_parameter_is_named(client: httpx.Client) -> None:
     [
         ("/live?kind=event", "unknown parameter 'kind'; did you mean 'kinds'?"),
         ("/map?view=floor", "unknown parameter 'view'; did you mean 'views'?"),
-        ("/live?q=1", "unknown parameter 'q'; expected one of kinds, min_confidence, zone, since_seq"),
+        (
+            "/live?q=1",
+            "unknown parameter 'q'; expected one of kinds, min_confidence, zone, track, max_rate_hz, since_seq",
+        ),
         (f"/live?{'é' * 100}=1", f"unknown parameter '{'é' * 50}"),
     ],
 )

@@ -15,6 +15,7 @@ import pytest
 from websockets.sync.client import connect
 
 from conftest import require
+from livessl import client
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.server import http
@@ -49,6 +50,18 @@ def test_everything_is_encrypted(folder: Path) -> None:
             httpx.get(server.url.replace("https", "http") + "/api/v1/health")
         with pytest.raises(httpx.ConnectError, match="certificate verify failed"):
             httpx.get(f"{server.url}/api/v1/health", verify=ssl.create_default_context())
+
+
+def test_client_trusts_the_named_authority_and_no_unknown_one(folder: Path) -> None:
+    with running_server(site_of(FILES, folder)) as server:
+        with client.connect(server.url, ca_file=folder / "site.crt") as live:
+            assert next(iter(live)).kind == "hello"
+            assert live.site().site == "small"
+        with client.connect(server.url) as live:
+            with pytest.raises(client.RefusedError, match=r"is not trusted: .*; name the certificate of its"):
+                next(iter(live))
+            with pytest.raises(client.RefusedError, match="certificate is not trusted"):
+                live.site()
 
 
 def test_connections_that_never_begin_tls_are_limited(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,8 @@
 With the set-up as filed, the arrays' delays of a sound fit no place if something is wrong. Each alternative is tried:
 every order of an array's channels, turns and shifts of an array, another speed of sound. The one that explains the
 sounds best is named, provided that it explains them far better than the set-up as filed, and better than every
-alternative of another array.
+alternative of another array. Sounds at unknown places are judged with the freedom of a careful set-up
+(`livessl.core.commission.judge`), those at measured places by their misfits (`livessl.core.commission.trial`).
 """
 
 from __future__ import annotations
@@ -18,19 +19,34 @@ from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.judge import COSTS, Judge
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
+from livessl.core.commission.trial import FLOOR_S as KNOWN_FLOOR_S
 from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
 
-MIN_GAIN: Final = 4.0
-"""Least gain in the criterion of sounds at unknown places, for each array beyond the first, for which a set-up is said
-to be other than filed."""
+MIN_GAIN: Final = 9.0
+GAIN_PER_ARRAY: Final = 1.0
+"""Least gain in the deviance of sounds at unknown places from which a set-up is said to be other than filed, and what
+is added to it for each array beyond the first, because more arrays have more alternatives. Few careful set-ups exceed
+it by chance (`benchmarks/doctor_chance.py`)."""
 
-MIN_LEAD: Final = 3.0
-"""Least lead in the same measure over the best alternative about another array or channel."""
+MIN_LEAD: Final = 6.0
+MIN_LEAD_OF_GAIN: Final = 0.12
+"""Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
+the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
+
+EQUAL: Final = 0.5
+"""Share of the least lead within which alternatives explain the sounds equally well."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
 """The same for sounds at places that somebody measured, in the Bayesian information criterion."""
+
+FLOOR_S: Final = 12e-6
+"""Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
+to 2 cm and 1.5 degrees."""
+
+MOST_SOUNDS: Final = 24
+"""Most sounds that are compared: more of them tell little more, because the errors of the set-up do not average out."""
 
 MIN_RATIO: Final = 1.3
 """Least ratio between the misfit as filed and that of the alternative."""
@@ -87,10 +103,10 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
     c_m_s : float
         Speed of sound as filed, m/s.
     """
-    trial = Trial(microphones, delays, PlaceSearch(bounds_m, c_m_s))
-    if trial.sounds < LEAST_SOUNDS or len(microphones) < 2:
-        return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
-    return _compared(trial, Judge(microphones, delays, PlaceSearch(bounds_m, c_m_s)))
+    judge = Judge(microphones, most_telling(delays), PlaceSearch(bounds_m, c_m_s))
+    if judge.sounds < LEAST_SOUNDS or judge.arrays < 2:
+        return Diagnosis(judge.sounds, judge.misfit_s, None, (), contradicts=False)
+    return _by_judge(judge)
 
 
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
@@ -105,17 +121,24 @@ def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s
     places_m : (S, 3) float64
         Where the sounds were made, metres.
     """
-    return _compared(Trial(microphones, delays, KnownPlaces(places_m, c_m_s)))
+    return _by_criterion(Trial(microphones, delays, KnownPlaces(places_m, c_m_s)))
 
 
-def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
-    """Compare alternatives by the judge, or by their misfits alone."""
-    least, least_lead = KNOWN_MIN_GAIN, KNOWN_MIN_LEAD
-    if judge is not None:
-        least, least_lead = MIN_GAIN * (judge.arrays - 1), MIN_LEAD
-    is_small = trial.filed.misfit_s <= MIN_RATIO * trial.floor_s
-    if is_small and (judge is None or not judge.may_gain(least + COSTS["turned"])):
-        return Diagnosis(trial.sounds, trial.filed.misfit_s, None, (), contradicts=False)
+def most_telling(delays: Delays) -> dict[str, FloatArray]:
+    """Return the delays of at most `MOST_SOUNDS` sounds: those that most channels received, over the whole time."""
+    received = np.sum([np.isfinite(one).sum(axis=1) for one in delays.values()], axis=0)
+    if len(received) <= MOST_SOUNDS:
+        return dict(delays)
+    able = np.flatnonzero(received >= np.sort(received)[-MOST_SOUNDS])
+    used = able[np.linspace(0, len(able) - 1, MOST_SOUNDS).round().astype(int)]
+    return {name: one[used] for name, one in delays.items()}
+
+
+def _by_criterion(trial: Trial) -> Diagnosis:
+    """Compare alternatives by their misfits alone, as sounds at known places allow."""
+    filed_s = trial.filed.misfit_s
+    if filed_s <= MIN_RATIO * KNOWN_FLOOR_S:
+        return Diagnosis(trial.sounds, filed_s, None, (), contradicts=False)
     tried = [
         *trial.orders(),
         *trial.exchanges(),
@@ -124,23 +147,44 @@ def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
         *trial.heights(),
         *trial.speeds(),
     ]
-    filed = trial.criterion(trial.filed, 0)
-    if judge is not None:
-        filed, tried = judge.filed, [judge.judged(one) for one in tried]
     rivals = sorted(tried, key=lambda one: one.criterion)
-    best, gained = rivals[0], filed - rivals[0].criterion
-    contradicts = gained > least
-    if judge is not None:
-        contradicts &= best.is_large  # smaller errors are those of a careful set-up
-    else:
-        contradicts &= trial.filed.misfit_s > MIN_RATIO * max(best.misfit_s, trial.floor_s)
+    gained = trial.criterion(trial.filed, 0) - rivals[0].criterion
+    contradicts = gained > KNOWN_MIN_GAIN and filed_s > MIN_RATIO * max(rivals[0].misfit_s, KNOWN_FLOOR_S)
+    return _decided(trial.sounds, filed_s, rivals, gained, contradicts, KNOWN_MIN_LEAD, KNOWN_MIN_LEAD)
+
+
+def _by_judge(judge: Judge) -> Diagnosis:
+    """Compare alternatives with the freedom of a careful set-up."""
+    least = MIN_GAIN + GAIN_PER_ARRAY * (judge.arrays - 1)
+    misfit_s = judge.misfit_s
+    if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
+        return Diagnosis(judge.sounds, misfit_s, None, (), contradicts=False)
+    rivals = judge.judged()
+    gained = judge.filed - rivals[0].criterion
+    contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
+    rivals[0] = judge.with_misfit(rivals[0])
+    least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
+    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, EQUAL * least_lead)
+
+
+def _decided(
+    sounds: int,
+    misfit_s: float,
+    rivals: Sequence[Alternative],
+    gained: float,
+    contradicts: bool,
+    least_lead: float,
+    apart: float,
+) -> Diagnosis:
+    """Name the best alternative if it leads by so much, or those that are not further apart."""
+    best = rivals[0]
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained
     named = contradicts and lead > least_lead and best.is_large
-    undecided = _undecided(rivals, least_lead) if contradicts and not named else ()
+    undecided = _undecided(rivals, apart) if contradicts and not named else ()
     return Diagnosis(
-        trial.sounds,
-        trial.filed.misfit_s,
+        sounds,
+        misfit_s,
         best if named else None,
         tuple(rivals),
         contradicts,
@@ -149,10 +193,10 @@ def _compared(trial: Trial, judge: Judge | None = None) -> Diagnosis:
     )
 
 
-def _undecided(rivals: Sequence[Alternative], least_lead: float) -> tuple[Alternative, ...]:
+def _undecided(rivals: Sequence[Alternative], apart: float) -> tuple[Alternative, ...]:
     """Return the best alternatives if they are the same fault of different arrays, such as a shift of one of two."""
     best = rivals[0]
-    close = [one for one in rivals if one.criterion - best.criterion <= least_lead and one.array != best.array]
+    close = [one for one in rivals if one.criterion - best.criterion <= apart and one.array != best.array]
     if not close or any(one.fault != best.fault or not one.is_large for one in (best, *close)):
         return ()
     firsts = {one.array: one for one in reversed((best, *close))}

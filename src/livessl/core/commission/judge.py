@@ -1,24 +1,25 @@
-"""Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has."""
+"""Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has.
+
+All set-ups are fitted together. The few that explain the sounds about as well as the best one are what matters; the
+others are not fitted to the end.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.alternative import Alternative
+from livessl.core.commission.hypotheses import Hypotheses, Hypothesis
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.poses import moved
-from livessl.core.commission.tolerance import SPEED_STD_M_S, Explained, Freedom, careful, explained
+from livessl.core.commission.set_up import SetUp, Stacked
+from livessl.core.commission.tolerance import Explained, explained
 from livessl.core.types import FloatArray
-
-FREE_M: Final = 1.0
-FREE_DEG: Final = 20.0
-FREE_MICROPHONE_M: Final = 0.1
-FREE_SPEED_M_S: Final = 20.0
-"""Standard deviations of what an alternative leaves free, from what was found for it: metres, degrees, metres, m/s."""
 
 COSTS: Final = {
     "exchanged": 1.0,
@@ -33,14 +34,8 @@ COSTS: Final = {
 each channel in another order. A shift costs two more, because people measure distances better than angles, and a
 microphone does, because there are many."""
 
-
-@dataclass(frozen=True, slots=True)
-class _Applied:
-    """An alternative as a set-up, and delays of its channels."""
-
-    microphones: dict[str, FloatArray]
-    delays: dict[str, FloatArray]
-    c_m_s: float
+MOST_SLOPES: Final = 500_000
+"""Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
 
 
 class Judge:
@@ -56,125 +51,95 @@ class Judge:
     """
 
     def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
-        self._microphones, self._delays, self._search = microphones, delays, search
-        self._filed = self._explained(self._applied(None), None)
-
-    @property
-    def arrays(self) -> int:
-        """Number of arrays."""
-        return len(self._microphones)
+        self.arrays, self.sounds, self._search = len(microphones), len(next(iter(delays.values()))), search
+        self._hypotheses = Hypotheses(microphones, delays, search)
+        self._as_filed = self._hypotheses.filed()
+        [self._filed] = self._fitted([self._as_filed])
 
     @property
     def filed(self) -> float:
         """Deviance of the set-up as filed."""
         return self._filed.deviance
 
+    @property
+    def misfit_s(self) -> float:
+        """Misfit of the sounds in the set-up exactly as filed, seconds."""
+        return self._misfit_s(self._as_filed.set_up)
+
     def may_gain(self, least: float) -> bool:
-        """Return whether a set-up that is nearly as filed may explain the sounds better by so much.
+        """Return whether a set-up that is nearly as filed may explain the sounds better by so much."""
+        freer = self._hypotheses.freer(self._filed.places_m)
+        return any(self.filed - found.deviance >= least for found in self._fitted(freer))
 
-        The poses, and then the microphones, of one array after the other are left free together.
-        """
-        for name, at_m in self._microphones.items():
-            careful_one = careful(self._microphones)[name]
-            for freed in (
-                replace(careful_one, position_m=FREE_M, orientation_deg=FREE_DEG),
-                replace(careful_one, microphones_m=np.full(len(at_m), FREE_MICROPHONE_M)),
-            ):
-                found = explained(
-                    self._microphones,
-                    self._delays,
-                    self._filed.places_m,
-                    self._search.bounds_m,
-                    self._search.c_m_s,
-                    careful(self._microphones) | {name: freed},
-                    FREE_SPEED_M_S,
-                )
-                if self.filed - found.deviance >= least:
-                    return True
-        return False
+    def judged(self) -> list[Alternative]:
+        """Return the alternatives, the best first, each with its criterion and its size as the sounds say best."""
+        tried = [*self._hypotheses.near(self._filed.places_m), *self._hypotheses.far()]
+        found = zip(tried, self._fitted(tried), strict=True)
+        judged = (_adjusted(one.alternative, fit) for one, fit in found if one.alternative is not None)
+        return sorted(judged, key=lambda one: one.criterion)
 
-    def judged(self, alternative: Alternative) -> Alternative:
-        """Return an alternative with its criterion, and with its size as the sounds say best."""
-        found = self._explained(self._applied(alternative), alternative)
-        others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
-        return replace(_adjusted(alternative, found), criterion=found.deviance + COSTS.get(alternative.fault, others))
+    def with_misfit(self, alternative: Alternative) -> Alternative:
+        """Return an alternative with the misfit of the sounds in it, which is exactly as filed otherwise."""
+        return replace(alternative, misfit_s=self._misfit_s(_applied(self._as_filed.set_up, alternative)))
 
-    def _explained(self, applied: _Applied, alternative: Alternative | None) -> Explained:
-        freedom, speed_std_m_s = careful(applied.microphones), SPEED_STD_M_S
-        if alternative is not None:
-            name = alternative.array
-            if name is not None:
-                freedom[name] = _freed(freedom[name], alternative)
-            if alternative.fault == "temperature":
-                speed_std_m_s = FREE_SPEED_M_S
-        starts_m = self._search.fit(applied.microphones, applied.delays, applied.c_m_s).positions_m
-        return explained(
-            applied.microphones,
-            applied.delays,
-            starts_m,
-            self._search.bounds_m,
-            applied.c_m_s,
-            freedom,
-            speed_std_m_s,
-        )
+    def _misfit_s(self, set_up: SetUp) -> float:
+        return self._search.fit(set_up.microphones, set_up.delays, set_up.c_m_s).misfit_s
 
-    def _applied(self, alternative: Alternative | None) -> _Applied:
-        microphones, delays, c_m_s = dict(self._microphones), dict(self._delays), self._search.c_m_s
-        if alternative is None:
-            return _Applied(microphones, delays, c_m_s)
-        name, other = alternative.array, alternative.other
-        if alternative.order:
-            order = np.array(alternative.order) - 1
-            for array in delays if name is None else (name,):
-                delays[array] = delays[array][:, order]
-        elif name is None:
-            c_m_s = alternative.speed_m_s or c_m_s
-            microphones = {array: at_m + alternative.shift_m for array, at_m in microphones.items()}
-        elif other is not None:
-            delays[name], delays[other] = delays[other], delays[name]
-        elif alternative.channel is not None:
-            index = alternative.channel - 1
-            delays[name], microphones[name] = delays[name].copy(), microphones[name].copy()
-            delays[name][:, index] -= alternative.late_s
-            microphones[name][index] += alternative.shift_m
-        else:
-            turn = np.radians(alternative.turn_deg)
-            microphones[name] = moved(microphones[name], np.array(alternative.shift_m), turn)
-        return _Applied(microphones, delays, c_m_s)
+    def _fitted(self, tried: Sequence[Hypothesis]) -> list[Explained]:
+        """Fit hypotheses, as many together as fit into a little memory."""
+        first = tried[0].set_up
+        most = max(1, MOST_SLOPES // max(one.size * (8 + 3 * one.shape[1]) for one in first.delays.values()))
+        bounds_m, found = self._search.bounds_m, []
+        for begin in range(0, len(tried), most):
+            some = tried[begin : begin + most]
+            set_ups = [one.set_up for one in some]
+            starts_m = np.stack([one.starts_m for one in some])
+            places_m = Stacked(set_ups, bounds_m).placed(starts_m, [one.but for one in some])
+            found += explained(set_ups, places_m, bounds_m)
+        return found
 
 
-def _freed(own: Freedom, alternative: Alternative) -> Freedom:
-    """Return the freedom of an array with that which an alternative adds."""
-    if alternative.fault == "turned":
-        return replace(own, orientation_deg=FREE_DEG)
-    if alternative.fault == "moved":
-        return replace(own, position_m=FREE_M)
-    if alternative.fault == "geometry" and alternative.channel is not None:
-        microphones_m = own.microphones_m.copy()
-        microphones_m[alternative.channel - 1] = FREE_MICROPHONE_M
-        return replace(own, microphones_m=microphones_m)
-    return own
+def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
+    """Return the filed set-up as an alternative has it."""
+    microphones, delays, c_m_s = dict(filed.microphones), dict(filed.delays), filed.c_m_s
+    name, other = alternative.array, alternative.other
+    if alternative.order:
+        order = np.array(alternative.order) - 1
+        for array in delays if name is None else (name,):
+            delays[array] = delays[array][:, order]
+    elif name is None:
+        c_m_s = alternative.speed_m_s or c_m_s
+    elif other is not None:
+        delays[name], delays[other] = delays[other], delays[name]
+    elif alternative.channel is not None:
+        index = alternative.channel - 1
+        delays[name], microphones[name] = delays[name].copy(), microphones[name].copy()
+        delays[name][:, index] -= alternative.late_s
+        microphones[name][index] += alternative.shift_m
+    else:
+        turn = np.radians(alternative.turn_deg)
+        microphones[name] = moved(microphones[name], np.array(alternative.shift_m), turn)
+    return replace(filed, microphones=microphones, delays=delays, c_m_s=c_m_s)
 
 
 def _adjusted(alternative: Alternative, found: Explained) -> Alternative:
-    """Return an alternative with the change that was found for what it leaves free."""
+    """Return an alternative with its criterion, and with the change that was found for what it leaves free."""
+    others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
+    judged = replace(alternative, criterion=found.deviance + COSTS.get(alternative.fault, others))
     name = alternative.array
     if alternative.fault == "turned" and name is not None:
         first, then = (Rotation.from_rotvec(np.radians(one)) for one in (alternative.turn_deg, found.turns_deg[name]))
-        return replace(alternative, turn_deg=_three(np.degrees((then * first).as_rotvec())))
+        return replace(judged, turn_deg=_three(np.degrees((then * first).as_rotvec())))
     if alternative.fault == "moved" and name is not None:
-        return replace(alternative, shift_m=_three(np.array(alternative.shift_m) + found.shifts_m[name]))
+        return replace(judged, shift_m=_three(found.shifts_m[name]))
     if alternative.fault == "geometry" and name is not None and alternative.channel is not None:
-        displaced_m = found.displaced_m[name][alternative.channel - 1]
-        return replace(alternative, shift_m=_three(np.array(alternative.shift_m) + displaced_m))
+        return replace(judged, shift_m=_three(found.displaced_m[name][alternative.channel - 1]))
+    if alternative.fault == "late_channel":
+        return replace(judged, late_s=found.late_s)
     if alternative.fault == "temperature" and alternative.speed_m_s is not None:
         off_m_s = found.speed_off_m_s
-        return replace(
-            alternative,
-            speed_m_s=alternative.speed_m_s + off_m_s,
-            speed_off_m_s=alternative.speed_off_m_s + off_m_s,
-        )
-    return alternative
+        return replace(judged, speed_m_s=alternative.speed_m_s + off_m_s, speed_off_m_s=off_m_s)
+    return judged
 
 
 def _three(values: FloatArray) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.types import FloatArray
+from livessl.core.types import Float32Array, FloatArray
 
 Microphones = Mapping[str, FloatArray]
 """Positions (K, 3) of the microphones of each array, metres."""
@@ -28,6 +28,11 @@ KEPT: Final = 0.8
 
 _STEPS: Final = 25
 """Steps of the refinement, which ends after a handful."""
+
+LEAST_DAMPING: Final = 1e-9
+LEAST_SLOPE: Final = 1e-16
+"""Least damping, and what is added to the normal equations of a place in square seconds per square metre, so that they
+can be solved for a sound that two channels received, or one. Slopes are some 1e-3 s/m."""
 
 _FIRST_DAMPING: Final = 1e-3
 _LEAST_M: Final = 1e-6
@@ -86,10 +91,26 @@ class PlaceSearch:
         self.c_m_s = c_m_s
         self._points_m = _points(self.bounds_m)
 
+    @property
+    def points_m(self) -> FloatArray:
+        """Grid points (G, 3) at which places begin, metres."""
+        return self._points_m
+
     def table_s(self, microphones_m: FloatArray) -> FloatArray:
         """Delays (K, G) that a sound at each grid point has at an array's microphones, seconds."""
         squares = ((self._points_m[None] - microphones_m[:, None]) ** 2).sum(axis=2)
         return np.asarray(np.sqrt(squares) / self.c_m_s)
+
+    def tables_s(self, microphones_m: FloatArray) -> Float32Array:
+        """Delays (T, K, G) as `table_s` has them of T arrays (T, K, 3), in single precision: exact to 0.1 us."""
+        points_m, at_m = self.points_m.astype(np.float32), microphones_m.astype(np.float32)
+        squares = at_m @ (np.float32(-2.0) * points_m.T)
+        squares += (at_m**2).sum(axis=-1)[..., None]
+        squares += (points_m**2).sum(axis=-1)
+        np.maximum(squares, 0.0, out=squares)
+        np.sqrt(squares, out=squares)
+        squares /= np.float32(self.c_m_s)
+        return squares
 
     def costs(self, table_s: FloatArray, delays_s: FloatArray) -> FloatArray:
         """Squared contradiction of delays (S, K) at one array with each grid point, (S, G)."""
@@ -127,7 +148,7 @@ class PlaceSearch:
             normal = np.einsum("sri,srj->sij", slope, slope)
             right = np.einsum("sri,sr->si", slope, off)
             scale = np.einsum("sii->s", normal) / 3.0
-            normal = normal + (damping * scale + 1e-30)[:, None, None] * np.eye(3)
+            normal = normal + (damping * scale + LEAST_SLOPE)[:, None, None] * np.eye(3)
             moved_m = np.clip(
                 positions_m - np.linalg.solve(normal, right[..., None])[..., 0],
                 self.bounds_m[:, 0],
@@ -140,7 +161,7 @@ class PlaceSearch:
             done = np.linalg.norm(moved_m - positions_m, axis=1).max() < _LEAST_M
             positions_m[better], off[better], slope[better] = moved_m[better], tried[better], tried_slope[better]
             cost = np.where(better, tried_cost, cost)
-            damping = np.where(better, damping / 5.0, damping * 8.0)
+            damping = np.where(better, np.maximum(damping / 5.0, LEAST_DAMPING), damping * 8.0)
             if done:
                 break
         return Places(positions_m, np.sqrt(cost / degrees_of_freedom(delays)))

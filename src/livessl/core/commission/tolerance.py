@@ -1,6 +1,8 @@
-"""Fits a set-up to the delays of sounds with the freedom that a careful set-up has.
+"""Explains delays by a set-up that may be off by as little as people measure, and says how well that works.
 
-No pose is measured exactly, and delays in rooms have outliers. Each array may therefore be shifted and turned, each
+Nobody places an array to better than a centimetre or two and a degree. A set-up as filed that is compared with
+alternatives without that freedom always contradicts the sounds a little, and a small turn or shift of a wrong array
+explains it. So the set-up as filed and each alternative get the same freedom: arrays may be shifted and turned, each
 microphone may be elsewhere, and the speed of sound may differ, by as much as their standard deviations allow. What
 remains is weighed by a distribution with heavy tails, for each sound at each array together, because an array that
 receives an echo best has errors in all its delays.
@@ -8,14 +10,14 @@ receives an echo best has errors in all its delays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from livessl.core.commission.places import Delays, Microphones, contradictions_s, slopes_s_m
-from livessl.core.commission.poses import moved
+from livessl.core.commission.set_up import SetUp, Stacked, away, centred_rows, centred_where, inverse
 from livessl.core.types import FloatArray
 
 DELAY_STD_S: Final = 6e-6
@@ -24,13 +26,19 @@ DELAY_STD_S: Final = 6e-6
 TAILS: Final = 3.0
 """Degrees of freedom of the t distribution of delays: 3 has heavy tails."""
 
-POSITION_STD_M: Final = 0.02
-ORIENTATION_STD_DEG: Final = 1.2
-MICROPHONE_STD_M: Final = 0.002
-SPEED_STD_M_S: Final = 1.5
-"""Standard deviations of a careful set-up, along each axis: metres, degrees, metres and m/s."""
+FREE_LATE_S: Final = 1e-3
+"""Standard deviation of the delay of a channel that may have any, seconds."""
 
-_STEPS: Final = 5
+WIDER: Final = (8.0, 4.0, 2.0)
+"""Factors on `DELAY_STD_S` in the first steps, so that a set-up that is far from the sounds is drawn to them although
+they are all in the tails."""
+
+MOST_STEPS: Final = 8
+"""Steps of a fit beyond the first ones."""
+
+_ENOUGH: Final = 0.02
+"""Change of every deviance below which a fit ends."""
+
 _MOST_STEP_M: Final = 1.0
 """Longest step of a place in one iteration, metres."""
 
@@ -39,23 +47,6 @@ _LEAST_SLOPE: Final = 1e-6
 
 _POSE: Final = 6
 """Unknowns of a pose: three of the shift, three of the turn."""
-
-
-@dataclass(frozen=True, slots=True)
-class Freedom:
-    """Standard deviations of one array, along each axis.
-
-    Parameters
-    ----------
-    position_m, orientation_deg : float
-        Metres and degrees.
-    microphones_m : (K,) float64
-        Of each microphone, metres.
-    """
-
-    position_m: float
-    orientation_deg: float
-    microphones_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +65,8 @@ class Explained:
         By how much each microphone does besides.
     speed_off_m_s : float
         By how much the speed of sound does.
+    late_s : float
+        Delay of the channel that may have one, seconds.
     """
 
     deviance: float
@@ -82,154 +75,179 @@ class Explained:
     turns_deg: Mapping[str, FloatArray]
     displaced_m: Mapping[str, FloatArray]
     speed_off_m_s: float
+    late_s: float
 
 
-def careful(microphones: Microphones) -> dict[str, Freedom]:
-    """Return the freedom of arrays that were set up with care."""
-    return {
-        name: Freedom(POSITION_STD_M, ORIENTATION_STD_DEG, np.full(len(at_m), MICROPHONE_STD_M))
-        for name, at_m in microphones.items()
-    }
-
-
-def explained(
-    microphones: Microphones,
-    delays: Delays,
-    starts_m: FloatArray,
-    bounds_m: FloatArray,
-    c_m_s: float,
-    freedom: Mapping[str, Freedom],
-    speed_std_m_s: float = SPEED_STD_M_S,
-) -> Explained:
-    """Fit places and the small freedom of a set-up to delays, and return how well they fit.
+def explained(set_ups: Sequence[SetUp], starts_m: FloatArray, bounds_m: FloatArray) -> list[Explained]:
+    """Fit places and the small freedom of set-ups to delays, and return how well they fit.
 
     Parameters
     ----------
-    microphones : mapping of array to (K, 3) float64
-        The set-up, metres.
-    delays : mapping of array to (S, K) float64
-        Seconds; NaN where there is none.
-    starts_m : (S, 3) float64
+    set_ups : sequence of SetUp
+        H set-ups of the same arrays with as many sounds.
+    starts_m : (H, S, 3) float64
         Places to begin at, metres.
     bounds_m : (3, 2) float64
         Search volume, metres.
-    c_m_s, speed_std_m_s : float
-        Speed of sound and its standard deviation, m/s.
-    freedom : mapping of array to Freedom
     """
-    problem = _Problem(microphones, delays, bounds_m, c_m_s, freedom, speed_std_m_s)
-    places_m, unknowns = starts_m.copy(), np.zeros(len(problem.scale))
-    best = problem.deviance(places_m, unknowns), places_m, unknowns
-    for _ in range(_STEPS):
-        places_m, unknowns = problem.step(places_m, unknowns)
-        deviance = problem.deviance(places_m, unknowns)
-        if deviance < best[0]:
-            best = deviance, places_m, unknowns
-    return problem.result(*best)
+    fit = Fit(set_ups, starts_m, bounds_m)
+    fit.run()
+    return fit.results()
 
 
-class _Problem:
-    """The fit. Unknowns are in standard deviations: for each array shift, turn and microphones, then the speed."""
+class Fit:
+    """Fits of several set-ups, all of them together; see `explained`.
 
-    def __init__(
-        self,
-        microphones: Microphones,
-        delays: Delays,
-        bounds_m: FloatArray,
-        c_m_s: float,
-        freedom: Mapping[str, Freedom],
-        speed_std_m_s: float,
-    ) -> None:
-        self._microphones, self._delays, self._bounds_m, self._c_m_s = microphones, delays, bounds_m, c_m_s
-        counts = [measured.shape[1] for measured in delays.values()]
-        ends = np.cumsum(counts)
-        self._rows = {name: slice(end - n, end) for name, end, n in zip(delays, ends, counts, strict=True)}
+    The unknowns of each are in standard deviations: for each array shift, turn and microphones, then the speed of sound
+    and the delay of one channel.
+    """
+
+    def __init__(self, set_ups: Sequence[SetUp], starts_m: FloatArray, bounds_m: FloatArray) -> None:
+        self._stacked = Stacked(set_ups, bounds_m)
         self._columns: dict[str, slice] = {}
-        parts: list[FloatArray] = []
         at = 0
-        for name, count in zip(delays, counts, strict=True):
-            own = freedom[name]
+        for name, at_m in set_ups[0].microphones.items():
+            if name in self._stacked.names:
+                self._columns[name] = slice(at, at + _POSE + 3 * len(at_m))
+                at += _POSE + 3 * len(at_m)
+        self._scale = np.array([self._scales(one) for one in set_ups])
+        # independent delays of each sound at each array
+        self._count = {name: np.maximum(one.sum(axis=-1) - 1, 0) for name, one in self._stacked.there.items()}
+        self._of_late = {name: np.zeros_like(one) for name, one in self._stacked.measured_s.items()}
+        for row, one in enumerate(set_ups):
+            if one.late is not None:
+                name, index = one.late
+                there = self._stacked.there[name][row]
+                self._of_late[name][row] = centred_where(np.eye(there.shape[1])[index][None] * there, there)
+        self._places_m, self._unknowns = starts_m.copy(), np.zeros_like(self._scale)
+        self._off = self._residuals()
+        self.deviances = self._deviances()
+        """Deviance of each set-up so far, (H,)."""
+        self._best = self._places_m, self._unknowns
+
+    def run(self) -> None:
+        """Fit until no deviance changes any more."""
+        for step in range(len(WIDER) + MOST_STEPS):
+            before = self.deviances
+            self._step(WIDER[step] if step < len(WIDER) else 1.0)
+            self._off = self._residuals()
+            deviances = self._deviances()
+            better = deviances < before
+            self.deviances = np.where(better, deviances, before)
+            places_m, unknowns = self._best
+            self._best = (
+                np.where(better[:, None, None], self._places_m, places_m),
+                np.where(better[:, None], self._unknowns, unknowns),
+            )
+            if step >= len(WIDER) and (before - self.deviances).max() < _ENOUGH:
+                break
+
+    def results(self) -> list[Explained]:
+        """Return the best fit of each set-up, its unknowns by name."""
+        places_m, unknowns = self._best
+        return list(self._results(places_m, unknowns * self._scale))
+
+    def _results(self, places_m: FloatArray, off: FloatArray) -> Iterator[Explained]:
+        for row, deviance in enumerate(self.deviances):
+            own = {name: off[row, columns] for name, columns in self._columns.items()}
+            yield Explained(
+                float(deviance),
+                places_m[row],
+                {name: one[:3] for name, one in own.items()},
+                {name: np.degrees(one[3:_POSE]) for name, one in own.items()},
+                {name: one[_POSE:].reshape(-1, 3) for name, one in own.items()},
+                float(off[row, -2]),
+                float(off[row, -1]),
+            )
+
+    def _scales(self, one: SetUp) -> FloatArray:
+        parts = []
+        for name in self._columns:
+            own = one.freedom[name]
             parts += [np.full(3, own.position_m), np.full(3, np.radians(own.orientation_deg))]
             parts.append(np.repeat(own.microphones_m, 3))
-            self._columns[name] = slice(at, at + _POSE + 3 * count)
-            at += _POSE + 3 * count
-        self.scale = np.concatenate([*parts, [speed_std_m_s]])
-        # independent delays of each sound at each array
-        self._count = {name: np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for name, one in delays.items()}
+        return np.concatenate([*parts, [one.speed_std_m_s, FREE_LATE_S if one.late is not None else 0.0]])
 
-    def deviance(self, places_m: FloatArray, unknowns: FloatArray) -> float:
-        """Minus twice the logarithm of the likelihood and of the priors."""
-        total = float(unknowns @ unknowns)
-        for name, squares in self._squares(self._off(places_m, unknowns)).items():
-            total += float(((TAILS + self._count[name]) * np.log1p(squares / TAILS)).sum())
-        return total
-
-    def step(self, places_m: FloatArray, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """One step of the method of Gauss and Newton, the places eliminated; reweighted for the tails."""
-        microphones, c_m_s = self._set_up(unknowns)
-        off = self._off(places_m, unknowns)
-        weight = np.zeros_like(off)
-        for name, squares in self._squares(off).items():
-            weight[:, self._rows[name]] = ((TAILS + self._count[name]) / (TAILS + squares))[:, None]
-        of_places = slopes_s_m(microphones, self._delays, places_m, c_m_s) / DELAY_STD_S
-        of_unknowns = self._slopes(microphones, places_m, c_m_s) * (self.scale / DELAY_STD_S)
-        weighted = of_places * weight[..., None]
-        normal = np.einsum("sri,srj->sij", weighted, of_places) + _LEAST_SLOPE * np.eye(3)
-        mixed = np.einsum("sri,srn->sin", weighted, of_unknowns)
-        right = np.einsum("sri,sr->si", weighted, off)
-        rows = (of_unknowns * weight[..., None]).reshape(-1, len(unknowns))
-        whole = rows.T @ of_unknowns.reshape(-1, len(unknowns)) + np.eye(len(unknowns))
-        gradient = rows.T @ off.ravel() + unknowns
-        solved = np.linalg.solve(normal, np.concatenate([mixed, right[..., None]], axis=2))
-        of_mixed, of_right = solved[..., :-1], solved[..., -1]
-        reduced = whole - np.einsum("sin,sim->nm", mixed, of_mixed)
-        change = -np.linalg.solve(reduced, gradient - np.einsum("sin,si->n", mixed, of_right))
-        step_m = np.clip(-(of_right + of_mixed @ change), -_MOST_STEP_M, _MOST_STEP_M)
-        moved_m = np.clip(places_m + step_m, self._bounds_m[:, 0], self._bounds_m[:, 1])
-        return moved_m, unknowns + change
-
-    def result(self, deviance: float, places_m: FloatArray, unknowns: FloatArray) -> Explained:
-        """Return the unknowns by name."""
-        off = unknowns * self.scale
-        shifts_m, turns_deg, displaced_m = {}, {}, {}
-        for name, columns in self._columns.items():
-            own = off[columns]
-            shifts_m[name], turns_deg[name] = own[:3], np.degrees(own[3:_POSE])
-            displaced_m[name] = own[_POSE:].reshape(-1, 3)
-        return Explained(deviance, places_m, shifts_m, turns_deg, displaced_m, float(off[-1]))
-
-    def _set_up(self, unknowns: FloatArray) -> tuple[dict[str, FloatArray], float]:
-        off = unknowns * self.scale
+    def _set_ups(self) -> tuple[dict[str, FloatArray], FloatArray]:
+        """Places (H, K, 3) of the microphones of each array, metres, and speeds of sound (H,), with the unknowns."""
+        off = self._unknowns * self._scale
         microphones = {}
         for name, columns in self._columns.items():
-            own = off[columns]
-            microphones[name] = moved(self._microphones[name], own[:3], own[3:_POSE]) + own[_POSE:].reshape(-1, 3)
-        return microphones, self._c_m_s + float(off[-1])
+            at_m, own = self._stacked.microphones[name], off[:, columns]
+            centre_m = at_m.mean(axis=1, keepdims=True)
+            turn = Rotation.from_rotvec(own[:, 3:_POSE]).as_matrix()
+            turned_m = (at_m - centre_m) @ turn.swapaxes(1, 2)
+            microphones[name] = turned_m + centre_m + own[:, None, :3] + own[:, _POSE:].reshape(at_m.shape)
+        return microphones, self._stacked.c_m_s + off[:, -2]
 
-    def _off(self, places_m: FloatArray, unknowns: FloatArray) -> FloatArray:
-        microphones, c_m_s = self._set_up(unknowns)
-        return contradictions_s(microphones, self._delays, places_m, c_m_s) / DELAY_STD_S
+    def _residuals(self) -> dict[str, FloatArray]:
+        """Residuals (H, S, K) of the delays at each array, in standard deviations; keeps what the slopes need."""
+        self._microphones, self._c_m_s = self._set_ups()
+        late_s = (self._unknowns[:, -1] * self._scale[:, -1])[:, None, None]
+        self._away, residuals = {}, {}
+        for name in self._columns:
+            self._away[name] = away(self._places_m, self._microphones[name])
+            predicted_s = self._away[name][0] / self._c_m_s[:, None, None]
+            off_s = centred_where(predicted_s, self._stacked.there[name]) - self._stacked.measured_s[name]
+            residuals[name] = (off_s + late_s * self._of_late[name]) / DELAY_STD_S
+        return residuals
 
-    def _squares(self, off: FloatArray) -> dict[str, FloatArray]:
-        return {name: (off[:, rows] ** 2).sum(axis=1) for name, rows in self._rows.items()}
+    def _deviances(self) -> FloatArray:
+        total = (self._unknowns**2).sum(axis=1)
+        for name, off in self._off.items():
+            squares = (off**2).sum(axis=-1)
+            total = total + ((TAILS + self._count[name]) * np.log1p(squares / TAILS)).sum(axis=1)
+        return np.asarray(total)
 
-    def _slopes(self, microphones: Microphones, places_m: FloatArray, c_m_s: float) -> FloatArray:
-        """Slope (S, R, N) of the contradictions by the unknowns, seconds per metre, radian and m/s."""
-        parts = [self._of_array(name, microphones[name], places_m, c_m_s) for name in self._columns]
-        return np.concatenate(parts, axis=1)
+    def _step(self, wider: float) -> None:
+        """Make one step of the method of Gauss and Newton, the places eliminated; reweighted for the tails."""
+        rows, count = self._scale.shape
+        sounds = self._places_m.shape[1]
+        normal = np.tile(_LEAST_SLOPE * np.eye(3), (rows, sounds, 1, 1))
+        mixed, right = np.zeros((rows, sounds, 3, count)), np.zeros((rows, sounds, 3))
+        whole, gradient = np.tile(np.eye(count), (rows, 1, 1)), self._unknowns.copy()
+        for name, columns in self._columns.items():
+            of_places, of_unknowns = self._slopes(name)
+            off = self._off[name]
+            squares = (off**2).sum(axis=-1) / wider**2
+            weight = (TAILS + self._count[name]) / (TAILS + squares) / wider**2
+            used = np.r_[columns, count - 2, count - 1]
+            weighted = of_places.swapaxes(-1, -2) * weight[..., None, None]
+            normal += weighted @ of_places
+            mixed[..., used] += weighted @ of_unknowns
+            right += (weighted @ off[..., None])[..., 0]
+            root = np.sqrt(weight)[..., None]
+            flat = (of_unknowns * root[..., None]).reshape(rows, -1, len(used)).swapaxes(1, 2)
+            whole[:, used[:, None], used] += flat @ flat.swapaxes(1, 2)
+            gradient[:, used] += (flat @ (off * root).reshape(rows, -1, 1))[..., 0]
+        inverted = inverse(normal)
+        of_mixed, of_right = inverted @ mixed, (inverted @ right[..., None])[..., 0]
+        eliminated = mixed.reshape(rows, -1, count).swapaxes(1, 2)
+        reduced = whole - eliminated @ of_mixed.reshape(rows, -1, count)
+        rest = gradient - (eliminated @ of_right.reshape(rows, -1, 1))[..., 0]
+        change = -np.linalg.solve(reduced, rest[..., None])[..., 0]
+        step_m = -(of_right + (of_mixed @ change[:, None, :, None])[..., 0])
+        moved_m = self._places_m + np.clip(step_m, -_MOST_STEP_M, _MOST_STEP_M)
+        self._places_m = np.clip(moved_m, *self._stacked.bounds_m.T)
+        self._unknowns = self._unknowns + change
 
-    def _of_array(self, name: str, at_m: FloatArray, places_m: FloatArray, c_m_s: float) -> FloatArray:
-        towards = places_m[:, None] - at_m
-        away_m = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
-        slope = -towards / (away_m * c_m_s)[..., None]  # of the delays by the microphones' positions
-        columns, index = self._columns[name], np.arange(len(at_m))
-        slopes = np.zeros((len(places_m), len(at_m), len(self.scale)))
-        own = slopes[..., columns]
-        own[..., :3] = slope
-        own[..., 3:_POSE] = np.cross(at_m - at_m.mean(axis=0), slope)
-        own[..., _POSE:].reshape(len(places_m), len(at_m), len(at_m), 3)[:, index, index] = slope
-        slopes[..., -1] = -away_m / c_m_s**2
-        there = np.isfinite(self._delays[name])[..., None]
-        slopes = np.where(there, slopes, 0.0)
-        mean = slopes.sum(axis=1, keepdims=True) / np.maximum(there.sum(axis=1, keepdims=True), 1)
-        return np.asarray(np.where(there, slopes - mean, 0.0))
+    def _slopes(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Slopes of an array's residuals by the places, (H, S, K, 3), and by its unknowns and the last two."""
+        away_m, unit = self._away[name]
+        at_m, c_m_s = self._microphones[name], self._c_m_s[:, None, None]
+        there, scale = self._stacked.there[name], self._scale[:, None, None]
+        of_places = unit / (c_m_s[..., None] * DELAY_STD_S)
+        slope = -of_places  # by the microphones' positions
+        turns = np.cross((at_m - at_m.mean(axis=1, keepdims=True))[:, None], slope)
+        rows, sounds, channels, _ = slope.shape
+        own = np.zeros((rows, sounds, channels, channels, 3))
+        index = np.arange(channels)
+        own[:, :, index, index] = slope
+        speed = -away_m / (c_m_s**2 * DELAY_STD_S)
+        parts = [slope, turns, own.reshape(rows, sounds, channels, -1), speed[..., None]]
+        centred = centred_rows(np.concatenate(parts, axis=-1), there)
+        of_late = self._of_late[name][..., None] / DELAY_STD_S
+        of_unknowns = np.concatenate([centred, of_late], axis=-1)
+        columns = self._columns[name]
+        scales = np.concatenate([scale[..., columns], scale[..., -2:]], axis=-1)
+        return centred_rows(of_places, there), of_unknowns * scales

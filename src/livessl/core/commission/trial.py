@@ -1,9 +1,9 @@
-"""Tries other set-ups than the one that is filed against the delays of some sounds."""
+"""Tries other set-ups than the one that is filed against the delays of sounds at places that somebody measured."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import combinations, permutations
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -12,26 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.alternative import LEAST_SHIFT_M, LEAST_TURN_DEG, Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
-from livessl.core.commission.places import Delays, KnownPlaces, Microphones, Places, PlaceSearch, degrees_of_freedom
-from livessl.core.commission.poses import DELAY_STD_S, UNKNOWN_M, Adjusted, Freedom, adjust
+from livessl.core.commission.hypotheses import MIN_FOR_ONE, channel_orders
+from livessl.core.commission.places import Delays, KnownPlaces, Microphones, Places, degrees_of_freedom
+from livessl.core.commission.poses import DELAY_STD_S, Adjusted, Freedom, adjust
 from livessl.core.types import FloatArray, IntArray
-
-ALL_ORDERS: Final = 4
-"""Most microphones of an array of which all orders are tried; of larger arrays exchanges of two, shifts and mirror."""
 
 REFINED: Final = 6
 """Alternatives, the best at first sight, whose places are refined."""
 
-MIN_FOR_ONE: Final = 4
-"""Fewest microphones of an array of which a single one is examined: the others must say what it ought to receive."""
-
-FLOOR_S: Final = 12e-6
-"""Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
-to 2 cm and 1.5 degrees. A smaller one is no reason to prefer an alternative."""
-
-KNOWN_FLOOR_S: Final = 20e-6
-"""The same for sounds at places that somebody measured: to some centimetres, which turn the direction by a degree or
-two."""
+FLOOR_S: Final = 20e-6
+"""Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: places to some centimetres,
+which turn the direction by a degree or two. A smaller one is no reason to prefer an alternative."""
 
 PLACE_STD_M: Final = 0.03
 """Standard deviation of such places along each axis, metres."""
@@ -55,13 +46,10 @@ class Trial:
         As filed, metres.
     delays : mapping of array to (S, K) float64
         Seconds.
-    search : PlaceSearch
-        `KnownPlaces` if somebody measured the places of the sounds.
+    search : KnownPlaces
     """
 
-    def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
-        self._is_known = isinstance(search, KnownPlaces)
-        self.floor_s = KNOWN_FLOOR_S if self._is_known else FLOOR_S
+    def __init__(self, microphones: Microphones, delays: Delays, search: KnownPlaces) -> None:
         self._microphones, self._delays, self._search = microphones, delays, search
         self.sounds = len(next(iter(delays.values())))
         self._tables = {name: search.table_s(at_m) for name, at_m in microphones.items()}
@@ -71,19 +59,19 @@ class Trial:
 
     def criterion(self, places: Places, unknowns: float) -> float:
         """Bayesian information criterion of a set-up with so many unknowns more than that which is filed."""
-        misfit_s = np.hypot(places.misfit_s, self.floor_s / 3.0)
+        misfit_s = np.hypot(places.misfit_s, FLOOR_S / 3.0)
         return float(self._free * np.log(misfit_s**2) + unknowns * np.log(self._free))
 
     def orders(self) -> Iterator[Alternative]:
         """Yield the best alternative orders of channels, of one array and of all."""
         tried: list[tuple[float, str | None, dict[str, IntArray]]] = []
         for name, delays in self._delays.items():
-            for order in _orders(delays.shape[1]):
+            for order in channel_orders(delays.shape[1]):
                 costs = self._search.costs(self._tables[name], delays[:, order])
                 tried.append((self._lowest({name: costs}), name, {name: order}))
         counts = {delays.shape[1] for delays in self._delays.values()}
         if len(counts) == 1:
-            for order in _orders(counts.pop()):
+            for order in channel_orders(counts.pop()):
                 together = {
                     name: self._search.costs(self._tables[name], delays[:, order])
                     for name, delays in self._delays.items()
@@ -187,9 +175,7 @@ class Trial:
         )
 
     def heights(self) -> Iterator[Alternative]:
-        """Yield all arrays higher or lower, which only sounds at known places can show."""
-        if not self._is_known:
-            return
+        """Yield all arrays higher or lower."""
         best: tuple[Places, float] | None = None
         for rise_m in np.arange(-MOST_RISE_M, MOST_RISE_M + RISE_STEP_M / 2.0, RISE_STEP_M):
             microphones = {name: at_m + np.array([0.0, 0.0, rise_m]) for name, at_m in self._microphones.items()}
@@ -232,8 +218,7 @@ class Trial:
         return self._adjusted(microphones, places.positions_m, Freedom({name: _TURNED})), best[1]
 
     def _adjusted(self, microphones: Microphones, places_m: FloatArray, freedom: Freedom) -> Adjusted:
-        std_m = PLACE_STD_M if self._is_known else UNKNOWN_M
-        return adjust(microphones, self._delays, places_m, self._search.c_m_s, freedom, std_m)
+        return adjust(microphones, self._delays, places_m, self._search.c_m_s, freedom, PLACE_STD_M)
 
     def _placed(self, name: str, adjusted: Adjusted, turn: Rotation) -> Places:
         centre_m = self._microphones[name].mean(axis=0)
@@ -249,18 +234,3 @@ class Trial:
         """Sum over the sounds of the lowest cost with some arrays' costs changed; one bad sound counts little."""
         lowest = self._together(changed).min(axis=1)
         return float(np.sqrt(lowest).sum())
-
-
-def _orders(count: int) -> list[IntArray]:
-    """Orders of channels to try: `order[i]` is the channel that carries microphone i."""
-    same = tuple(range(count))
-    if count <= ALL_ORDERS:
-        return [np.array(order) for order in permutations(same) if order != same]
-    tried = []
-    for i, k in combinations(same, 2):
-        order = list(same)
-        order[i], order[k] = k, i
-        tried.append(tuple(order))
-    tried += [tuple(np.roll(same, shift)) for shift in range(1, count)]
-    tried += [tuple(np.roll(same[::-1], shift)) for shift in range(count)]
-    return [np.array(order) for order in dict.fromkeys(tried)]

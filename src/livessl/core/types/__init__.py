@@ -1,5 +1,6 @@
 """The values that flow through livessl: frozen, validated where they are made, with read-only arrays."""
 
+from livessl.core.states import ClockState, Status, TrackState
 from livessl.core.types.arrays import (
     BoolArray,
     ComplexArray,
@@ -19,9 +20,7 @@ from livessl.core.types.results import (
     Estimate,
     Event,
     Output,
-    Status,
     Track,
-    TrackState,
     Update,
     Window,
 )
@@ -34,7 +33,6 @@ from livessl.core.types.sound import (
     MIN_MICROPHONES,
     ArraySpec,
     Block,
-    ClockState,
     Evidence,
     Frame,
     Mark,

@@ -3,28 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 
+from livessl.core.states import Status, TrackState
 from livessl.core.types.arrays import FloatArray, read_only
 from livessl.core.types.sound import Evidence, Received
-
-
-class Status(StrEnum):
-    """Kind of an event's answer: a position, a direction only, or none."""
-
-    LOCATED = "located"
-    DIRECTION_ONLY = "direction-only"
-    REFUSED = "refused"
-
-
-class TrackState(StrEnum):
-    """Stage in the life of a track."""
-
-    NEW = "new"
-    UPDATE = "update"
-    END = "end"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
+from livessl.core.states import ClockState
 from livessl.core.types.arrays import BoolArray, Float32Array, FloatArray, IntArray, RealArray, read_only
 from livessl.core.types.report import ChannelLevel, HostState
 
@@ -26,14 +26,6 @@ MAX_MICROPHONES: Final = 16
 MAX_SAMPLE: Final = 1e6
 """Largest magnitude of a sample, 120 dB above full scale. No converter gives more; a larger value comes from a broken
 file or sender, and one such sample would mask every other array."""
-
-
-class ClockState(StrEnum):
-    """Reliability of a node's mapping from sample index to site time."""
-
-    SETTLING = "settling"
-    LOCKED = "locked"
-    STEPPED = "stepped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,6 +306,9 @@ class Evidence:
         the microphones were random; 0 if it is not known.
     is_presumed : bool
         Whether the array is taken to contribute even if its sound does not stand out from its noise.
+    background : (P, L) float32, or None
+        What `gcc.values` would be of a background alone that went on as it was before the sound; None if that is not
+        known.
     """
 
     spec: ArraySpec
@@ -321,6 +316,7 @@ class Evidence:
     below: tuple[GCC, ...] = ()
     noise_rms: float = 0.0
     is_presumed: bool = True
+    background: Float32Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,11 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from livessl.errors import RunError
+from livessl.schema.alerts import DeliveryState as DeliveryState
 from livessl.server.alerts.rules import RuleState
 from livessl.server.api.encode import JsonObject
 
@@ -34,18 +34,6 @@ NO_ACTION: Final = "the site file no longer has this action"
 """Why an alert was given up whose action was removed."""
 
 CURE: Final = "free space on its disk, or close the program that locks the file"
-
-
-class DeliveryState(StrEnum):
-    """Progress of one alert to one action.
-
-    It waits for the next attempt, arrived, was given up (a dead letter), or was dismissed by an operator after that.
-    """
-
-    WAITING = "waiting"
-    DELIVERED = "delivered"
-    DEAD = "dead"
-    DISMISSED = "dismissed"
 
 
 class Raised(NamedTuple):
@@ -96,6 +84,7 @@ class Outbox:
     """
 
     def __init__(self, path: Path | None = None) -> None:
+        self.path = path
         self._lock = threading.Lock()
         try:
             self._db = sqlite3.connect(path or ":memory:", timeout=BUSY_S, check_same_thread=False)

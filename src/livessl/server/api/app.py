@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import re
-from base64 import b64encode
-from collections.abc import Callable
-from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
@@ -15,22 +11,27 @@ from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl import __version__
+from livessl.schema.answers import errors
 from livessl.server.api import documentation, routes
 from livessl.server.api.alert_routes import alert_routes, dead_letter_routes
-from livessl.server.api.answers import errors
 from livessl.server.api.asyncapi import asyncapi_route
 from livessl.server.api.auth import HEALTH, Access, Gate
 from livessl.server.api.clip_routes import clip_routes
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.event_log_route import event_log_route
+from livessl.server.api.headers import SafeHeaders, other_origins
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.journal_routes import journal_routes
 from livessl.server.api.live import live_routes
+from livessl.server.api.log_route import log_route
 from livessl.server.api.metrics import metrics_route
 from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.reload_routes import reload_route
 from livessl.server.api.set_up_routes import set_up_routes
+from livessl.server.api.stream import stream_route
 from livessl.server.api.zone_routes import zone_routes
 from livessl.server.parts import Parts
 from livessl.server.store import StoreError
@@ -38,19 +39,6 @@ from livessl.server.store import StoreError
 STATIC: Final = Path(__file__).parents[1] / "static"
 """The dashboard's files."""
 
-
-def _content_security_policy(page: str) -> str:
-    """Return the policy of all pages; of scripts inside pages it admits that of the dashboard."""
-    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
-    digests = (b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
-    admitted = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
-    return (
-        f"default-src 'self'; script-src {admitted}; img-src 'self' data:; "
-        "media-src 'self' blob:; connect-src 'self' ws: wss:; frame-ancestors 'self'"
-    )
-
-
-_CSP: Final = _content_security_policy((STATIC / "index.html").read_text(encoding="utf-8"))
 
 _DESCRIPTION: Final = """\
 Where in the room a sound happened: events, live estimates, tracks, arrays and power maps.
@@ -75,8 +63,10 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     )
     app.add_middleware(_HeadAsGet)
     app.add_middleware(Gate, access=access, refusals=parts.refusals)
+    if site.server.http.allowed_origins:
+        app.add_middleware(other_origins, http=site.server.http, shown=tuple(routes.MAP_HEADERS))
     app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
-    app.middleware("http")(_with_safe_headers)
+    app.add_middleware(SafeHeaders, http=site.server.http, page=STATIC / "index.html")
     app.add_middleware(BehindProxy, http=site.server.http)
 
     strict = [Depends(refuse_unknown_parameters)]
@@ -85,6 +75,8 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         routes.switch_route(parts),
         routes.access_route(parts, access),
         history_routes(parts),
+        event_log_route(parts),
+        stream_route(parts),
         journal_routes(parts),
         routes.map_route(parts),
         alert_routes(parts),
@@ -93,6 +85,8 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         set_up_routes(parts),
         proposal_routes(parts),
         clip_routes(parts),
+        reload_route(parts),
+        log_route(parts),
     ):
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))
@@ -118,14 +112,6 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
 
 async def _without_database(_request: Request, error: Exception) -> Response:
     return JSONResponse({"detail": str(error)}, 503)
-
-
-async def _with_safe_headers(request: Request, proceed: Callable[[Request], Any]) -> Response:
-    response: Response = await proceed(request)
-    response.headers["Content-Security-Policy"] = _CSP
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers.setdefault("Cache-Control", "no-cache")
-    return response
 
 
 def _describe_tokens(described: JsonObject) -> None:

@@ -9,11 +9,11 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from livessl import __version__
+from livessl.schema.messages import MESSAGES
 from livessl.server.api.auth import PROTOCOL, TOKEN_PROTOCOL, Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.hosts import public_host
 from livessl.server.api.live import LISTEN, LIVE, MAP
-from livessl.server.api.messages import MESSAGES
 from livessl.server.api.queries import ListenParameters, LiveParameters, MapParameters
 from livessl.server.api.routes import as_json
 from livessl.server.clips.listeners import HEADER as SOUND_HEADER

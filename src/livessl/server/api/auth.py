@@ -29,6 +29,7 @@ TOKEN_PROTOCOL: Final = "livessl.token."  # noqa: S105 - what stands before a to
 
 HEALTH: Final = "/api/v1/health"
 ACCESS: Final = "/api/v1/access"
+LOG: Final = "/api/v1/log"
 
 ANYONE: Final = Client("anyone", Role.ADMIN)
 """Every client of a site without tokens, whose server listens on the local machine only."""
@@ -48,7 +49,7 @@ _log = logging.getLogger(__name__)
 
 
 class Access:
-    """The valid tokens, and the WebSockets that were opened with them. Call it from the event loop's thread only.
+    """The valid tokens, and the requests and WebSockets that use them now. For the event loop's thread only.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ class Access:
                 _log.error("%s; the former tokens stay in force", error)
 
     def _replace(self, tokens: Tokens) -> None:
-        """Replace the valid tokens, and end the WebSockets whose token is revoked or has another role."""
+        """Replace the valid tokens, and end what lasts and whose token is revoked or has another role."""
         self._tokens = tokens
         for revoked, (token, client) in self._open.items():
             if tokens.client(token) != client:
@@ -109,7 +110,7 @@ class Access:
 
     @contextmanager
     def held(self, token: str, client: Client) -> Iterator[asyncio.Event]:
-        """Register an open WebSocket; the event is set when its token is revoked or has another role."""
+        """Register a WebSocket or a request; the event is set when its token is revoked or has another role."""
         revoked = asyncio.Event()
         self._open[revoked] = token, client
         try:
@@ -157,10 +158,10 @@ class Gate:
             return
         scope["client_role"] = None if client is None else client.role
         scope["client_name"] = None if client is None else client.name
-        if scope["type"] == "websocket" and client is not None and token is not None:
+        if client is not None and token is not None:
             with self._access.held(token, client) as revoked:
-                await self._app(scope, _until(revoked, receive), _choosing_protocol(scope, send))
-                if revoked.is_set():
+                await self._app(scope, _until(revoked, receive, scope["type"]), _choosing_protocol(scope, send))
+                if revoked.is_set() and scope["type"] == "websocket":
                     await _close_revoked(send)
         else:
             await self._app(scope, receive, _choosing_protocol(scope, send))
@@ -178,14 +179,14 @@ async def _close_revoked(send: Send) -> None:
             await send({"type": "websocket.close", "code": 1008, "reason": "the token is no longer valid"})
 
 
-def _until(revoked: asyncio.Event, receive: Receive) -> Receive:
-    """Return a `receive` that reports a disconnection once the token is revoked."""
+def _until(revoked: asyncio.Event, receive: Receive, kind: str) -> Receive:
+    """Return a `receive` that reports a disconnection once the token is revoked; `kind` is the scope's type."""
 
     async def receive_or_leave() -> Message:
         received, ended = asyncio.ensure_future(receive()), asyncio.ensure_future(revoked.wait())
         try:
             await asyncio.wait((received, ended), return_when=asyncio.FIRST_COMPLETED)
-            return {"type": "websocket.disconnect", "code": 1008} if ended.done() else received.result()
+            return {"type": f"{kind}.disconnect", "code": 1008} if ended.done() else received.result()
         finally:
             received.cancel()
             ended.cancel()
@@ -202,7 +203,7 @@ def needed_role(method: str, path: str) -> Role | None:
     path = path.removesuffix("\n")
     if method in _READING and (path in ("/", "/docs", "/history", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
-    if path == ACCESS:
+    if path in (ACCESS, LOG):
         return Role.ADMIN
     if _SOUND.fullmatch(path):
         return Role.OPERATOR

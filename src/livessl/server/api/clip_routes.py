@@ -13,8 +13,8 @@ import soundfile
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
+from livessl.schema.answers import errors
 from livessl.server.api import clip_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
 from livessl.server.clips.service import state_of

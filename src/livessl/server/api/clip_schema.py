@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from livessl.server.api.schema import PositionM, UtcTime, Version
+from livessl.schema.values import PositionM, UtcTime, Version
 
 
 class ClipBeam(BaseModel):

@@ -1,4 +1,4 @@
-"""Encoder of estimates, events, tracks and array states as JSON-ready dictionaries; `schema.py` describes them."""
+"""Encoder of estimates, events, tracks and array states as JSON-ready dictionaries; `livessl.schema` describes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoder of the nodes' reports as a part of the arrays' states; `report_schema.py` describes it."""
+"""Encoder of the nodes' reports as a part of the arrays' states; `schema/reports.py` describes it."""
 
 from __future__ import annotations
 

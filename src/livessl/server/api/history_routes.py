@@ -16,8 +16,8 @@ from pydantic import WithJsonSchema
 
 from livessl.clock import utc_text
 from livessl.core.types import Status
-from livessl.server.api import answers
-from livessl.server.api.answers import errors
+from livessl.schema import answers
+from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.png import map_png
 from livessl.server.api.queries import array_names, instant, page_cursor, unprocessable

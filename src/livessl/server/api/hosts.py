@@ -35,6 +35,7 @@ class ServerNames:
     def __init__(self, http: HttpConfig) -> None:
         self._names = frozenset({*_OWN, in_url(http.host).lower(), *http.trusted_hosts})
         self._trusted = frozenset(http.trusted_hosts)
+        self._origins = frozenset(http.allowed_origins)
         self.limited = bool(http.trusted_hosts) or (http.tokens is None and is_loopback(http.host))
         """True if requests under other names are refused. Without tokens they must be: any web page could otherwise
         point its own host name at this server and read the answers as its own (DNS rebinding)."""
@@ -48,13 +49,13 @@ class ServerNames:
         return next((host for host in hosts if not _matches(host, self._names)), None)
 
     def may_open(self, headers: Headers) -> bool:
-        """Return True if the page that opens a WebSocket is one of this server; browsers do not check that.
+        """Return True if the page that opens a WebSocket is one of this server, or of `allowed_origins`.
 
-        A client that names no page is no browser. Behind a proxy that replaces the host, only `X-Forwarded-Host` or
-        `trusted_hosts` reveal the name that the browser uses.
+        Browsers do not check that. A client that names no page is no browser. Behind a proxy that replaces the host,
+        only `X-Forwarded-Host` or `trusted_hosts` reveal the name that the browser uses.
         """
         scheme, _, page = headers.get("origin", "").lower().partition("://")
-        if "origin" not in headers:
+        if "origin" not in headers or headers["origin"].lower() in self._origins:
             return True
         port = _PORTS.get(scheme, "")
         hosts = {headers.get("host", "").lower(), public_host(headers).lower()}

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import WithJsonSchema
 
 from livessl.clock import utc_text
-from livessl.server.api.answers import errors
+from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.history_routes import cached
 from livessl.server.api.journal_schema import JournalAnswer

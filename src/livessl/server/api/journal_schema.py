@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from livessl.server.api.schema import UtcTime, Version
+from livessl.schema.values import UtcTime, Version
 from livessl.server.history.journal import EntryKind
 
 

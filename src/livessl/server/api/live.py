@@ -49,20 +49,22 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
         kinds: str | None = None,
         min_confidence: str = "0",
         zone: str | None = None,
+        track: str | None = None,
+        max_rate_hz: str | None = None,
         since_seq: str | None = None,
     ) -> None:
         await socket.accept()  # only a connected client can receive a reason
         try:
             _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.LiveParameters)
-            wanted = queries.live_filter(book.current.zones, kinds, min_confidence, zone)
-            since = queries.message_number("since_seq", since_seq)
+            wanted = queries.live_filter(book.current.zones, kinds, min_confidence, zone, track, max_rate_hz)
+            since = queries.whole_number("since_seq", since_seq)
         except ValueError as error:
             await _refuse(socket, error)
             return
         arrays = await asyncio.to_thread(parts.array_states.describe)
         subscription = fanout.subscribe(wanted, since)
-        hello = Numbered(_hello(parts, str(socket.scope["client_role"]), arrays))
+        hello = Numbered(greeting(parts, str(socket.scope["client_role"]), arrays))
         try:
             await _while_connected(socket, _send_all(socket, subscription, hello, parts))
         finally:
@@ -106,7 +108,7 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
     return router
 
 
-def _hello(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
+def greeting(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:
     """Encode the first message of a connection."""
     return {
         "v": API_VERSION,

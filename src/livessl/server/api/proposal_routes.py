@@ -13,8 +13,8 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from livessl.clock import utc_text
 from livessl.core.types import FloatArray
 from livessl.errors import ConfigError
+from livessl.schema.answers import errors
 from livessl.server.api import set_up_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json

@@ -22,8 +22,12 @@ KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "poses"
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
 
 
+MAX_RATE_HZ: Final = 1000.0
+"""Highest rate that a subscriber can ask for, in messages a second: more than there are of any subject."""
+
+
 class LiveParameters(BaseModel):
-    """Query parameters of the live WebSocket."""
+    """Query parameters of the live messages, over a WebSocket or as server-sent events."""
 
     kinds: str | None = Field(
         default=None,
@@ -38,6 +42,20 @@ class LiveParameters(BaseModel):
         default=None,
         description="Only events, updates, tracks, changes and alerts inside this zone are sent.",
         examples=["door"],
+    )
+    track: int | None = Field(
+        default=None,
+        ge=0,
+        description="Of tracks and their changes in zones, only those of the track of this number are sent.",
+        examples=[7],
+    )
+    max_rate_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=MAX_RATE_HZ,
+        description="Most updates of a sound, states of a track, and states of the arrays a second; those in between "
+        "are left out. Events, alerts, changes in zones, and the first and last state of a track are always sent.",
+        examples=[2.0],
     )
     since_seq: int | None = Field(
         default=None,
@@ -144,30 +162,37 @@ def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
         raise unprocessable(name, f"{name}: {error}") from error
 
 
-def live_filter(zones: Collection[str], kinds: str | None, min_confidence: str, zone: str | None) -> Filter:
-    """Filter of a live subscriber, on a site with these zones.
+def live_filter(
+    zones: Collection[str],
+    kinds: str | None,
+    min_confidence: str,
+    zone: str | None,
+    track: str | None = None,
+    max_rate_hz: str | None = None,
+) -> Filter:
+    """Filter of a live subscriber, on a site with these zones, from the texts of its query.
 
     Raises
     ------
     ValueError
-        If a kind or the zone does not exist, or the confidence is out of range.
+        If a kind or the zone does not exist, or a number is out of range.
     """
     chosen = None if kinds is None else frozenset(kind.strip() for kind in kinds.split(","))
     if chosen is not None and not chosen <= KINDS:
         raise ValueError(f"kinds: expected some of {', '.join(sorted(KINDS))}, got {kinds!r}")
-    try:
-        least = float(min_confidence)
-    except ValueError:
-        least = float("nan")
+    least = _number(min_confidence)
     if not 0.0 <= least <= 1.0:
         raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
+    rate_hz = None if max_rate_hz is None else _number(max_rate_hz)
+    if rate_hz is not None and not 0.0 < rate_hz <= MAX_RATE_HZ:
+        raise ValueError(f"max_rate_hz: expected a number above 0, at most {MAX_RATE_HZ:g}, got {max_rate_hz!r}")
     if zone is not None and zone not in zones:
         raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
-    return Filter(chosen, least, zone)
+    return Filter(chosen, least, zone, whole_number("track", track, "the number of a track"), rate_hz)
 
 
-def message_number(name: str, text: str | None) -> int | None:
-    """The `seq` of a message.
+def whole_number(name: str, text: str | None, what: str = "the seq of a message") -> int | None:
+    """The number in a parameter, None if it is absent.
 
     Raises
     ------
@@ -175,8 +200,15 @@ def message_number(name: str, text: str | None) -> int | None:
         If the text is no decimal number of at most 19 digits.
     """
     if text is not None and not (text.isascii() and text.isdigit() and len(text) < 20):
-        raise ValueError(f"{name}: expected the seq of a message, got {text!r}")
+        raise ValueError(f"{name}: expected {what}, got {text!r}")
     return None if text is None else int(text)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
 
 
 def array_names(site: Site) -> list[str]:

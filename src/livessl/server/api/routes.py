@@ -15,8 +15,8 @@ from pydantic import WithJsonSchema
 from livessl import __version__
 from livessl.clock import utc_text
 from livessl.core.types import FRAME_S
-from livessl.server.api import answers
-from livessl.server.api.answers import errors
+from livessl.schema import answers
+from livessl.schema.answers import errors
 from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 _DATE_TIME: Final = {"type": "string", "format": "date-time"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
-_MAP_HEADERS: Final = {
+MAP_HEADERS: Final = {
     name: {"description": description, "schema": schema, "example": example}
     for name, schema, example, description in (
         ("X-Map-Shape", {"type": "string"}, "200,160", "Lengths of the axes: rows and columns, or x, y and z."),
@@ -47,7 +47,7 @@ Time = Annotated[str, WithJsonSchema(_DATE_TIME)]
 
 
 def as_json(found: JsonObject, status: int = 200) -> Response:
-    """An answer as JSON. The models in `answers.py` describe it and are not run."""
+    """An answer as JSON. The models in `schema/answers.py` describe it and are not run."""
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
@@ -166,6 +166,8 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     if (unkept or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
+    if parts.hub_link is not None and parts.hub_link.problem is not None:
+        problems.append(parts.hub_link.problem)
     if problems and status == "ok":
         status = "degraded"
     reasons += problems
@@ -237,7 +239,7 @@ def map_route(parts: Parts) -> APIRouter:
             200: {
                 "description": "The map: a picture, or little-endian float32 numbers, row by row.",
                 "content": {"image/png": _BINARY, "application/octet-stream": _BINARY},
-                "headers": _MAP_HEADERS,
+                "headers": MAP_HEADERS,
             },
             204: {"description": "No window has been localized yet."},
             **errors(404, texts={404: "There is no array of that name, or it has no part in the newest map."}),

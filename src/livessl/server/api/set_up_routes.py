@@ -12,8 +12,8 @@ from fastapi import APIRouter, HTTPException, Query, Response
 from livessl.clock import utc_text
 from livessl.core.commission.verification import set_up_verdict
 from livessl.core.types import FloatArray, Observation
+from livessl.schema.answers import errors
 from livessl.server.api import set_up_schema
-from livessl.server.api.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject, where
 from livessl.server.api.routes import as_json
 from livessl.server.heard_sounds import HeardSound

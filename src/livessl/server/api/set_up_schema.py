@@ -8,8 +8,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from livessl.core.commission.verification import SetUpVerdict
 from livessl.core.types import Status
-from livessl.server.api.answers import Finding
-from livessl.server.api.schema import PositionM, UtcTime, Version
+from livessl.schema.answers import Finding
+from livessl.schema.values import PositionM, UtcTime, Version
 
 MOST_CLAPS = 64
 """Most known places of one verification."""
@@ -273,7 +273,7 @@ class SetUp(BaseModel):
 
     v: Version
     calibration: Calibration
-    arrays: dict[str, PlacedMicrophones]
+    arrays: dict[str, PlacedMicrophones] = Field(description="Where each array is now, by its name.")
     next_place_m: PlaceM | None = Field(description="Where to clap first; null if no place is free.")
     refinement: Refinement
 
@@ -284,4 +284,4 @@ class Changed(BaseModel):
     v: Version
     changed: list[str] = Field(description="Arrays whose poses are other ones now.", examples=[["south"]])
     calibration: Calibration
-    arrays: dict[str, PlacedMicrophones]
+    arrays: dict[str, PlacedMicrophones] = Field(description="Where each array is now, by its name.")

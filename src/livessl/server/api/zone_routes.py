@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from livessl.server.api import zone_schema
-from livessl.server.api.answers import errors
+from livessl.schema import zones as zone_schema
+from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json

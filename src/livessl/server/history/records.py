@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import orjson
-from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
+from sqlalchemy import Connection, delete, func, insert, select
 
 from livessl.core.types import FRAME_NS
 from livessl.server.history.query import JsonObject
@@ -13,43 +14,40 @@ from livessl.server.history.tables import disabled, early, event_row, events, pr
 
 _INSERT_EVENT = insert(events)
 _INSERT_TAG = insert(tags)
-_UPDATE_EVENT = (
-    update(events)
-    .where(events.c.number == bindparam("place"))
-    .values({name: bindparam(name) for name in events.c.keys() if name != "number"})  # noqa: SIM118 - not a dict
-)
 
 
 def put_events(connection: Connection, given: Sequence[tuple[JsonObject, int]]) -> int:
-    """Store events, each with its start in nanoseconds; one of a known id replaces it in its place.
+    """Store events, each with its start in nanoseconds; one of a known id replaces that event.
+
+    An event that has changed gets a new number, so that numbers are the order in which events were stored: see
+    `history.log`. One that is the same as before is left alone.
 
     Returns
     -------
     int
-        Number of new events.
+        Number of events whose id was not known.
     """
     latest = {event["id"]: (event, time_ns) for event, time_ns in given}
     if not latest:
         return 0
-    before = _numbers(connection, list(latest))
+    before = _stored(connection, list(latest))
     rows = {name: event_row(event, time_ns) for name, (event, time_ns) in latest.items()}
-    if before:
-        connection.execute(delete(tags).where(tags.c.number.in_(list(before.values()))))
-        connection.execute(_UPDATE_EVENT, [{**rows[name], "place": number} for name, number in before.items()])
-    new = [row for name, row in rows.items() if name not in before]
-    if new:
-        connection.execute(_INSERT_EVENT, new)
-    numbers = before | (_numbers(connection, [row["id"] for row in new]) if new else {})
-    tagged = [row for name, (event, _) in latest.items() for row in tag_rows(event, rows[name], numbers[name])]
+    rows = {name: row for name, row in rows.items() if name not in before or before[name].body != row["body"]}
+    if not rows:
+        return 0
+    remove_numbers(connection, [before[name].number for name in rows if name in before])
+    connection.execute(_INSERT_EVENT, list(rows.values()))
+    numbers = {name: stored.number for name, stored in _stored(connection, list(rows)).items()}
+    tagged = [each for name, row in rows.items() for each in tag_rows(latest[name][0], row, numbers[name])]
     if tagged:
         connection.execute(_INSERT_TAG, tagged)
-    return len(new)
+    return sum(name not in before for name in rows)
 
 
 def remove_events(connection: Connection, ids: Iterable[str]) -> int:
     """Delete the events of these ids; return how many there were."""
     names = list(ids)
-    return remove_numbers(connection, list(_numbers(connection, names).values())) if names else 0
+    return remove_numbers(connection, [stored.number for stored in _stored(connection, names).values()])
 
 
 def remove_numbers(connection: Connection, numbers: Sequence[int]) -> int:
@@ -81,14 +79,22 @@ def put_early(connection: Connection, name: str) -> None:
     connection.execute(insert(early), {"id": name})
 
 
-def end_early(connection: Connection, frame_index: int) -> None:
-    """Let the early events before a frame index be final, and forget those that are gone."""
+def end_early(connection: Connection, frame_index: int) -> list[tuple[JsonObject, int]]:
+    """Let the early events before a frame index be final, and forget those that are gone.
+
+    Returns
+    -------
+    list of (JsonObject, int)
+        The events that are final now, each with its start in nanoseconds, oldest first.
+    """
     ids = early_ids(connection)
     if not ids:
-        return
+        return []
     later = select(events.c.id).where(events.c.id.in_(ids), events.c.time_ns >= frame_index * FRAME_NS)
     ended = set(ids) - set(connection.execute(later).scalars())
     connection.execute(delete(early).where(early.c.id.in_(ended)))
+    query = select(events.c.time_ns, events.c.body).where(events.c.id.in_(ended)).order_by(events.c.time_ns)
+    return [(orjson.loads(body), time_ns) for time_ns, body in connection.execute(query)]
 
 
 def early_ids(connection: Connection) -> list[str]:
@@ -110,11 +116,16 @@ def put_disabled(connection: Connection, site: str, array: str, *, is_disabled: 
         connection.execute(insert(disabled), {"site": site, "array": array})
 
 
-def _numbers(connection: Connection, ids: Sequence[str]) -> dict[str, int]:
-    """Return the numbers of the events of these ids, as far as they are stored."""
-    found: dict[str, int] = {}
+class _Stored(NamedTuple):
+    number: int
+    body: str
+
+
+def _stored(connection: Connection, ids: Sequence[str]) -> dict[str, _Stored]:
+    """Return the number and the JSON of the events of these ids, as far as they are stored."""
+    found: dict[str, _Stored] = {}
     for first in range(0, len(ids), 500):
         some = ids[first : first + 500]
-        rows = connection.execute(select(events.c.id, events.c.number).where(events.c.id.in_(some)))
-        found |= {row.id: row.number for row in rows}
+        rows = connection.execute(select(events.c.id, events.c.number, events.c.body).where(events.c.id.in_(some)))
+        found |= {row.id: _Stored(row.number, row.body) for row in rows}
     return found

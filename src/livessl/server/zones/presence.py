@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Final
 
 from livessl.clock import utc_text
 from livessl.core.types import Track, TrackState
+from livessl.schema.zones import Change
 from livessl.server.zones.shapes import ZoneMap
 
 ENTER: Final = 0.7
@@ -22,14 +22,6 @@ MAX_CHANGES: Final = 1000
 """Most changes that are kept for people who ask later; about 500 kB."""
 
 NS_PER_S: Final = 1_000_000_000
-
-
-class Change(StrEnum):
-    """Changes of a track: it enters a zone, leaves it, or has been there for the zone's `loiter_s`."""
-
-    ENTER = "enter"
-    LEAVE = "leave"
-    LOITER = "loiter"
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: a model of every message of the live WebSocket. See `schema.py`."""
+"""The contract of the API, continued: a model of every message of the live WebSocket. See `values.py`."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, Field
 
-from livessl.core.types import Status
-from livessl.server.api.alert_schema import Alert
-from livessl.server.api.answers import ArrayGeometry
-from livessl.server.api.schema import (
+from livessl.core.states import Status
+from livessl.schema.alerts import Alert
+from livessl.schema.answers import ArrayGeometry
+from livessl.schema.base import Model
+from livessl.schema.values import (
     Array,
     ArrayNames,
     Candidates,
@@ -31,7 +32,7 @@ from livessl.server.api.schema import (
     Version,
     Zones,
 )
-from livessl.server.api.zone_schema import ZoneChange, ZoneShape
+from livessl.schema.zones import ZoneChange, ZoneShape
 
 Overloaded = Annotated[
     str | None,
@@ -42,7 +43,7 @@ Overloaded = Annotated[
 ]
 
 
-class _Numbered(BaseModel):
+class _Numbered(Model):
     v: Version
     seq: Seq
 
@@ -123,7 +124,7 @@ class PosesMessage(_Numbered):
     changed: list[str] = Field(description="Names of the arrays that changed.", examples=[["south"]])
 
 
-class Gap(BaseModel):
+class Gap(Model):
     """Notice of messages that this client will not get; it has no number of its own."""
 
     kind: Literal["gap"]

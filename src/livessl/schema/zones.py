@@ -1,14 +1,14 @@
-"""The contract of the API for zones: a model of every value and answer. See `schema.py`."""
+"""The contract of the API for zones: a model of every value and answer. See `values.py`."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from livessl.server.api.schema import PositionM, StartS, UtcTime, Version, Zones
-from livessl.server.zones.presence import Change
+from livessl.schema.base import Model
+from livessl.schema.values import PositionM, StartS, UtcTime, Version, Zones
 
 IntervalM = Annotated[
     list[float], Field(min_length=2, max_length=2, description="Lowest and highest coordinate in metres.")
@@ -28,7 +28,15 @@ class ZoneOwner(StrEnum):
     DRAWN = "drawn"
 
 
-class ZoneShape(BaseModel):
+class Change(StrEnum):
+    """Changes of a track: it enters a zone, leaves it, or has been there for the zone's `loiter_s`."""
+
+    ENTER = "enter"
+    LEAVE = "leave"
+    LOITER = "loiter"
+
+
+class ZoneShape(Model):
     """A named part of the room."""
 
     bounds_m: BoundsM = Field(description="The zone itself if it is a box; otherwise the smallest box around it.")
@@ -43,7 +51,7 @@ class ZoneShape(BaseModel):
     owner: ZoneOwner
 
 
-class ZoneChange(BaseModel):
+class ZoneChange(Model):
     """A change of a track in a zone."""
 
     kind: Literal["zone"]
@@ -61,7 +69,7 @@ class ZoneChange(BaseModel):
     zones: Zones
 
 
-class _Versioned(BaseModel):
+class _Versioned(Model):
     v: Version
 
 

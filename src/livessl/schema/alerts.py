@@ -1,4 +1,4 @@
-"""The contract of the API for alerts: a model of every value, answer and request. See `schema.py`."""
+"""The contract of the API for alerts: a model of every value, answer and request. See `values.py`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,28 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
-from livessl.server.alerts.outbox import DeliveryState
-from livessl.server.api.schema import ArrayCondition, Event, Membership, UtcTime, Version
-from livessl.server.api.zone_schema import ZoneChange
+from livessl.schema.base import Model
+from livessl.schema.values import ArrayCondition, Event, Membership, UtcTime, Version
+from livessl.schema.zones import ZoneChange
 
 RuleName = Annotated[str, Field(description="Name of the rule in the site file.", examples=["door"])]
 ActionName = Annotated[str, Field(description="Name of the action in the site file.", examples=["guard"])]
 Count = Annotated[int, Field(ge=0)]
 
 
-class AlertedArray(BaseModel):
+class DeliveryState(StrEnum):
+    """Progress of one alert to one action.
+
+    It waits for the next attempt, arrived, was given up (a dead letter), or was dismissed by an operator after that.
+    """
+
+    WAITING = "waiting"
+    DELIVERED = "delivered"
+    DEAD = "dead"
+    DISMISSED = "dismissed"
+
+
+class AlertedArray(Model):
     """An array that an alert is about, in its state at that time."""
 
     name: str = Field(description="Name of the array.", examples=["north"])
@@ -25,7 +37,7 @@ class AlertedArray(BaseModel):
     reason: str | None = Field(description="Why it is in that state.", examples=["nothing received for 1.5 s"])
 
 
-class AlertedFinding(BaseModel):
+class AlertedFinding(Model):
     """A fault of the set-up that an alert is about."""
 
     kind: Literal["finding"]
@@ -39,7 +51,7 @@ class AlertedFinding(BaseModel):
     input: int | None = Field(ge=1, description="Input of the device that carries the channel, if known.", examples=[7])
 
 
-class Alert(BaseModel):
+class Alert(Model):
     """An alert of a rule about an event, a change of a track, an array or a finding; the others are null."""
 
     kind: Literal["alert"]
@@ -77,7 +89,7 @@ class Alert(BaseModel):
     change: ZoneChange | None = Field(description="What a track did in a zone, if the alert is about that.")
 
 
-class Delivery(BaseModel):
+class Delivery(Model):
     """Progress of one alert to one action."""
 
     number: int = Field(ge=1, description="Number of the delivery.", examples=[17])
@@ -100,7 +112,7 @@ class DeadLetter(Delivery):
     alert: Alert
 
 
-class _Versioned(BaseModel):
+class _Versioned(Model):
     v: Version
 
 
@@ -131,7 +143,7 @@ class RuleKind(StrEnum):
     FINDINGS = "findings"
 
 
-class Suppressed(BaseModel):
+class Suppressed(Model):
     """Matches that did not alert, by the reason."""
 
     disarmed: Count = Field(description="The rule was disarmed.")
@@ -140,7 +152,7 @@ class Suppressed(BaseModel):
     held_off: Count = Field(description="Too soon after the alert before.")
 
 
-class Rule(BaseModel):
+class Rule(Model):
     """A rule and its state."""
 
     name: RuleName
@@ -189,7 +201,7 @@ class Dismissed(_Versioned):
     dismissed: Count = Field(description="Number of dead letters that were dismissed.", examples=[1])
 
 
-class TriedAlert(BaseModel):
+class TriedAlert(Model):
     """An event about which a rule would have alerted."""
 
     event_id: str = Field(description="Id of the event.", examples=["small-1767225600000-1"])

@@ -5,7 +5,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import BaseModel, Field
+from pydantic import Field
+
+from livessl.schema.base import Model
 
 Dbfs = Annotated[float, Field(description="Level over the whole band in dB relative to full scale.", examples=[-38.2])]
 
@@ -22,7 +24,7 @@ class DriftState(StrEnum):
     UNMEASURABLE = "unmeasurable"
 
 
-class Channel(BaseModel):
+class Channel(Model):
     """Level of one channel over the whole band, as its node reports it once a second; not while a sound goes on."""
 
     peak_dbfs: Dbfs | None = Field(
@@ -45,7 +47,7 @@ class Channel(BaseModel):
     )
 
 
-class Host(BaseModel):
+class Host(Model):
     """State of the machine that a node runs on, as the node reads it once a minute."""
 
     synchronized: bool | None = Field(

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: a model of every REST answer and of every error body. See `schema.py`."""
+"""The contract of the API, continued: a model of every REST answer and of every error body. See `values.py`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
-from livessl.server.api.schema import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
-from livessl.server.api.zone_schema import BoundsM, IntervalM, ZoneShape
+from livessl.schema.base import Model
+from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
+from livessl.schema.zones import BoundsM, IntervalM, ZoneShape
 
 BandHz = Annotated[
     list[float],
@@ -49,17 +50,17 @@ class Door(StrEnum):
     HTTP = "http"
 
 
-class _Versioned(BaseModel):
+class _Versioned(Model):
     v: Version
 
 
-class RoomSize(BaseModel):
+class RoomSize(Model):
     """The room: a box whose lowest corner is the origin."""
 
     size_m: PositionM = Field(description="Size in x, y and z, in metres.", examples=[[8.0, 10.0, 4.0]])
 
 
-class SearchGrid(BaseModel):
+class SearchGrid(Model):
     """Grid of the points that are searched."""
 
     bounds_m: BoundsM
@@ -69,14 +70,14 @@ class SearchGrid(BaseModel):
     )
 
 
-class ActivitySettings(BaseModel):
+class ActivitySettings(Model):
     """Settings of the activity detection."""
 
     threshold: float = Field(gt=0, le=1, description="Threshold relative to the recent maximum.", examples=[0.1])
     floor_factor: float = Field(ge=1, description="Threshold relative to the noise floor's power.", examples=[4.0])
 
 
-class ArrayGeometry(BaseModel):
+class ArrayGeometry(Model):
     """Position of an array and of its microphones."""
 
     position_m: PositionM = Field(description="Mean position of the microphones [x, y, z] in metres.")
@@ -86,7 +87,7 @@ class ArrayGeometry(BaseModel):
     band_hz: BandHz
 
 
-class FloorPlanPlace(BaseModel):
+class FloorPlanPlace(Model):
     """Place of the floor plan's picture, which `GET floor-plan` returns."""
 
     bounds_m: list[IntervalM] = Field(
@@ -94,7 +95,7 @@ class FloorPlanPlace(BaseModel):
     )
 
 
-class Privacy(BaseModel):
+class Privacy(Model):
     """Rules for keeping sound and events."""
 
     mode: PrivacyMode
@@ -140,7 +141,7 @@ class Arrays(_Versioned):
     arrays: list[PlacedArray]
 
 
-class Finding(BaseModel):
+class Finding(Model):
     """One thing that is wrong with the set-up."""
 
     kind: Literal["finding"]
@@ -192,6 +193,23 @@ class EventPage(_Versioned):
     )
 
 
+class EventLog(_Versioned):
+    """Events in the order in which they were stored."""
+
+    position: str = Field(
+        description="Pass it unchanged as `after` for the events stored from now on, and treat it as opaque.",
+        examples=["0-4711"],
+    )
+    more: bool = Field(description="Whether more events are stored already: ask again at once.", examples=[False])
+    unsaved: int = Field(ge=0, description="Events published and not stored yet: ask again soon.", examples=[0])
+    complete: bool = Field(
+        description="False if events may be missing: the history asked for is not this one, as after a restart of a "
+        "server that keeps it in memory, or the position is too old.",
+        examples=[True],
+    )
+    events: list[Event]
+
+
 class OneEvent(_Versioned, Event):
     """One event."""
 
@@ -211,7 +229,7 @@ class HeatMap(_Versioned):
     elsewhere: int = Field(ge=0, description="Number of events outside the cells or without a position.", examples=[4])
 
 
-class Secured(BaseModel):
+class Secured(Model):
     """Which connections are protected."""
 
     nodes: bool = Field(description="Whether nodes need an enrolled key and are encrypted.", examples=[True])
@@ -219,7 +237,7 @@ class Secured(BaseModel):
     tls: bool = Field(description="Whether HTTP is encrypted.", examples=[False])
 
 
-class Refused(BaseModel):
+class Refused(Model):
     """Numbers of peers and requests that were refused since the start."""
 
     nodes: int = Field(ge=0, description="Refused at the nodes' socket.", examples=[0])
@@ -247,7 +265,7 @@ class Shed(StrEnum):
     QUIET = "quiet"
 
 
-class Load(BaseModel):
+class Load(Model):
     """Load of the fusion, over the last five seconds."""
 
     state: LoadState
@@ -287,14 +305,14 @@ class Health(HealthStatus):
     refused: Refused
 
 
-class KnownClient(BaseModel):
+class KnownClient(Model):
     """A client that has a token."""
 
     name: str = Field(description="Name that the token was issued to.", examples=["wall"])
     role: RoleName
 
 
-class RefusedCaller(BaseModel):
+class RefusedCaller(Model):
     """A caller that was refused, and how often for the same reason."""
 
     door: Door
@@ -329,7 +347,7 @@ class Switched(_Versioned):
     enabled: bool = Field(description="Whether its sound is used from now on.", examples=[False])
 
 
-class Error(BaseModel):
+class Error(Model):
     """Body of every error but 422."""
 
     detail: str = Field(
@@ -337,7 +355,7 @@ class Error(BaseModel):
     )
 
 
-class ValidationError(BaseModel):
+class ValidationError(Model):
     """One fault of a request."""
 
     loc: list[str | int] = Field(description="Where the fault is.", examples=[["query", "min_confidence"]])
@@ -349,7 +367,7 @@ class ValidationError(BaseModel):
     ctx: dict[str, Any] = Field(default={}, description="Limits that the value was checked against.")
 
 
-class HTTPValidationError(BaseModel):
+class HTTPValidationError(Model):
     """Body of a 422: every fault of the request."""
 
     detail: list[ValidationError]

@@ -10,10 +10,11 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, BaseModel, Field
+from pydantic import AwareDatetime, Field
 
-from livessl.core.types import ClockState, Status, TrackState
-from livessl.server.api.report_schema import Channel, DriftState, Host
+from livessl.core.states import ClockState, Status, TrackState
+from livessl.schema.base import Model
+from livessl.schema.reports import Channel, DriftState, Host
 
 Version = Annotated[
     Literal[1],
@@ -103,7 +104,7 @@ class ArrayCondition(StrEnum):
     DISABLED = "disabled"
 
 
-class Contribution(BaseModel):
+class Contribution(Model):
     """The part that one array has in an event or update."""
 
     array: str = Field(description="Name of the array.", examples=["north"])
@@ -137,7 +138,7 @@ class Contribution(BaseModel):
     )
 
 
-class LatencyStages(BaseModel):
+class LatencyStages(Model):
     """Stages between the end of the sound and the answer, in seconds; their sum is `latency_s`."""
 
     waited: float = Field(description="Wait for the quiet that ends an event; 0 for an update.", examples=[0.3])
@@ -159,7 +160,7 @@ StagesOrNull = Annotated[
 ]
 
 
-class Candidate(BaseModel):
+class Candidate(Model):
     """One of several places that explain a sound about equally well, such as mirror images."""
 
     position_m: PositionM
@@ -175,7 +176,7 @@ Candidates = Annotated[
 ]
 
 
-class Membership(BaseModel):
+class Membership(Model):
     """A zone, and the probability that the sound came from it."""
 
     name: str = Field(description="Name of the zone.", examples=["door"])
@@ -187,7 +188,7 @@ class Membership(BaseModel):
     )
 
 
-class Event(BaseModel):
+class Event(Model):
     """A finished sound: the accurate answer."""
 
     kind: Literal["event"]
@@ -239,7 +240,7 @@ class Event(BaseModel):
     candidates: Candidates
 
 
-class OtherSource(BaseModel):
+class OtherSource(Model):
     """A further source that sounds at the same time."""
 
     position_m: PositionM
@@ -248,7 +249,7 @@ class OtherSource(BaseModel):
     zones: Zones
 
 
-class Track(BaseModel):
+class Track(Model):
     """A source that is followed over several estimates."""
 
     kind: Literal["track"]
@@ -264,14 +265,14 @@ class Track(BaseModel):
     zones: Zones
 
 
-class Agreement(BaseModel):
+class Agreement(Model):
     """Agreement of an array with the others in the last ten sounds that three or more arrays detected."""
 
     agreed: int = Field(ge=0, le=10, description="Sounds in which it agreed.", examples=[9])
     disagreed: int = Field(ge=0, le=10, description="Sounds in which it was an outlier.", examples=[1])
 
 
-class ClockOffset(BaseModel):
+class ClockOffset(Model):
     """Offset of an array's clock from a reference clock, measured from sounds that both detected."""
 
     offset_s: float = Field(description="Seconds by which its clock is ahead of the reference.", examples=[0.012])
@@ -287,7 +288,7 @@ class ClockOffset(BaseModel):
     )
 
 
-class Counters(BaseModel):
+class Counters(Model):
     """Counts of an array since the live run or the replay began."""
 
     frames: int = Field(ge=0, description="Frames received.", examples=[5210])
@@ -313,7 +314,7 @@ class Counters(BaseModel):
     )
 
 
-class Array(BaseModel):
+class Array(Model):
     """State of an array."""
 
     name: str = Field(description="Name in the site file.", examples=["north"])

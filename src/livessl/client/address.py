@@ -1,0 +1,131 @@
+"""The address of a server, the token and certificates to reach it with, and single requests to it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlencode
+
+from livessl.errors import RunError, UseError
+
+ANSWER_S: Final = 30.0
+"""Longest wait, in seconds, for an answer."""
+
+SHOWN_BYTES: Final = 300
+"""Longest part of an answer, in bytes, that an error repeats."""
+
+
+class UnreachableError(RunError):
+    """No answer from the server: it does not run, restarts, or cannot be reached."""
+
+
+class UnavailableError(UnreachableError):
+    """The server runs, and cannot answer this request now."""
+
+
+class RefusedError(RunError):
+    """The server refuses the request: the token, a parameter or the address is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A server, and how to reach it.
+
+    Parameters
+    ----------
+    url : str
+        Without a slash at its end.
+    token : str or None
+    context : ssl.SSLContext or None
+        Certificates to trust; None without TLS.
+    """
+
+    url: str
+    token: str | None
+    context: ssl.SSLContext | None
+
+    @classmethod
+    def of(cls, url: str, token: str | None, ca_file: str | Path | None) -> Address:
+        """Return the address that a user gives.
+
+        Raises
+        ------
+        UseError
+            If the URL is none of HTTP, or the file with certificates cannot be used.
+        """
+        if not url.startswith(("http://", "https://")):
+            raise UseError(f"url: expected an address such as http://127.0.0.1:8000, got {url!r}")
+        if token is not None and not (token.isascii() and token.isprintable()):
+            raise UseError("token: expected the text that `livessl keys token` printed, got other characters")
+        secure = url.startswith("https://")
+        if ca_file is not None and not secure:
+            raise UseError(f"ca_file: expected an address that begins with https:// beside it, got {url!r}")
+        try:
+            context = ssl.create_default_context(cafile=ca_file) if secure else None
+        except OSError as error:
+            raise UseError(f"ca_file: cannot read certificates from {ca_file}: {error}; name a PEM file") from error
+        return cls(url.rstrip("/"), token, context)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Headers of every request."""
+        return {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
+
+    def live(self, query: Mapping[str, str]) -> str:
+        """Return the address of the live WebSocket."""
+        return f"ws{self.url.removeprefix('http')}/api/v1/live?{urlencode(query)}"
+
+    def get(self, path: str, query: Mapping[str, str] | None = None) -> bytes:
+        """Return the answer to `GET /api/v1/PATH`.
+
+        Raises
+        ------
+        UnreachableError
+            If there is none; `UnavailableError` if the server says that it has none now.
+        RefusedError
+            If the request is wrong.
+        """
+        address = f"{self.url}/api/v1/{path}" + (f"?{urlencode(query)}" if query else "")
+        request = urllib.request.Request(address, headers=self.headers)  # noqa: S310 - `of` has checked the scheme
+        try:
+            with urllib.request.urlopen(request, timeout=ANSWER_S, context=self.context) as response:  # noqa: S310
+                return bytes(response.read())
+        except urllib.error.HTTPError as error:
+            with error:
+                what = f"{address}: the server answered {error.code}: {_detail(error.read(SHOWN_BYTES))}"
+            if error.code >= 500 or error.code == 429:
+                raise UnavailableError(what) from error
+            raise RefusedError(what + self.cure(error.code)) from error
+        except (OSError, http.client.HTTPException) as error:
+            raise self.lost(error) from error
+
+    def cure(self, status: int) -> str:
+        """Return what to do about a refusal with this status."""
+        if status not in (401, 403):
+            return ""
+        return "; give a token" if self.token is None else "; give a token that is valid and has the role"
+
+    def lost(self, error: Exception) -> RunError:
+        """Return the error to raise for one of the connection: a wrong certificate does not mend itself."""
+        reason = getattr(error, "reason", error)
+        if isinstance(reason, ssl.SSLCertVerificationError):
+            cure = "name the certificate of its authority as ca_file"
+            return RefusedError(f"{self.url}: its certificate is not trusted: {reason.verify_message}; {cure}")
+        return UnreachableError(f"{self.url}: no answer from a server ({reason}); check that it runs and its address")
+
+
+def _detail(body: bytes) -> str:
+    """Return the reason in an error's body."""
+    try:
+        found: Any = json.loads(body)
+        detail = found["detail"]
+    except (ValueError, KeyError, TypeError):
+        return body.decode(errors="replace")
+    return detail if isinstance(detail, str) else "; ".join(str(fault.get("msg", fault)) for fault in detail)

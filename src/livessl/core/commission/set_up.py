@@ -1,0 +1,187 @@
+"""Set-ups that some sounds have to be explained by, stacked so that all of them are fitted in one computation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from livessl.core.commission.places import LEAST_DAMPING, LEAST_SLOPE, Delays, Microphones
+from livessl.core.types import BoolArray, FloatArray
+
+POSITION_STD_M: Final = 0.02
+ORIENTATION_STD_DEG: Final = 1.2
+MICROPHONE_STD_M: Final = 0.002
+SPEED_STD_M_S: Final = 1.5
+"""Standard deviations of a careful set-up, along each axis: metres, degrees, metres and m/s."""
+
+_STEPS: Final = 25
+"""Most steps of the refinement of places, which ends after a handful."""
+
+_FIRST_DAMPING: Final = 1e-3
+_ENOUGH_M: Final = 1e-3
+"""Step, in metres, below which the refinement of places ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """Standard deviations of one array, along each axis.
+
+    Parameters
+    ----------
+    position_m, orientation_deg : float
+        Metres and degrees.
+    microphones_m : (K,) float64
+        Of each microphone, metres.
+    """
+
+    position_m: float
+    orientation_deg: float
+    microphones_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """A set-up, the delays of some sounds in it, and how far it may be from what is given.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        Metres.
+    delays : mapping of array to (S, K) float64
+        Seconds; NaN where there is none.
+    c_m_s, speed_std_m_s : float
+        Speed of sound and its standard deviation, m/s.
+    freedom : mapping of array to Freedom
+    late : (str, int) or None
+        Array and index of a channel that may have any delay.
+    """
+
+    microphones: Microphones
+    delays: Delays
+    c_m_s: float
+    freedom: dict[str, Freedom]
+    speed_std_m_s: float = SPEED_STD_M_S
+    late: tuple[str, int] | None = None
+
+
+def careful(microphones: Microphones) -> dict[str, Freedom]:
+    """Return the freedom of arrays that were set up with care."""
+    return {
+        name: Freedom(POSITION_STD_M, ORIENTATION_STD_DEG, np.full(len(at_m), MICROPHONE_STD_M))
+        for name, at_m in microphones.items()
+    }
+
+
+class Stacked:
+    """H set-ups of the same arrays, with S sounds each.
+
+    Parameters
+    ----------
+    set_ups : sequence of SetUp
+        They have the same arrays with as many microphones, and as many sounds.
+    bounds_m : (3, 2) float64
+        Search volume, metres.
+
+    Attributes
+    ----------
+    microphones : dict of array to (H, K, 3) float64
+        Metres.
+    there : dict of array to (H, S, K) bool
+        Whether a channel has a delay of a sound.
+    measured_s : dict of array to (H, S, K) float64
+        Delays against the mean of the array's channels, seconds.
+    c_m_s : (H,) float64
+        Metres per second.
+    """
+
+    def __init__(self, set_ups: Sequence[SetUp], bounds_m: FloatArray) -> None:
+        self.set_ups, self.bounds_m = tuple(set_ups), bounds_m
+        self.names = tuple(set_ups[0].delays)
+        self.microphones = {name: np.stack([one.microphones[name] for one in set_ups]) for name in self.names}
+        self.c_m_s = np.array([one.c_m_s for one in set_ups])
+        self.there: dict[str, BoolArray] = {}
+        self.measured_s: dict[str, FloatArray] = {}
+        for name in self.names:
+            delays_s = np.stack([one.delays[name] for one in set_ups])
+            self.there[name] = np.isfinite(delays_s)
+            self.measured_s[name] = centred_where(delays_s, self.there[name])
+
+    def placed(self, starts_m: FloatArray, but: Sequence[tuple[str, int] | None] = ()) -> FloatArray:
+        """Find the places (H, S, 3) that explain the delays best, the set-ups exactly as given, metres.
+
+        All places are refined together by the method of Levenberg and Marquardt, within the search volume.
+
+        Parameters
+        ----------
+        starts_m : (H, S, 3) float64
+            Places to begin at, metres.
+        but : sequence of (str, int) or None
+            For each set-up, the array and index of a channel that is left out.
+        """
+        there = {name: one.copy() for name, one in self.there.items()}
+        for row, left_out in enumerate(but):
+            if left_out is not None:
+                there[left_out[0]][row, :, left_out[1]] = False
+        measured = {name: centred_where(self.measured_s[name], there[name]) for name in self.names}
+        places_m, damping = starts_m.copy(), np.full(starts_m.shape[:2], _FIRST_DAMPING)
+        off, slope = self._off_and_slope(places_m, there, measured)
+        cost = (off**2).sum(axis=-1)
+        for _ in range(_STEPS):
+            turned = slope.swapaxes(-1, -2)
+            normal = turned @ slope
+            scale = np.trace(normal, axis1=-2, axis2=-1) / 3.0
+            normal = normal + (damping * scale + LEAST_SLOPE)[..., None, None] * np.eye(3)
+            step_m = (inverse(normal) @ (turned @ off[..., None]))[..., 0]
+            tried_m = np.clip(places_m - step_m, self.bounds_m[:, 0], self.bounds_m[:, 1])
+            done = np.linalg.norm(tried_m - places_m, axis=-1).max() < _ENOUGH_M
+            tried, tried_slope = self._off_and_slope(tried_m, there, measured)
+            tried_cost = (tried**2).sum(axis=-1)
+            better = tried_cost < cost
+            places_m[better], off[better], slope[better] = tried_m[better], tried[better], tried_slope[better]
+            cost = np.where(better, tried_cost, cost)
+            damping = np.where(better, np.maximum(damping / 5.0, LEAST_DAMPING), damping * 8.0)
+            if done:
+                break
+        return places_m
+
+    def _off_and_slope(
+        self, places_m: FloatArray, there: dict[str, BoolArray], measured_s: dict[str, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residuals (H, S, R) of the delays, seconds, and their slopes (H, S, R, 3) by the places."""
+        offs, slopes = [], []
+        for name in self.names:
+            away_m, unit = away(places_m, self.microphones[name])
+            c_m_s = self.c_m_s[:, None, None]
+            offs.append(centred_where(away_m / c_m_s, there[name]) - measured_s[name])
+            slopes.append(centred_rows(unit / c_m_s[..., None], there[name]))
+        return np.concatenate(offs, axis=2), np.concatenate(slopes, axis=2)
+
+
+def away(places_m: FloatArray, microphones_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (H, S, K) of places (H, S, 3) from microphones (H, K, 3), metres, and unit vectors (H, S, K, 3)."""
+    towards = places_m[:, :, None] - microphones_m[:, None]
+    away_m = np.maximum(np.sqrt(np.einsum("hski,hski->hsk", towards, towards)), 1e-9)
+    return away_m, towards / away_m[..., None]
+
+
+def centred_where(values: FloatArray, there: BoolArray) -> FloatArray:
+    """Values (..., K) against their mean where there are any; 0 elsewhere."""
+    return centred_rows(values[..., None], there)[..., 0]
+
+
+def centred_rows(values: FloatArray, there: BoolArray) -> FloatArray:
+    """Rows (..., K, n) against their mean over the K where there are any; 0 elsewhere."""
+    count = np.maximum(there.sum(axis=-1), 1)[..., None, None]
+    known = np.where(there[..., None], values, 0.0)
+    return np.asarray(np.where(there[..., None], known - known.sum(axis=-2, keepdims=True) / count, 0.0))
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of matrices (..., 3, 3), by cofactors: LAPACK is slow with many small ones."""
+    a, b, c = (matrices[..., row, :] for row in range(3))
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    determinant = (a * cofactors[..., 0]).sum(axis=-1)
+    return np.asarray(cofactors / determinant[..., None, None])

@@ -1,0 +1,105 @@
+"""The events in the order in which they were stored, for clients that must not miss one while they are away.
+
+An event that is stored again, because sound has arrived late, is there once: at the place of its last version.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from sqlalchemy import Connection, func, select
+
+from livessl.server.history.query import Query, Row
+from livessl.server.history.search import matching
+from livessl.server.history.tables import events
+
+DURABLE: Final = 0
+"""Life of a history that outlives the server; one in memory has a random number."""
+
+
+class LogPosition(NamedTuple):
+    """A place in the order of storing.
+
+    Parameters
+    ----------
+    life : int
+        The history that it is of: in memory, each start of the server begins another one.
+    number : int
+        Number of the last event before the place.
+    """
+
+    life: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.life:x}-{self.number}"
+
+    @classmethod
+    def parse(cls, text: str) -> LogPosition:
+        """Return the position of which `text` is the text form.
+
+        Raises
+        ------
+        ValueError
+            If the text is not that of a position.
+        """
+        parts = re.fullmatch(r"([0-9a-f]{1,16})-([0-9]{1,18})", text, re.ASCII)
+        if parts is None:
+            raise ValueError(f"expected the position of an answer before, got {text!r}")
+        return cls(int(parts[1], 16), int(parts[2]))
+
+
+class LogPage(NamedTuple):
+    """Events in the order in which they were stored.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    position : LogPosition
+        The place after them, from which the next page goes on.
+    has_more : bool
+        Whether more events are stored already.
+    is_complete : bool
+        False if events may be missing, because the position asked for is of another history, or too old for one that
+        keeps the newest events only.
+    """
+
+    rows: Sequence[Row]
+    position: LogPosition
+    has_more: bool
+    is_complete: bool
+
+
+def log_page(connection: Connection, query: Query, after: LogPosition | None, life: int, kept: int | None) -> LogPage:
+    """Return the events that were stored after a position.
+
+    Parameters
+    ----------
+    connection : Connection
+    query : Query
+        Filters, and the most events of the page.
+    after : LogPosition or None
+        None gives the position of the end, and no event.
+    life : int
+        The history that the connection reads.
+    kept : int or None
+        Number of events that the history keeps at most; None if there is no limit.
+    """
+    newest = connection.execute(select(func.max(events.c.number))).scalar() or 0
+    if after is None:
+        return LogPage([], LogPosition(life, newest), has_more=False, is_complete=True)
+    begin, is_complete = after.number, True
+    if after.life != life or after.number > newest > 0:
+        begin, is_complete = 0, False
+    elif kept is not None and after.number < newest - kept:
+        is_complete = False
+    statement, searched = matching(query, events.c.time_ns, events.c.number, events.c.body)
+    number = searched.c.number
+    statement = statement.where(number > begin, number <= newest).order_by(number).limit(query.limit + 1)
+    rows = [Row(*row) for row in connection.execute(statement)]
+    has_more = len(rows) > query.limit
+    rows = rows[: query.limit]
+    end = rows[-1].number if has_more else max(newest, begin)
+    return LogPage(rows, LogPosition(life, end), has_more, is_complete)
