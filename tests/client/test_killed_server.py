@@ -17,7 +17,7 @@ from livessl.client import Event, Options, Received, aconnect, connect
 from publishing_lives import FINAL, free_port, server_lives
 from small_site import HANG_S, wait_until, write_site
 
-KILLS = 5
+KILLS = 3
 SHARE = 40
 """Events of each life."""
 
