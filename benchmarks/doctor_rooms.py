@@ -241,7 +241,7 @@ class Room:
         """What the arrays record, with a fault that is made there."""
         if self._recordings is None:
             specs = self.site_with(FAULTS[0], len(ARRAYS)).specs
-            placed = [replace(spec, microphones_m=self._built(spec.name)) for spec in specs]
+            placed = [replace(spec, microphones_m=self.built(spec.name)) for spec in specs]
             self._recordings = {
                 spec.name: render(self.scene, spec.microphones_m, seed=self.seed + 1 + number)
                 for number, spec in enumerate(placed)
@@ -255,7 +255,7 @@ class Room:
             recordings |= routed
         return recordings
 
-    def _built(self, name: str) -> FloatArray:
+    def built(self, name: str) -> FloatArray:
         """The true places of an array's microphones, metres: not quite those of the site file."""
         rng = np.random.default_rng([self.seed, 2, ARRAYS.index(name)])
         filed_m = self._filed[name]

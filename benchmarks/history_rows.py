@@ -35,7 +35,7 @@ TAG_COLUMNS: Final = tuple(tags.c.keys())
 
 
 class Rest(NamedTuple):
-    """What a search does not need of an event's place and confidence."""
+    """Duration and level of an event, which no measured search filters by together with its place."""
 
     duration_s: float
     level_dbfs: float

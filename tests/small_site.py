@@ -168,9 +168,11 @@ def started(*command: str | Path, **options: Any) -> Iterator[subprocess.Popen[s
 
 
 @contextmanager
-def running_server(site: Site, method: str | None = None) -> Iterator[Server]:
+def running_server(
+    site: Site, method: str | None = None, read_site: Callable[[], Site] | None = None
+) -> Iterator[Server]:
     """A whole server in a thread, answering."""
-    server = Server(site, SystemClock(), method=method)
+    server = Server(site, SystemClock(), method=method, read_site=read_site)
     thread = Thread(target=server.run)
     thread.start()
     try:

@@ -35,7 +35,16 @@ LOCALIZES = {
     "livessl.core.locate.srp",
     "livessl.core.stream.fusion",
 }
-NEVER_LIVE = {"matplotlib", "pyarrow", "scipy.signal", "scipy.sparse", "scipy.spatial", "scipy.stats", "tqdm"}
+NEVER_LIVE = {
+    "matplotlib",
+    "opentelemetry.sdk",
+    "pyarrow",
+    "scipy.signal",
+    "scipy.sparse",
+    "scipy.spatial",
+    "scipy.stats",
+    "tqdm",
+}
 
 LOADED_BY_THE_FUSION_THREAD = {"numba", "scipy.fft", "scipy.special"}
 """What takes longest to load; a server listens before."""

@@ -11,18 +11,19 @@ from processes import make_recordings
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
 
-KILLS = 3
+KILLS = 2
+SOUNDS = 5
 
 
 def test_alerts_and_changes_survive_kills_of_the_whole_server(tmp_path: Path) -> None:
     seed = random.randrange(10**6)
     print(f"seed {seed}")
-    make_recordings(tmp_path / "recordings", 8, gap_s=1.2)
+    make_recordings(tmp_path / "recordings", SOUNDS, gap_s=1.2)
     outcome = play_killed(tmp_path / "recordings", tmp_path / "site", KILLS, seed)
     print(outcome)
     assert outcome.kills == KILLS
-    assert outcome.sounds == 8
-    assert 1 < len(outcome.wanted) < 8, "some sounds are in the excluded zone, and some are not"
+    assert outcome.sounds == SOUNDS
+    assert 0 < len(outcome.wanted) < SOUNDS, "some sounds are in the excluded zone, and some are not"
     assert outcome.missing == []
     assert outcome.accepted.keys() == outcome.wanted
     assert (outcome.differing, outcome.unwanted, outcome.forgotten) == (0, [], [])

@@ -8,7 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.types import Float32Array, FloatArray
-from livessl.simulation.noise import BLADES_HZ, LOWEST_HZ, diffuse, fan, pink
+from livessl.simulation.noise import (
+    BLADES_HZ,
+    LOWEST_HZ,
+    MAINS_HZ,
+    OFF_S,
+    ON_S,
+    diffuse,
+    fan,
+    from_one_side,
+    hum,
+    intermittent,
+    music,
+    pink,
+)
 
 RATE_HZ = 16000.0
 C_M_S = 343.0
@@ -84,3 +97,65 @@ def test_noise_is_the_same_for_the_same_seed_and_another_for_another() -> None:
     for one, same, other in zip(made(1), made(1), made(2), strict=True):
         np.testing.assert_array_equal(one, same)
         assert np.abs(one - other).max() > 0.1
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=4)
+def test_hum_is_harmonics_of_twice_the_mains(seed: int) -> None:
+    noise = hum(np.random.default_rng(seed), COUNT, RATE_HZ)
+    assert np.square(noise).mean() == pytest.approx(1.0, rel=0.05)
+    frequencies_hz = np.fft.rfftfreq(COUNT, 1.0 / RATE_HZ)
+    spectrum = np.abs(np.fft.rfft(noise)) ** 2
+    near = [
+        (np.abs(frequencies_hz - 2.0 * mains_hz * np.maximum(1.0, np.round(frequencies_hz / (2.0 * mains_hz)))) < 1.0)
+        for mains_hz in MAINS_HZ
+    ]
+    shares = [float(spectrum[each].sum() / spectrum.sum()) for each in near]
+    assert max(shares) > 0.95  # cutting the tones off spreads them a little
+    assert min(shares) < 0.5
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=4)
+def test_intermittent_noise_goes_on_and_off(seed: int) -> None:
+    noise = intermittent(np.random.default_rng(seed), COUNT, RATE_HZ)
+    assert np.square(noise).mean() == pytest.approx(1.0, rel=1e-3)
+    silent = noise == 0.0
+    changes = int(np.count_nonzero(np.diff(silent.astype(np.int8))))
+    seconds = COUNT / RATE_HZ
+    assert 2.0 * seconds / (ON_S[1] + OFF_S[1]) - 3.0 <= changes <= 2.0 * seconds / (ON_S[0] + OFF_S[0]) + 3.0
+    assert 0.2 < silent.mean() < 0.9
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=2, deadline=None)
+def test_music_has_notes_and_beats(seed: int) -> None:
+    noise = music(np.random.default_rng(seed), 3 * round(RATE_HZ), RATE_HZ)
+    assert np.square(noise).mean() == pytest.approx(1.0, rel=1e-3)
+    spectrum = np.sort(np.abs(np.fft.rfft(noise)) ** 2)[::-1]
+    assert spectrum[: len(spectrum) // 50].sum() > 0.5 * spectrum.sum()  # a fiftieth of the bins: tones
+    quarter = round(0.1 * RATE_HZ)
+    levels = np.square(noise[: len(noise) // quarter * quarter].reshape(-1, quarter)).mean(axis=1)
+    assert levels.max() > 2.0 * levels.min()
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=8)
+def test_noise_from_one_side_arrives_there_first(seed: int) -> None:
+    """In the middle of a cross of microphones, one arm hears it before the opposite one, by almost the whole way."""
+    arm_m, centre = 0.4, np.array([2.0, 2.0, 1.5])
+    ways = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
+    noise = from_one_side(np.random.default_rng(seed), centre + arm_m * ways, 1 << 15, RATE_HZ, C_M_S)
+    np.testing.assert_allclose(np.square(noise).mean(axis=1), 1.0, rtol=1e-3)
+    spectra = np.fft.rfft(noise, axis=1)
+    frequencies_hz = np.fft.rfftfreq(noise.shape[1], 1.0 / RATE_HZ)
+    low = (frequencies_hz > LOWEST_HZ) & (frequencies_hz < 200.0)  # the way is less than half a period
+    early_s = []
+    for first, opposite in ((0, 1), (2, 3), (4, 5)):
+        cross = np.vdot(spectra[opposite][low], spectra[first][low])
+        early_s.append(float(np.angle(cross)) / (2.0 * np.pi * 150.0))
+    ahead = np.abs(early_s) * C_M_S / (2.0 * arm_m)
+    # waves within 40 degrees of the side: cos 40 = 0.77 at least, but the level of each wave is drawn
+    assert 0.6 < ahead.max() < 1.4
+    assert np.sort(ahead)[1] < 0.6
+    assert early_s[2] > -0.3 * arm_m / C_M_S  # never from below the floor

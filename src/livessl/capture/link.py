@@ -16,8 +16,9 @@ from livessl.capture.dealer import Dealer
 from livessl.capture.outbox import Outbox
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
-from livessl.core.types import BackfillRequest, Message
+from livessl.core.types import FRAME_NS, BackfillRequest, Message
 from livessl.site.keys import NodeKeys
+from livessl.traces import traces_in_use
 
 HELLO_NS: Final = 1_000_000_000
 """Interval of greetings, in ns, while the server does not answer, or while there is nothing else to send."""
@@ -76,7 +77,8 @@ class Link:
         self._clock = clock
         self._backfill = backfill
         self._spool = Spool() if spool is None else spool
-        self._outbox = Outbox(self._spool)
+        self._traces = None if hello.replay else traces_in_use()
+        self._outbox = Outbox(self._spool, None if self._traces is None else self._trace_frame)
         self._dealer = Dealer(endpoint, keys, len(hello.arrays)) if dealer is None else dealer
         self._keyed = keys is not None
         self._hello = replace(hello, backlog=self._outbox.backlog_spans())
@@ -241,6 +243,10 @@ class Link:
         if self._hello.backlog:
             self._hello = replace(self._hello, backlog={})
             self._say_hello()
+
+    def _trace_frame(self, array: str, frame_index: int) -> None:
+        assert self._traces is not None
+        self._traces.frame_sent(array, frame_index, (frame_index + 1) * FRAME_NS, self._clock.now_ns())
 
     def _disconnect(self) -> None:
         """Expect nothing from the connection: unacknowledged frames are sent again when the server answers."""

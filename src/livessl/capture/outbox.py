@@ -48,6 +48,8 @@ class Outbox:
     ----------
     spool : Spool
         Holds the frames; those that it holds already are the first backlog.
+    on_sent : callable or None
+        Gets the array and the frame index of every frame that was handed over.
 
     Attributes
     ----------
@@ -57,7 +59,8 @@ class Outbox:
         Frame index before which the server needs nothing more, by its last acknowledgement.
     """
 
-    def __init__(self, spool: Spool) -> None:
+    def __init__(self, spool: Spool, on_sent: Callable[[str, int], None] | None = None) -> None:
+        self._on_sent = on_sent
         self.dropped = 0
         self.settled: int | None = None
         self._with_sections = False
@@ -160,7 +163,7 @@ class Outbox:
         while self._requested:
             if not send(wire.encode(self._requested[0])):
                 return False
-            self._requested.popleft()
+            self._note_sent(self._requested.popleft())
         if self._backlog_sent and now_ns - self._backlog_sent_ns >= BACKLOG_TIMEOUT_NS:
             self._backlog_sent.clear()
         while self._backlog and len(self._backlog_sent) < BACKLOG_FRAMES:
@@ -183,7 +186,14 @@ class Outbox:
             _log.error("%s", error)
             self.dropped += 1
             return True
-        return send(data)
+        if not send(data):
+            return False
+        self._note_sent(message)
+        return True
+
+    def _note_sent(self, message: Kept | Message) -> None:
+        if self._on_sent is not None and not isinstance(message, Mark):
+            self._on_sent(message.array, message.frame_index)
 
     def _add_frame(self, frame: Frame, now_ns: int, *, connected: bool) -> None:
         kept, removed = self._spool.append(frame)

@@ -10,6 +10,7 @@ from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
 from livessl.garbage import collect_as_usual
+from livessl.traces import traced
 
 
 def add_arguments(parser: Any) -> None:
@@ -42,10 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
     device = audio_device(arguments, config, clock)
     collect_as_usual()
     if device is not None:
-        with stop_on_signal() as stop:
+        with stop_on_signal() as stop, traced("livessl-node", arguments.node):
             capture_device(site, arguments.node, device, clock, name, stop.is_set)
         return OK
     parts = recordings(arguments, site, clock.now_ns())
-    with stop_on_signal() as stop, progress.timed("playing", *span_ns(parts)) as bar:
+    traces = traced("livessl-node", arguments.node)
+    with stop_on_signal() as stop, traces, progress.timed("playing", *span_ns(parts)) as bar:
         capture_recordings(site, arguments.node, parts, clock, name, stop.is_set, bar)
     return OK

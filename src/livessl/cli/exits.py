@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -35,3 +35,13 @@ def stop_on_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)
+
+
+@contextmanager
+def on_hang_up(work: Callable[[], None]) -> Iterator[None]:
+    """Call `work` at SIGHUP, which would end the process otherwise; it may interrupt anything, itself included."""
+    previous = signal.signal(signal.SIGHUP, lambda *_: work())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, previous)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctr
 from livessl.cli.output import complain
 from livessl.cli.standard_streams import open_standard_streams
 from livessl.errors import RunError, UseError
+from livessl.log_format import VARIABLE, LogForm, log_form, set_up_logging
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,8 @@ class Command:
     Parameters
     ----------
     name : str
-        Name of the command and of its module in `livessl.cli`, which has `add_arguments(parser)` and `run(arguments)`.
+        Name of the command and, with underscores, of its module in `livessl.cli`, which has `add_arguments(parser)` and
+        `run(arguments)`.
     text : str
         One line of help.
     example : str
@@ -40,6 +41,7 @@ class Command:
 COMMANDS: Final = (
     Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
+    Command("hub", "run the hub of many sites", "livessl hub --config hub.yaml"),
     Command("events", "follow the events of a running server", "livessl events --zone door --json"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
@@ -79,6 +81,11 @@ COMMANDS: Final = (
         "verify a set-up, and measure poses, by claps at places that you know",
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
+    Command(
+        "support-bundle",
+        "collect what helps others to find a fault, without secrets",
+        "livessl support-bundle --site site.yaml",
+    ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),
     Command("init", "write a first site file", "livessl init --room 8,10,4 --arrays 2 --interface UMC1820"),
     Command("check", "validate a site file and list all its faults", "livessl check site.yaml"),
@@ -108,10 +115,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = _parser(given).parse_args(given)
     from threadpoolctl import threadpool_limits
 
-    logging.basicConfig(
-        level=logging.DEBUG if parsed.verbose else logging.INFO, format="livessl: %(message)s", stream=sys.stderr
-    )
     try:
+        if parsed.log is not None:
+            os.environ[VARIABLE] = parsed.log  # for the processes that this one starts
+        set_up_logging(parsed.command, log_form(), verbose=parsed.verbose)
         with sigterm_as_ctrl_c(), threadpool_limits(limits=1, user_api="blas"):
             return int(parsed.run(parsed))
     except UseError as error:
@@ -135,8 +142,12 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
+    parser.add_argument(
+        "--log", type=LogForm, choices=list(LogForm), help="form of the log lines (default: LIVESSL_LOG, or text)"
+    )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    chosen = next((word for word in given if not word.startswith("-")), None)
+    names = {command.name for command in COMMANDS}
+    chosen = next((word for word in given if word in names), None)
     for command in COMMANDS:
         sub = commands.add_parser(
             command.name,
@@ -145,7 +156,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
             epilog=f"example: {command.example}",
         )
         if command.name == chosen:
-            module = import_module(f"livessl.cli.{command.name}")
-            sub.set_defaults(run=module.run)
+            module = import_module(f"livessl.cli.{command.name.replace('-', '_')}")
+            sub.set_defaults(run=module.run, command=command.name)
             module.add_arguments(sub)
     return parser

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from livessl.log_format import is_json_log
 
 if TYPE_CHECKING:
     from livessl.site.models import Site
 
 
 def complain(text: str, kind: str = "error") -> None:
-    """Print one line to stderr."""
-    print(f"livessl: {kind}: {text}", file=sys.stderr)
+    """Print one line to stderr; where the log is JSON, log it."""
+    if is_json_log():
+        logging.getLogger("livessl").log(logging.ERROR if kind == "error" else logging.WARNING, "%s", text)
+    else:
+        print(f"livessl: {kind}: {text}", file=sys.stderr)
 
 
 def print_warnings(site: Site) -> None:

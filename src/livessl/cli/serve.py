@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import logging
+import queue
 from typing import TYPE_CHECKING, Any
 
-from livessl.cli.exits import OK
+from livessl.cli.exits import OK, on_hang_up
 from livessl.cli.options import add_joint, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import print_warnings
 from livessl.clock import SystemClock
+from livessl.traces import traced
 
 if TYPE_CHECKING:
     from livessl.server.app import Server
@@ -29,9 +31,14 @@ def run(arguments: argparse.Namespace) -> int:
     import_from_here()
     site = read_site(arguments)
     print_warnings(site)
-    server = Server(site, SystemClock(), method=arguments.method)
-    logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
-    run_until_stopped(server)
+    requests: queue.SimpleQueue[None] = queue.SimpleQueue()  # a signal that comes too early must not end the process
+    with on_hang_up(lambda: requests.put(None)), traced("livessl-server", site.site):
+        server = Server(site, SystemClock(), method=arguments.method, read_site=lambda: read_site(arguments))
+        logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
+        with on_hang_up(server.parts.reloader.request):
+            if not requests.empty():
+                server.parts.reloader.request()
+            run_until_stopped(server)
     return OK
 
 

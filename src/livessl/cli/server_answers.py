@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import urllib.error
 import urllib.request
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,20 +40,26 @@ def read_token(token_file: Path) -> str:
 
 
 def ask(url: str, path: str, token_file: Path | None) -> Any:
-    """Return a server's answer to `GET /api/v1/PATH`.
+    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
+    address = _address(url, path)
+    return _decoded(address, fetch(address, token_file))
+
+
+def fetch(address: str, token_file: Path | None) -> bytes:
+    """Return the body of a server's answer to `GET`.
 
     Raises
     ------
     UseError
         If the address or the token's file cannot be used.
     RunError
-        If the server does not answer, or refuses.
+        If the server does not answer, or refuses; with the server's reason.
     """
-    return _answer(url, path, token_file, None, ANSWER_S)
+    return _answer(address, token_file, None, ANSWER_S)
 
 
 def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> Any:
-    """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
+    """Return a server's answer, which is JSON, to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters
     ----------
@@ -65,29 +72,39 @@ def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: floa
 
     Raises
     ------
-    UseError
-        If the address or the token's file cannot be used.
-    RunError
-        If the server does not answer, or refuses; with the server's reason.
+    UseError, RunError
+        See `fetch`.
     """
-    return _answer(url, path, token_file, json.dumps(value).encode(), wait_s)
+    address = _address(url, path)
+    return _decoded(address, _answer(address, token_file, json.dumps(value).encode(), wait_s))
 
 
-def _answer(url: str, path: str, token_file: Path | None, body: bytes | None, wait_s: float) -> Any:
-    address = f"{url.rstrip('/')}/api/v1/{path}"
+def _address(url: str, path: str) -> str:
+    return f"{url.rstrip('/')}/api/v1/{path}"
+
+
+def _decoded(address: str, body: bytes) -> Any:
+    try:
+        return json.loads(body)
+    except ValueError as error:
+        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
+
+
+def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: float) -> bytes:
     if not address.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {url!r}")
+        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {} if body is None else {"Content-Type": "application/json"}
     if token_file is not None:
         headers["Authorization"] = f"Bearer {read_token(token_file)}"
     request = urllib.request.Request(address, body, headers)  # noqa: S310 - the address begins with http
     try:
         with urllib.request.urlopen(request, timeout=wait_s) as response:  # noqa: S310
-            return json.load(response)
+            answer: bytes = response.read()
+            return answer
     except urllib.error.HTTPError as error:
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
         raise RunError(f"{address}: the server answered {error.code} {error.reason}{_reason(error)}{cure}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
 

@@ -23,7 +23,9 @@ from livessl.server.compiling import KernelLoader
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.event_retention import delete_old_events
+from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.journal import Journal, also
 from livessl.server.latency import Latency
@@ -33,6 +35,8 @@ from livessl.server.parts import Parts
 from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
+from livessl.server.recent_log import RecentLog
+from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
@@ -46,6 +50,7 @@ from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
+from livessl.traces import traces_in_use
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
@@ -71,6 +76,7 @@ def assemble(
     receiver: Inbox | None = None,
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
+    read_site: Callable[[], Site] | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -84,12 +90,19 @@ def assemble(
         Gets every event after the sinks and before `publish`; called on the fusion thread.
     url : str
         Address of the server, for the links in alerts.
+    read_site : callable or None
+        Reads the site file again; None for a server without one.
 
     Raises
     ------
     BindError, ConfigError, ClipsError
         See `Receiver`, `Alerts` and `Clips`.
     """
+
+    def publish_to_all(message: JsonObject) -> None:
+        if hub_link is not None and not site_time.is_replay:
+            hub_link.take(message)
+        publish(message)
 
     def publish_event(event: JsonObject) -> None:
         sinks.take(event)
@@ -104,6 +117,9 @@ def assemble(
         site_time = SiteTime(clock)
         journal = Journal(store, clock)
         journal.site(site)
+        hub_link = None
+        if store.outbox is not None:
+            hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
         zone_book = ZoneBook(site, publish)
 
         def zones() -> ZoneMap:
@@ -113,13 +129,17 @@ def assemble(
         overload = Overload(clock)
         # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        publish_arrays, publish_alert = also(journal.arrays, publish), also(journal.alert, publish)
+        found = traces_in_use()
+        traces = None if found is None else EventTraces(found)
+        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(journal.alert, publish_to_all)
         array_states = ArrayStates(
             site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        alerts = Alerts(site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips)
+        alerts = Alerts(
+            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces
+        )
         undo.callback(alerts.stop)
         for _, alert in reversed(alerts.outbox.recent(RESTORED)):
             journal.alert(alert)
@@ -131,13 +151,13 @@ def assemble(
 
         presence = Presence(zones, publish_change)
         tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
-        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts)
+        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts, traces)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
+            publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound
+            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
         set_up = SetUpInForce(site, clock, publish)
         proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
@@ -145,6 +165,7 @@ def assemble(
         for follower in (engine.take_over, set_up_watch.take_over, *(() if clips is None else (clips.take_over,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
+        reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
         undo.pop_all()
     return Parts(
         site=site,
@@ -172,6 +193,9 @@ def assemble(
         journal=journal,
         presence=presence,
         floor_plan=floor_plan,
+        hub_link=hub_link,
+        reloader=reloader,
+        recent_log=RecentLog(),
     )
 
 
@@ -190,6 +214,8 @@ class Server:
         Stands in for the nodes' socket.
     stepped : bool
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
+    read_site : callable or None
+        Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
 
     Raises
     ------
@@ -210,15 +236,13 @@ class Server:
         on_event: Callable[[JsonObject], None] | None = None,
         receiver: Inbox | None = None,
         stepped: bool = False,
+        read_site: Callable[[], Site] | None = None,
     ) -> None:
-        faults = unprotected_addresses(site)
-        if faults:
-            raise ConfigError(faults)
-        if method is not None:
-            site = site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})
+        site = _usable(site, method)
+        read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
         self._access = Access(None if http.tokens is None else site.file(http.tokens))
-        certificate = certificate_of(site)
+        certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
         self._kernel_loader = KernelLoader()
@@ -235,9 +259,10 @@ class Server:
             store = Store.of(site)
             undo.callback(store.close)
             url = url_of(self._listener, tls=certificate is not None)
-            self.parts = assemble(site, clock, store, sinks, Fanout(first_seq), self._publish, receiver, on_event, url)
+            fanout = Fanout(first_seq)
+            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
-        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
+        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
         self.endpoint = self.parts.receiver.endpoint
         """The address that nodes connect to."""
@@ -250,10 +275,12 @@ class Server:
         sys.setswitchinterval(SWITCH_S)
         collect_as_usual()
         try:
-            asyncio.run(self._serve())
+            with self.parts.recent_log.attached():
+                asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
             self._kernel_loader.stop()
+            self.parts.reloader.stop()
             self.parts.engine.stop()
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
@@ -262,6 +289,8 @@ class Server:
             if self.parts.clips is not None:
                 self.parts.clips.stop()
             self.parts.receiver.stop()
+            if self.parts.hub_link is not None:
+                self.parts.hub_link.stop()
             self.parts.store.close()
             self.parts.sinks.close()
             self._listener.close()
@@ -285,6 +314,9 @@ class Server:
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
+        if self.parts.hub_link is not None:
+            self.parts.hub_link.start()
+        self.parts.reloader.start()
         if not self._stepped:
             self.parts.store.backlog.start()
             self.parts.engine.start(self._kernel_loader.load)
@@ -315,3 +347,19 @@ class Server:
             loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
         except RuntimeError:  # the loop has just closed, and no subscriber is left
             _log.debug("a message was published after the event loop had closed")
+
+
+def _usable(site: Site, method: str | None) -> Site:
+    """Return a site with the method of the command line, if it may be served.
+
+    Raises
+    ------
+    ConfigError
+        If the server would be open to the network.
+    """
+    faults = unprotected_addresses(site)
+    if faults:
+        raise ConfigError(faults)
+    if method is None:
+        return site
+    return site.model_copy(update={"fusion": site.fusion.model_copy(update={"method": method})})

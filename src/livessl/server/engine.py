@@ -14,6 +14,7 @@ from livessl.core.stream.site_state import ArraySetUp
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_log import EventLog
+from livessl.server.event_traces import EventTraces
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parallel import Parallel
@@ -60,6 +61,8 @@ class Engine:
         Returns the zones that are in force.
     sound_takers : sequence of SoundTaker
         Get every frame: for those who listen, and for what is kept of events.
+    traces : EventTraces or None
+        Times the steps of the fusion; None if nothing is traced.
     """
 
     def __init__(
@@ -75,7 +78,9 @@ class Engine:
         overload: Overload,
         zones: Callable[[], ZoneMap],
         sound_takers: Sequence[SoundTaker] = (),
+        traces: EventTraces | None = None,
     ) -> None:
+        self._traces = traces
         self._site = site
         self._clock = clock
         self._receiver = receiver
@@ -248,6 +253,8 @@ class Engine:
         run.fusion.exclude(self._array_states.disabled)
         for taker in self._sound_takers:
             taker.take(batch, run.fusion.settled)
+        if self._traces is not None:
+            self._traces.begin_step(self._clock.now_ns())
         self._publisher.publish(run.fusion.step(batch, self._site_time.now_ns()), run)
         if self._event_log.is_saved:
             self._receiver.ingest.note_final(run.fusion.settled_of)

@@ -18,6 +18,7 @@ from livessl.clock import Clock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Event
 from livessl.server.api.encode import JsonObject, Messages, Stages, where
+from livessl.server.event_traces import EventTraces
 from livessl.server.history.backlog import Write
 from livessl.server.latency import Latency
 from livessl.server.store import Finalized, Store, StoreError
@@ -116,6 +117,8 @@ class EventLog:
         Gets the message of every event.
     watcher : Watcher or None
         Sees the events of live runs, those included that are not published again.
+    traces : EventTraces or None
+        Adds spans of the events of live runs; None if nothing is traced.
     """
 
     def __init__(
@@ -126,7 +129,9 @@ class EventLog:
         latency: Latency,
         publish: Callable[[JsonObject], None],
         watcher: Watcher | None = None,
+        traces: EventTraces | None = None,
     ) -> None:
+        self._traces = traces
         self._site = site
         self._clock = clock
         self._store = store
@@ -171,13 +176,14 @@ class EventLog:
 
     def add_early(self, event: Event, messages: Messages) -> None:
         """Publish an event that cannot wait for an array that is late or away."""
-        message = messages.event(event, self._stages(event))
+        stages = self._stages(event)
+        message = messages.event(event, stages)
         self._write(partial(self._store.add, message, event.start_ns, early=True), 1)  # holds no sound of the event
         if not self._is_replay:
             self._remember(EarlyEvent.of(event, message))
         if self._watcher is not None and not self._is_replay:
             self._watcher.take_early(message, event.start_ns)
-        self._publish_event(message)
+        self._publish_event(message, event, stages)
 
     def add_final(self, results: FinalResults, messages: Messages, clocks: JsonObject) -> None:
         """Store final events in place of the early ones, then publish those that are news.
@@ -196,7 +202,7 @@ class EventLog:
         successors = [(early, early.successor(results.events)) for early in before]
         known = {early.id: early for early in before}
         rows: list[tuple[JsonObject, int]] = []
-        news: list[JsonObject] = []
+        news: list[tuple[JsonObject, Event, Stages | None]] = []
         for event in results.events:
             replaces = [early.id for early, successor in successors if successor is event and early.id != event.id]
             same = known.get(event.id)
@@ -206,7 +212,7 @@ class EventLog:
             stages = None if event.late or before else self._stages(event)
             message = messages.event(event, stages, replaces)
             rows.append((message, event.start_ns))
-            news.append(message)
+            news.append((message, event, stages))
         replaced = [early.id for early, successor in successors if successor is not None]
         done = {event.id for event in results.events} | {early.id for early in before}
         self._early = [early for early in self._early if early.id not in done]
@@ -218,8 +224,8 @@ class EventLog:
         self._write(store, len(rows), is_final=True)
         if self._watcher is not None:
             self._watcher.take_final(rows, results.until)
-        for message in news:
-            self._publish_event(message)
+        for message, event, stages in news:
+            self._publish_event(message, event, stages, first=event.id not in known)
 
     def retry(self) -> None:
         """Offer the store what it has not taken yet, if it is time to."""
@@ -233,15 +239,20 @@ class EventLog:
         for event in events:
             message = messages.event(event)
             self._write(partial(self._store.add, message, event.start_ns), 1)
-            self._publish_event(message)
+            self._publish_event(message, event, None)
 
     def _write(self, work: Callable[[], None], events: int, *, is_final: bool = False) -> None:
         """Have something stored, without waiting for it while the server runs."""
         self._store.backlog.put(Write(work, events, is_final), self._clock.monotonic_ns())
 
-    def _publish_event(self, message: JsonObject) -> None:
+    def _publish_event(self, message: JsonObject, event: Event, stages: Stages | None, *, first: bool = True) -> None:
         self.published += 1
+        if self._traces is None or self._is_replay:
+            self._publish(message)
+            return
+        began_ns = self._clock.now_ns()
         self._publish(message)
+        self._traces.published(event, stages, began_ns, self._clock.now_ns(), first=first)
 
     def _stages(self, event: Event) -> Stages | None:
         """Return where the time went that the event took; nothing of a recording's, which is long past."""

@@ -12,13 +12,16 @@ from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.proposals import Proposals
 from livessl.server.receiver import Inbox
+from livessl.server.recent_log import RecentLog
 from livessl.server.refusals import Refusals
+from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sinks import Sinks
@@ -63,13 +66,16 @@ class Parts:
     journal: Journal
     presence: Presence
     floor_plan: FloorPicture | None
+    hub_link: HubLink | None
+    reloader: Reloader
+    recent_log: RecentLog
 
     @property
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
         parts = (
             *(self.engine, self.receiver, self.maps, self.set_up_watch, self.proposals),
-            *(self.alerts, self.clips, self.store.backlog),
+            *(self.alerts, self.clips, self.store.backlog, self.reloader, self.hub_link),
         )
         failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)

@@ -18,7 +18,7 @@ NS_PER_S: Final = 1_000_000_000
 
 @dataclass(slots=True)
 class _Trail:
-    """What is known of a live track."""
+    """A live track so far."""
 
     start_ns: int
     start_utc: str

@@ -1,4 +1,7 @@
-"""Noise that rooms have: pink noise, a fan, and noise that arrives from everywhere. It knows no room and no level."""
+"""Noise that rooms have: pink, a fan, hum, music, bursts, and noise from everywhere or from one side.
+
+It knows no room and no level.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from typing import Final
 
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 
 from livessl.core.types import Float32Array, FloatArray
 
@@ -27,6 +31,31 @@ WANDER: Final = 0.003
 
 WANDER_S: Final = 0.5
 """Time, in seconds, over which a fan's speed changes."""
+
+MAINS_HZ: Final = (50.0, 60.0)
+"""Frequencies of the mains, in hertz; a transformer hums at the even harmonics."""
+
+HUM_ORDERS: Final = 24
+"""Number of harmonics of a hum; the power of one falls with the square of its order."""
+
+HUM_HISS: Final = 0.01
+"""Share of a hum's power that is pink noise."""
+
+CHORD_S: Final = 0.4
+"""Time, in seconds, between two chords of the music."""
+
+NOTES_HZ: Final = tuple(110.0 * 2.0 ** (step / 12.0) for step in (0, 2, 3, 5, 7, 8, 10, 12, 14, 15, 17, 19, 20, 22, 24))
+"""Notes of the music, in hertz: two octaves of a minor scale."""
+
+ON_S: Final = (0.3, 1.0)
+OFF_S: Final = (0.4, 1.6)
+"""Ranges, in seconds, of the time for which an intermittent noise is on, and off."""
+
+SIDE_WAVES: Final = 12
+"""Number of plane waves of the noise from one side."""
+
+SIDE_DEG: Final = 40.0
+"""Largest angle, in degrees, between one of these waves and the middle of the side."""
 
 _RIDGE: Final = 1e-6
 """Share of independent noise that keeps the coherence matrix positive definite where microphones are close."""
@@ -93,6 +122,79 @@ def diffuse(
     return _in_time(spectra, count)
 
 
+def hum(rng: np.random.Generator, count: int, sample_rate_hz: float) -> Float32Array:
+    """Return the hum of a transformer or a supply, (count,), with a mean power of 1: harmonics of twice the mains."""
+    first_hz = 2.0 * float(rng.choice(MAINS_HZ))
+    orders = np.arange(1, HUM_ORDERS + 1)
+    orders = orders[orders * first_hz < 0.45 * sample_rate_hz]
+    times_s = np.arange(count) / sample_rate_hz
+    tones = np.zeros(count)
+    for order in orders:
+        level = rng.uniform(0.5, 1.5) / order
+        tones += level * np.sin(2.0 * np.pi * order * first_hz * times_s + rng.uniform(0.0, 2.0 * np.pi))
+    tones *= np.sqrt((1.0 - HUM_HISS) / np.square(tones).mean())
+    return np.asarray(tones + np.sqrt(HUM_HISS) * pink(rng, count, sample_rate_hz)[0], dtype=np.float32)
+
+
+def music(rng: np.random.Generator, count: int, sample_rate_hz: float) -> Float32Array:
+    """Return music, (count,), with a mean power of 1: plucked chords, a bass, and a drum on every other beat."""
+    beat = round(CHORD_S * sample_rate_hz)
+    times_s = np.arange(4 * beat) / sample_rate_hz
+    sound = np.zeros(count + len(times_s))
+    for number, start in enumerate(range(-int(rng.integers(beat)), count, beat)):
+        here = np.zeros(len(times_s))
+        for note_hz in (NOTES_HZ[int(rng.integers(7))], *rng.choice(NOTES_HZ, 3, replace=False)):
+            for order in range(1, 9):
+                if order * note_hz < 0.45 * sample_rate_hz:
+                    decay = np.exp(-times_s * order / 0.6)
+                    here += decay * np.sin(2.0 * np.pi * order * note_hz * times_s + rng.uniform(0.0, 6.28)) / order
+        if number % 2:
+            here += 2.0 * rng.standard_normal(len(times_s)) * np.exp(-times_s / 0.05)
+        used = here[max(0, -start) :]
+        sound[max(0, start) : max(0, start) + len(used)] += used
+    sound = sound[:count]
+    return np.asarray(sound / np.sqrt(np.square(sound).mean()), dtype=np.float32)
+
+
+def intermittent(rng: np.random.Generator, count: int, sample_rate_hz: float) -> Float32Array:
+    """Return pink noise that goes on and off, (count,), with a mean power of 1 over all: a tool, a printer, a tap."""
+    hiss = pink(rng, count, sample_rate_hz)[0]
+    on, start = np.zeros(count, dtype=np.float32), 0
+    while start < count:
+        start += round(rng.uniform(*OFF_S) * sample_rate_hz) if start else round(rng.uniform(0.0, 1.0) * sample_rate_hz)
+        stop = start + round(rng.uniform(*ON_S) * sample_rate_hz)
+        on[start:stop] = 1.0
+        start = stop
+    if not on.any():
+        on[:] = 1.0  # shorter than the first pause
+    sound = hiss * on
+    return np.asarray(sound / np.sqrt(np.square(sound).mean()), dtype=np.float32)
+
+
+def from_one_side(
+    rng: np.random.Generator, microphones_m: FloatArray, count: int, sample_rate_hz: float, c_m_s: float
+) -> Float32Array:
+    """Return pink noise from one side, traffic or rain on a roof, at microphones: (K, count), a mean power of 1 each.
+
+    It is the sum of independent plane waves from directions within `SIDE_DEG` of one of the four walls or the ceiling.
+    Parameters are those of `diffuse`.
+    """
+    sides = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], dtype=np.float64)
+    side = sides[int(rng.integers(len(sides)))]
+    angles = np.radians(SIDE_DEG) * np.sqrt(rng.uniform(0.0, 1.0, SIDE_WAVES))
+    turns = rng.uniform(0.0, 2.0 * np.pi, SIDE_WAVES)
+    first, second = (np.roll(np.abs(side), shift) for shift in (1, 2))
+    across = np.cos(turns)[:, None] * first + np.sin(turns)[:, None] * second
+    towards = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * across
+    frequencies_hz = scipy.fft.rfftfreq(count, 1.0 / sample_rate_hz)
+    spectra = _pink_spectra(rng, count, sample_rate_hz, SIDE_WAVES)
+    early_s = towards @ (microphones_m - microphones_m.mean(axis=0)).T / c_m_s
+    summed = np.zeros((len(microphones_m), len(frequencies_hz)), dtype=np.complex128)
+    for spectrum, each_s in zip(spectra, early_s, strict=True):
+        summed += spectrum * np.exp(2j * np.pi * frequencies_hz * each_s[:, None])
+    return _in_time(summed, count)
+
+
 def _pink_spectra(rng: np.random.Generator, count: int, sample_rate_hz: float, channels: int) -> FloatArray:
     """Draw the spectra (channels, F) of independent pink noise; their expected power is equal."""
     frequencies_hz = scipy.fft.rfftfreq(count, 1.0 / sample_rate_hz)
@@ -102,7 +204,7 @@ def _pink_spectra(rng: np.random.Generator, count: int, sample_rate_hz: float, c
     return np.asarray((drawn[0] + 1j * drawn[1]) * shape)
 
 
-def _in_time(spectra: FloatArray, count: int) -> Float32Array:
+def _in_time(spectra: FloatArray | NDArray[np.complex128], count: int) -> Float32Array:
     """Transform to the time domain and give every channel a mean power of 1."""
     noise = scipy.fft.irfft(spectra, count, axis=1)
     return np.asarray(noise / np.sqrt(np.square(noise).mean(axis=1, keepdims=True)), dtype=np.float32)

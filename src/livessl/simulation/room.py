@@ -125,7 +125,7 @@ def impulse_responses(
     high-pass: below 100 Hz, where images only ever add, the response rings longer than the time asked for. The lattice
     is visited in shells of equal volume, so memory does not grow with the number of images.
     """
-    room_m, source, microphones = _checked_positions(room_size_m, source_m, microphones_m)
+    room_m, source, microphones = checked_positions(room_size_m, source_m, microphones_m)
     if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
         raise ValueError(f"sample rate: expected Hz above 0, got {sample_rate_hz}")
     if len(rt60s_s) == 0:
@@ -157,7 +157,7 @@ def impulse_responses(
     return responses
 
 
-def _checked_positions(
+def checked_positions(
     room_size_m: ArrayLike, source_m: ArrayLike, microphones_m: ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the room's size (3,), the source (3,) and the microphones (K, 3), metres, once they are checked."""
@@ -279,7 +279,11 @@ def _lay_down(fine: FloatArray, bins: FloatArray, order: IntArray, distance_m: F
 def _decimated(fine: FloatArray | Float32Array, fft_size: int) -> FloatArray:
     """Bring the fine axis (bins, R) to the sample rate and undo the droop sinc^2 of the two-bin taps."""
     spectrum = np.asarray(rfft(fine, fft_size * OVERSAMPLING, axis=0))[: fft_size // 2 + 1]
-    of_nyquist = 2.0 * np.arange(len(spectrum)) / fft_size
+    return np.asarray(irfft(spectrum * decimation_gain(fft_size).astype(fine.dtype)[:, None], fft_size, axis=0))
+
+
+def decimation_gain(fft_size: int) -> FloatArray:
+    """Return the gain in each bin, (fft_size/2 + 1,), that fades the response out and undoes the droop of the taps."""
+    of_nyquist = 2.0 * np.arange(fft_size // 2 + 1) / fft_size
     fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((of_nyquist - ROLL_OFF) / (1.0 - ROLL_OFF), 0.0, 1.0))
-    gain = (fade / np.sinc(of_nyquist / (2 * OVERSAMPLING)) ** 2).astype(fine.dtype)
-    return np.asarray(irfft(spectrum * gain[:, None], fft_size, axis=0))
+    return np.asarray(fade / np.sinc(of_nyquist / (2 * OVERSAMPLING)) ** 2)

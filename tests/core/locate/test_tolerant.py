@@ -75,6 +75,8 @@ def test_peaks_stay_where_they_are_and_get_wider() -> None:
     part = evidence_of(FRAMES[0], np.array([2.0, 2.0, 1.0]), 0.0, np.array([4.0, 3.0, 1.0]), 0.0)
     wide = tolerant(part)
     np.testing.assert_allclose(peak_lags_s(wide.gcc), peak_lags_s(part.gcc), atol=1e-6)
+    known = tolerant(replace(part, background=part.gcc.values)).background
+    np.testing.assert_array_equal(known, wide.gcc.values)
     assert (wide.gcc.values.max(axis=1) < 0.7 * part.gcc.values.max(axis=1)).all()
 
 

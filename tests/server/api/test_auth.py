@@ -49,7 +49,7 @@ class Secured:
     def routes(self) -> set[str]:
         """Every path of the OpenAPI description, with examples in place of its parameters."""
         described = self.ask("/api/v1/openapi.json", Role.VIEWER).json()
-        return {path.format(event_id="small-0", name="north", number=1) for path in described["paths"]}
+        return {path.format(event_id="small-0", name="north", number=1, key="k") for path in described["paths"]}
 
 
 def listen(live: ClientConnection) -> None:
@@ -80,7 +80,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Secured]:
 
 
 PUBLIC = {"/", "/static/app.js", "/static/index.html", "/api/v1/health"}
-FOR_ADMINS = {"/api/v1/access"}
+FOR_ADMINS = {"/api/v1/access", "/api/v1/log"}
 FOR_OPERATORS = {"/api/v1/events/small-0/clips/north", "/api/v1/events/small-0/clips/keep"}
 
 

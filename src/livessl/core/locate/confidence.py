@@ -7,7 +7,7 @@ It sees correlations and no sound. The constants were fitted to simulated events
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -35,6 +35,14 @@ peak-to-RMS ratio."""
 
 _WHOLE_SEGMENT_FIT: Final = (-3.56, 10.0, 0.82)
 """The same as `_ONSET_FIT` for evidence that includes whole segments; fitted where onsets alone were not sure."""
+
+_BACKGROUND_FIT: Final = 36.6
+"""Log-odds by which a background that explains the whole power at the position lowers the confidence; fitted by
+`livessl evaluate localizer --scenario noise --half development`."""
+
+_BACKGROUND_RMS: Final = 2.5
+"""Power of a background at a position, relative to its root mean square elsewhere, that is there by chance: it is known
+from some tenths of a second, and the position is where the background adds to the sound."""
 
 _DISTANCE_FIT: Final = (-0.04, 62.2)
 """Log-odds that no position further along the line of sight is as good: intercept, weight of the margin. It matters for
@@ -82,6 +90,9 @@ class ConfidenceFeatures:
         Whether the evidence includes whole segments.
     share : float
         Probability of the position among the places that explain the evidence about as well, such as mirror images.
+    background : float
+        Share of the power at the position that the background, if it went on as it was before the sound, would have
+        there above what it may have by chance; 0 if that is not known.
     """
 
     margin: float
@@ -90,6 +101,7 @@ class ConfidenceFeatures:
     second_array: float = 0.0
     whole: bool = False
     share: float = 1.0
+    background: float = 0.0
 
     @property
     def confidence(self) -> float:
@@ -108,7 +120,8 @@ class ConfidenceFeatures:
     def confidence_at_known_distance(self) -> float:
         """Probability that the position is right to within `NEAR_M` if the arrays determine its distance."""
         intercept, of_margin, of_ratio = _WHOLE_SEGMENT_FIT if self.whole else _ONSET_FIT
-        return _probability(intercept + of_margin * self.margin + of_ratio * self.peak_to_rms)
+        log_odds = intercept + of_margin * self.margin + of_ratio * self.peak_to_rms
+        return _probability(log_odds - _BACKGROUND_FIT * self.background)
 
     @property
     def is_sure(self) -> bool:
@@ -211,6 +224,7 @@ def judge(
         ratios[-2] if len(ratios) > 1 else 0.0,
         whole,
         1.0 if rivals is None else rivals.share,
+        _background_share(evidence, position_m, power, functional.c_m_s),
     )
     covariance_m2 = refine.laplace_covariance_m2(functional, evidence, position_m, grid)
     covariance_m2 *= _INFLATION * np.sqrt(len(evidence))
@@ -228,6 +242,28 @@ def judge(
     if rivals is None or not ambiguous:
         return Judgement(covariance_m2, features, refused)
     return Judgement(covariance_m2, features, refused, rivals.candidates, rivals.reason)
+
+
+def background_power(evidence: Sequence[Evidence], position_m: FloatArray, c_m_s: float) -> tuple[float, float]:
+    """Power that the background would have at a position, and its root mean square anywhere; 0 and 0 if not known."""
+    known = [
+        replace(part, gcc=replace(part.gcc, values=part.background)) for part in evidence if part.background is not None
+    ]
+    if not known:
+        return 0.0, 0.0
+    square = 0.0
+    for part in known:
+        of_pairs = np.square(part.gcc.values).mean(axis=1, dtype=np.float64).sum()
+        square += pair_weight(len(part.spec.microphones_m)) ** 2 * float(of_pairs)
+    return float(SRPFunctional(known, c_m_s).value(position_m[None])[0]), float(np.sqrt(square))
+
+
+def _background_share(evidence: Sequence[Evidence], position_m: FloatArray, power: float, c_m_s: float) -> float:
+    """Share of the power at a position that the background has there above what it may have by chance, at least 0."""
+    if power <= 0.0:
+        return 0.0
+    there, rms = background_power(evidence, position_m, c_m_s)
+    return max(0.0, there - _BACKGROUND_RMS * rms) / power
 
 
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:

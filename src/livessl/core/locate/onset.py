@@ -12,10 +12,10 @@ from livessl.core.correlate.gcc_phat import LagSampling, require_band
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
-from livessl.core.locate.confidence import CROSSING_DEG, LEAST_CONFIDENCE, NEAR_M, Judgement
+from livessl.core.locate.confidence import CROSSING_DEG, LEAST_CONFIDENCE, NEAR_M, Judgement, background_power
 from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
-from livessl.core.locate.frame_gccs import FrameGCCs
+from livessl.core.locate.frame_gccs import BEGINNING, FrameGCCs
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.outside import Outside, find_outside
@@ -25,7 +25,7 @@ from livessl.core.locate.second_source import SecondSourceSearch
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.locate.tolerant import tolerant
 from livessl.core.methods import ONSET
-from livessl.core.types import GCC, ArraySpec, Evidence
+from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array
 
 SEARCH_SPACING_M: Final = 0.1
 """Coarsest spacing of the search grid, in metres. Within 0.1 m the phase of a 0.5 m array at 6 kHz changes by less than
@@ -37,6 +37,17 @@ and without them the cost and the delay of an answer do not grow with the number
 
 MOST_ARRAYS_REEXAMINED: Final = 8
 """Most arrays whose whole segments are correlated where onsets are not sure; the time grows with their number."""
+
+
+BACKGROUND: Final = 0.05
+"""Share of the power at a position that the background has there beyond chance, from which on the background is
+subtracted and the sound is looked for beneath it."""
+
+
+FAR_BELOW: Final = 0.05
+COMPARABLE: Final = 0.1
+"""Power of a background relative to that of the sound, 13 and 10 dB below, from which on it counts, and counts in full.
+What a room still gives of an earlier sound from the same place is usually weaker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +122,11 @@ class Onset(MapEstimator):
         evidence = self.evidence(strongest)
         suspect = [name for name, sound in strongest.items() if sound.suspect]
         answer = self._answer(evidence, suspect)
+        if answer.judgement.features.background >= BACKGROUND:
+            beneath = self._without_background(evidence, answer.consensus.place)
+            other = self._answer(beneath, suspect)
+            if other.refused is None and other.rank() > answer.rank():
+                evidence, answer = beneath, other
         outside = self._outside(answer)
         separation = None
         if outside is None or not outside.is_sufficient:
@@ -239,6 +255,18 @@ class Onset(MapEstimator):
 
         return tuple(added(part) for part in evidence)
 
+    def _without_background(self, evidence: Sequence[Evidence], place: Place) -> tuple[Evidence, ...]:
+        """Subtract the background, scaled so that it has all the power at a place: nothing of the place remains."""
+        there, _ = background_power(place.evidence, place.position_m, self.c_m_s)
+        scale = np.float32(place.power / there)
+
+        def rest(part: Evidence) -> Evidence:
+            if part.background is None:
+                return part
+            return replace(part, gcc=replace(part.gcc, values=part.gcc.values - scale * part.background))
+
+        return tuple(rest(part) for part in evidence)
+
     def _frames(self, evidence: Evidence, sound: Sound) -> FrameGCCs:
         sampling = self._sampling(evidence.spec.name, sound.sample_rate_hz)
         live = np.any(evidence.gcc.values, axis=1)
@@ -255,7 +283,10 @@ class Onset(MapEstimator):
         gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
         faint = onsets.noise_power <= FAINT * onsets.weight
         presumed = sound.detected and faint
-        return Evidence(spec, sound.without_dead_channels(gcc), noise_rms=onsets.noise_rms, is_presumed=presumed)
+        kept, background = sound.without_dead_channels(gcc), _background(sound)
+        if background is not None:
+            background = sampling.fine(background / onsets.heights(pairs)) * np.any(kept.values, axis=1)[:, None]
+        return Evidence(spec, kept, noise_rms=onsets.noise_rms, is_presumed=presumed, background=background)
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
         known = self._samplings.get(array)
@@ -267,6 +298,28 @@ class Onset(MapEstimator):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
+
+
+def _background(sound: Sound) -> Float32Array | None:
+    """Lags that the frames of a sound would add up to if its background had gone on alone; None if it is not known.
+
+    The background is known from the pre-roll without its last frames, in which the sound may begin. The weights of
+    onsets say little about power, so that a background `FAR_BELOW` the sound is left out. Envelopes are magnitudes:
+    those of noise do not cancel, and say nothing about a place.
+    """
+    course = sound.course
+    if course is None or not sound.onsets:
+        return None
+    before = int(np.searchsorted(course.frame_indices, course.begin - BEGINNING))
+    known = [k for k in range(before) if sound.onsets[k].weight > 0.0]  # not those in which the noise was learned
+    if not known or before == len(sound.onsets) or np.iscomplexobj(sound.onsets[0].lags):
+        return None
+    level = float(course.powers[known].mean()) / max(float(course.powers[before:].mean()), 1e-30)
+    counted = min(1.0, (level - FAR_BELOW) / (COMPARABLE - FAR_BELOW))
+    if counted <= 0.0:
+        return None
+    share = counted * (len(sound.onsets) - before) / len(known)
+    return np.float32(share) * np.asarray(summed([sound.onsets[k] for k in known]).lags, dtype=np.float32)
 
 
 def _names(evidence: Sequence[Evidence]) -> frozenset[str]:

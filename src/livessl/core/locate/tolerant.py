@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.band import uses_envelope
-from livessl.core.types import Evidence
+from livessl.core.types import Evidence, Float32Array, FloatArray
 
 SHARE: Final = 0.5
 """Width of the distribution in units of the clocks' standard deviation. Half of it passes what is above 3 kHz in part,
@@ -41,9 +41,16 @@ def tolerant(evidence: Evidence) -> Evidence:
         return evidence
     weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) * step_s / width_s))
     weights /= weights.sum()
-    padded = np.pad(gcc.values, ((0, 0), (reach, reach)), mode="edge")
-    values = np.array([np.convolve(row, weights, mode="valid") for row in padded], dtype=np.float32)
+    values = _averaged(gcc.values, weights)
+    background = None if evidence.background is None else _averaged(evidence.background, weights)
     frequencies_hz = np.linspace(*spec.band_hz, 64)
     passed = np.exp(-np.square(2.0 * np.pi * frequencies_hz * width_s))  # power of noise that is left
     noise_rms = evidence.noise_rms * float(np.sqrt(passed.mean()))
-    return replace(evidence, gcc=replace(gcc, values=values), noise_rms=noise_rms)
+    return replace(evidence, gcc=replace(gcc, values=values), noise_rms=noise_rms, background=background)
+
+
+def _averaged(values: Float32Array, weights: FloatArray) -> Float32Array:
+    """Average values (P, L) along the lags; beyond the ends they stay as they are there."""
+    reach = len(weights) // 2
+    padded = np.pad(values, ((0, 0), (reach, reach)), mode="edge")
+    return np.array([np.convolve(row, weights, mode="valid") for row in padded], dtype=np.float32)

@@ -306,6 +306,9 @@ class Evidence:
         the microphones were random; 0 if it is not known.
     is_presumed : bool
         Whether the array is taken to contribute even if its sound does not stand out from its noise.
+    background : (P, L) float32, or None
+        What `gcc.values` would be of a background alone that went on as it was before the sound; None if that is not
+        known.
     """
 
     spec: ArraySpec
@@ -313,6 +316,7 @@ class Evidence:
     below: tuple[GCC, ...] = ()
     noise_rms: float = 0.0
     is_presumed: bool = True
+    background: Float32Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

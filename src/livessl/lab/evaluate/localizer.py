@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from livessl.core.geometry import angle_deg
-from livessl.core.locate.estimator import Estimator, Sound, create
+from livessl.core.locate.estimator import Estimator, Localization, Sound, create
 from livessl.core.stream.activity import exact_mask, runs
 from livessl.core.stream.verdict import judged
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
@@ -216,7 +216,11 @@ def found_row(
     estimator: Estimator, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray
 ) -> Row:
     """Locate a sound and compare the result with the truth: the columns that all scenarios share."""
-    found = estimator.locate(sounds)
+    return compared(estimator.locate(sounds), sounds, specs, source_m)
+
+
+def compared(found: Localization, sounds: Mapping[str, Sound], specs: Sequence[ArraySpec], source_m: FloatArray) -> Row:
+    """Compare what was found with the truth: the columns that all scenarios share."""
     outliers = found.outliers or {}
     error = found.position_m - source_m
     nearest_m = min((spec.centre_m for spec in specs), key=lambda centre_m: float(np.linalg.norm(centre_m - source_m)))

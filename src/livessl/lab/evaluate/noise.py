@@ -1,4 +1,4 @@
-"""The scenario `noise`: sounds in rooms with a fan, with talkers in the background, in diffuse and in sensor noise.
+"""The scenario `noise`: sounds in rooms with the noise that rooms have.
 
 Both halves differ in rooms, sounds and every draw. A position is in one room, and all kinds and levels of noise get the
 same sounds from it. What is measured is localization, not detection: it is known when the sound begins.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,26 +16,24 @@ import pyarrow as pa
 
 from livessl.core.correlate.band import band_power
 from livessl.core.geometry import Grid
-from livessl.core.locate.estimator import Estimator, create
+from livessl.core.locate.estimator import Course, Estimator, create
 from livessl.core.stream.activity import exact_mask
 from livessl.core.types import FRAME_S, ArraySpec, BoolArray, Float32Array, FloatArray
-from livessl.lab.evaluate.localizer import METHODS, SPACING_M, found_row, half_of, sound_of
+from livessl.lab.evaluate.localizer import METHODS, PRE_ROLL_FRAMES, SPACING_M, compared, half_of, sound_of
 from livessl.lab.evaluate.moments import SPEECH
+from livessl.lab.evaluate.noise_kinds import KINDS, Emitter, Noise, make_noise
 from livessl.lab.evaluate.noise_rooms import NOISE_ROOMS, NoiseRoom
+from livessl.lab.evaluate.noise_sounds import OTHER_SOUNDS
 from livessl.lab.evaluate.paper import C_M_S
 from livessl.lab.evaluate.parquet import NAME
 from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, NOISE
 from livessl.lab.evaluate.unit import PEAK, Clips, Row, convolved
-from livessl.simulation.noise import diffuse, fan
-from livessl.simulation.room import impulse_responses
+from livessl.simulation.walls import wall_absorption, wall_responses
 
-KINDS: Final = ("white", "fan", "talkers", "diffuse")
-"""Kinds of noise: of the sensors, from one place, from several, from everywhere."""
-
-SNRS_DB: Final = (20.0, 10.0, 5.0)
+SNRS_DB: Final = (20.0, 10.0, 5.0, 0.0)
 
 POSITIONS: Final = 24
-"""Number of positions by default: six in each room."""
+"""Number of positions by default: three in each room."""
 
 LEAD_S: Final = 1.0
 """Noise, in seconds, before the sound: more than the pre-roll that a node sends."""
@@ -55,24 +53,41 @@ APART_M: Final = 1.0
 WALL_M: Final = 0.2
 """Least distance, in metres, of a source from the walls."""
 
+WHERE: Final[Mapping[str, tuple[float, float]]] = {"inside": (0.0, 0.7), "edge": (0.7, 1.2), "outside": (1.2, np.inf)}
+"""Where a source is in plan: ranges of its distance from the middle of the arrays, relative to that of the array which
+is furthest from there."""
+
+FACING: Final = ("all around", "towards", "away")
+"""How a source radiates: alike in all directions, or as a talker who faces the nearest array, or turns away from it."""
+
+OTHER_NOISE: Final = ("diffuse", 20.0)
+"""Kind and level, in dB, of the noise with which the sounds of `OTHER_SOUNDS` are played."""
+
 SCHEMA: Final = pa.schema(
     [
         ("position", pa.int32()),
-        *((name, NAME) for name in ("room", "noise", "method", "sound", "clip")),
+        *((name, NAME) for name in ("room", "noise", "method", "sound", "clip", "where", "facing")),
         *((name, pa.float32()) for name in ("rt60_s", "snr_db", "active_s")),
         *((f"{axis}_m", pa.float32()) for axis in "xyz"),
         *((f"found_{axis}_m", pa.float32()) for axis in "xyz"),
-        *((name, pa.float32()) for name in ("error_m", "bearing_deg", "mahalanobis2", "to_noise_m")),
+        *((name, pa.float32()) for name in ("error_m", "bearing_deg", "mahalanobis2", "to_noise_m", "candidate_m")),
         ("status", NAME),
         ("outvoted", NAME),
-        *((name, pa.float32()) for name in ("confidence", "margin", "standing")),
+        ("whole", pa.bool_()),
+        *((name, pa.float32()) for name in ("confidence", "margin", "standing", "second_array", "crossing_deg")),
+        *((name, pa.float32()) for name in ("share", "background")),
     ]
 )
 """One row per sound, noise, level and method, as in the other scenarios. `to_noise_m` is the distance of the position
-found from the nearest noise source; null where the noise has no place."""
+found from the nearest noise source; null where the noise has no place. `candidate_m` is the distance of the nearest
+candidate place from the truth; null without candidates. The columns from `whole` on are the features of `onset`'s
+confidence."""
 
-_SOURCES, _NOISE = 1, 2
+_SOURCES, _NOISE, _OTHERS = 1, 2, 3
 """Keys of the random streams, so that a noise is the same whatever other kinds and levels are run."""
+
+_TRIES: Final = 400
+"""Places that are drawn in search of one in the wanted part of a room; small rooms may have hardly any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +98,7 @@ class NoiseSettings:
     ----------
     positions : int
         Number of positions of the source; they take the rooms of the half in turn, and each plays one random clip of
-        every class.
+        every class. 72 have every room with every place of `WHERE` and every one of `FACING` once.
     snrs_db : tuple of float
         Level of the sound's mean power over its whole recording and all microphones above that of the noise.
     seed : int
@@ -92,6 +107,10 @@ class NoiseSettings:
         Spacing of the grid that `srp-phat` searches before it refines.
     half : str
         Half of the rooms, clips and random draws: one of `HALVES`.
+    kinds : tuple of str
+        Kinds of noise.
+    others : bool
+        Whether the sounds of `OTHER_SOUNDS` are played, too.
     """
 
     positions: int
@@ -100,6 +119,8 @@ class NoiseSettings:
     sample_rate_hz: float = 16000.0
     spacing_m: float = SPACING_M
     half: str = HALVES[1]
+    kinds: tuple[str, ...] = KINDS
+    others: bool = True
     scenario: str = NOISE
     experiment: str = LOCALIZER
 
@@ -109,11 +130,23 @@ class NoiseSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class _Noise:
-    """Noise at all microphones (K, n), of a mean power of 1, and its places (N, 3); none if it comes from nowhere."""
+class _Scene:
+    """A room with a source of sound and sources of noise, and what they give at the microphones.
 
-    samples: Float32Array
-    places_m: FloatArray
+    Parameters
+    ----------
+    room : NoiseRoom
+    head : Row
+        Columns that all rows of the position share.
+    source : Emitter
+    noises : mapping of str to Noise
+        Noise of each kind, longer than every sound.
+    """
+
+    room: NoiseRoom
+    head: Row
+    source: Emitter
+    noises: Mapping[str, Noise]
 
 
 class NoisePosition:
@@ -144,76 +177,94 @@ class NoisePosition:
     def rows(self, number: int) -> list[Row]:
         """Simulate and localize position `number`: one row per sound, kind and level of noise, and method."""
         settings = self._settings
-        rooms = NOISE_ROOMS[settings.half]
-        room = rooms[number % len(rooms)]
         rng = np.random.default_rng(self._seed(number, _SOURCES, ""))
-        source_m = _free_place_m(room, rng)
-        fan_m, *talkers_m = (_free_place_m(room, rng, source_m) for _ in range(1 + TALKERS))
-        to_sound, to_fan, *to_talkers = (self._response(room, place_m) for place_m in (source_m, fan_m, *talkers_m))
         chosen = {name: clips[int(rng.integers(len(clips)))] for name, clips in self._clips.items()}
+        others = self._other_sounds(number) if settings.others else {}
+        longest = max(len(sound) for _, sound in (*chosen.values(), *others.values()))
+        scene = self._scene(number, rng, longest)
         lead = round((LEAD_S + rng.uniform(0.0, FRAME_S)) * settings.sample_rate_hz)
         rows: list[Row] = []
         for name, (clip, sound) in chosen.items():
-            wet = np.pad(convolved(sound, to_sound), ((0, 0), (lead, 0)))
-            for kind in KINDS:
-                draws = np.random.default_rng(self._seed(number, _NOISE, f"{name} {kind}"))
-                noise = self._noise(kind, room, wet.shape[1], draws, (fan_m, to_fan), (talkers_m, to_talkers))
-                sensors = draws.standard_normal(wet.shape, dtype=np.float32)
-                for snr_db in settings.snrs_db:
-                    head = {"position": number, "room": room.name, "noise": kind, "sound": name, "clip": clip}
-                    head |= {"rt60_s": room.rt60_s, "snr_db": snr_db}
-                    recorded = _mixed(room, wet, lead, [(noise.samples, snr_db), (sensors, SENSOR_DB)])
-                    found = self._found(room, recorded, lead, source_m, noise.places_m)
-                    rows += [head | row for row in found]
+            head = {"sound": name, "clip": clip}
+            rows += self._in_noise(scene, sound, lead, head, dict.fromkeys(settings.kinds, settings.snrs_db))
+        kind, snr_db = OTHER_NOISE
+        for name, (clip, sound) in others.items():
+            rows += self._in_noise(scene, sound, lead, {"sound": name, "clip": clip}, {kind: (snr_db,)})
+        return rows
+
+    def _other_sounds(self, number: int) -> dict[str, tuple[str, Float32Array]]:
+        """Synthesize each of `OTHER_SOUNDS` anew; the name of the clip is that of the sound."""
+        rate_hz = self._settings.sample_rate_hz
+        draws = {name: np.random.default_rng(self._seed(number, _OTHERS, name)) for name in OTHER_SOUNDS}
+        return {name: (name, make(draws[name], rate_hz)) for name, make in OTHER_SOUNDS.items()}
+
+    def _scene(self, number: int, rng: np.random.Generator, longest: int) -> _Scene:
+        """Draw the sources of a position, and make the noise of each kind for sounds of up to `longest` samples."""
+        settings = self._settings
+        rooms = NOISE_ROOMS[settings.half]
+        room = rooms[number % len(rooms)]
+        wanted, facing = list(WHERE)[number % len(WHERE)], FACING[number // len(WHERE) % len(FACING)]
+        source_m = _free_place_m(room, rng, wanted=wanted)
+        machine_m, *talkers_m = (_free_place_m(room, rng, source_m) for _ in range(1 + TALKERS))
+        emitted = self._emitter(room, source_m, _faced(room, source_m, facing))
+        machine, *talkers = (self._emitter(room, place_m) for place_m in (machine_m, *talkers_m))
+        count = longest + emitted[1].shape[1] + round((2.0 * LEAD_S + FRAME_S) * settings.sample_rate_hz)
+        kinds = dict.fromkeys((*settings.kinds, *((OTHER_NOISE[0],) if settings.others else ())))
+        noises = {
+            kind: make_noise(
+                kind,
+                room.microphones_m,
+                count,
+                settings.sample_rate_hz,
+                np.random.default_rng(self._seed(number, _NOISE, kind)),
+                machine,
+                talkers,
+                self._clips[SPEECH],
+            )
+            for kind in kinds
+        }
+        head = {"position": number, "room": room.name, "rt60_s": room.rt60_s, "facing": facing}
+        return _Scene(room, head | {"where": where(room, source_m)}, emitted, noises)
+
+    def _in_noise(
+        self,
+        scene: _Scene,
+        sound: Float32Array,
+        lead: int,
+        head: Row,
+        levels_db: Mapping[str, tuple[float, ...]],
+    ) -> list[Row]:
+        """Locate one sound in noise of each kind and level by each method."""
+        number, name = int(scene.head["position"]), str(head["sound"])
+        source_m, response = scene.source
+        wet = np.pad(convolved(sound, response), ((0, 0), (lead, 0)))
+        rows: list[Row] = []
+        for kind, snrs_db in levels_db.items():
+            draws = np.random.default_rng(self._seed(number, _NOISE, f"{name} {kind}"))
+            noise = scene.noises[kind].cut(draws, wet.shape[1])
+            sensors = draws.standard_normal(wet.shape, dtype=np.float32)
+            for snr_db in snrs_db:
+                recorded = _mixed(scene.room, wet, lead, [(noise.samples, snr_db), (sensors, SENSOR_DB)])
+                own = scene.head | head | {"noise": kind, "snr_db": snr_db}
+                rows += [own | row for row in self._found(scene.room, recorded, lead, source_m, noise.places_m)]
         return rows
 
     def _seed(self, number: int, purpose: int, name: str) -> np.random.SeedSequence:
         key = (HALVES.index(self._settings.half), number, purpose, zlib.crc32(name.encode()))
         return np.random.SeedSequence(self._settings.seed, spawn_key=key)
 
-    def _response(self, room: NoiseRoom, place_m: FloatArray) -> Float32Array:
-        (response,) = impulse_responses(
+    def _emitter(self, room: NoiseRoom, place_m: FloatArray, facing: FloatArray | None = None) -> Emitter:
+        response = wall_responses(
             room.size_m,
             place_m,
             room.microphones_m,
-            [room.rt60_s],
+            wall_absorption(room.rt60_s, room.size_m, room.shares, room.bands, C_M_S),
+            duration_s=max(room.rt60_s, 1.5 * float(np.linalg.norm(room.size_m)) / C_M_S),
             sample_rate_hz=self._settings.sample_rate_hz,
             c_m_s=C_M_S,
-            own_lengths=True,
-            compiled=True,
+            facing=facing,
         )
-        return np.asarray(response)
-
-    def _noise(
-        self,
-        kind: str,
-        room: NoiseRoom,
-        count: int,
-        rng: np.random.Generator,
-        of_fan: tuple[FloatArray, Float32Array],
-        of_talkers: tuple[Sequence[FloatArray], Sequence[Float32Array]],
-    ) -> _Noise:
-        """Make noise of a kind; `of_fan` and `of_talkers` are places and the responses from them."""
-        rate_hz, nowhere_m = self._settings.sample_rate_hz, np.empty((0, 3))
-        match kind:
-            case "white":
-                shape = (len(room.microphones_m), count)
-                return _Noise(rng.standard_normal(shape, dtype=np.float32), nowhere_m)
-            case "diffuse":
-                return _Noise(diffuse(rng, room.microphones_m, count, rate_hz, C_M_S), nowhere_m)
-            case "fan":
-                place_m, response = of_fan
-                before = response.shape[1]  # the room already sounds when the recording begins
-                wet = convolved(fan(rng, before + count, rate_hz), response)[:, before : before + count]
-                return _Noise(_of_unit_power(wet), place_m[None])
-            case _:
-                places_m, responses = of_talkers
-                wet = np.zeros((len(room.microphones_m), count), dtype=np.float32)
-                for response in responses:
-                    before = response.shape[1]
-                    speech = _speech(self._clips[SPEECH], before + count, rng)
-                    wet += _of_unit_power(convolved(speech, response)[:, before : before + count])
-                return _Noise(_of_unit_power(wet), np.array(places_m))
+        return place_m, response
 
     def _found(
         self,
@@ -225,16 +276,21 @@ class NoisePosition:
     ) -> Iterator[Row]:
         """Locate a sound by each method, and compare the results with the truth."""
         rate_hz = self._settings.sample_rate_hz
-        active = {spec.name: _active(recorded[spec.name], lead, spec, rate_hz) for spec in room.arrays}
+        courses = {spec.name: _course(recorded[spec.name], lead, spec, rate_hz) for spec in room.arrays}
         for method, estimator in self._methods(room).items():
-            sounds = {
-                spec.name: sound_of(estimator, spec, recorded[spec.name], active[spec.name], rate_hz)
-                for spec in room.arrays
-            }
-            row = found_row(estimator, sounds, room.arrays, source_m)
+            sounds = {}
+            for spec in room.arrays:
+                active, course = courses[spec.name]
+                sound = sound_of(estimator, spec, recorded[spec.name], active, rate_hz)
+                sounds[spec.name] = replace(sound, course=course) if sound.onsets else sound
+            found = estimator.locate(sounds)
+            row = compared(found, sounds, room.arrays, source_m)
             if len(noises_m):
-                found_m = np.array([row[f"found_{axis}_m"] for axis in "xyz"])
-                row["to_noise_m"] = float(np.linalg.norm(noises_m - found_m, axis=1).min())
+                row["to_noise_m"] = float(np.linalg.norm(noises_m - found.position_m, axis=1).min())
+            if found.candidates:
+                row["candidate_m"] = min(float(np.linalg.norm(c.position_m - source_m)) for c in found.candidates)
+            if found.features is not None:
+                row |= {name: getattr(found.features, name) for name in _FEATURES}
             yield {"method": method} | row
 
     def _methods(self, room: NoiseRoom) -> dict[str, Estimator]:
@@ -245,26 +301,45 @@ class NoisePosition:
         return self._estimators[room.name]
 
 
-def _free_place_m(room: NoiseRoom, rng: np.random.Generator, but_m: FloatArray | None = None) -> FloatArray:
-    """Draw a place (3,) away from walls, arrays and, if given, from another place."""
+_FEATURES: Final = ("whole", "second_array", "crossing_deg", "share", "background")
+"""Features of the confidence that the other scenarios do not store."""
+
+
+def where(room: NoiseRoom, place_m: FloatArray) -> str:
+    """Return in which part of `WHERE` a place (3,) is."""
+    centres_m = np.array([spec.centre_m for spec in room.arrays])[:, :2]
+    middle_m = centres_m.mean(axis=0)
+    reach = np.linalg.norm(place_m[:2] - middle_m) / np.linalg.norm(centres_m - middle_m, axis=1).max()
+    return next(name for name, (least, most) in WHERE.items() if least <= reach < most)
+
+
+def _faced(room: NoiseRoom, source_m: FloatArray, facing: str) -> FloatArray | None:
+    """Return the horizontal direction (3,) that a source faces; None if it radiates alike in all directions."""
+    if facing == FACING[0]:
+        return None
+    towards = min((spec.centre_m - source_m for spec in room.arrays), key=lambda way: float(np.linalg.norm(way)))
+    level = np.array([towards[0], towards[1], 0.0])
+    return level if facing == FACING[1] else -level
+
+
+def _free_place_m(
+    room: NoiseRoom, rng: np.random.Generator, but_m: FloatArray | None = None, wanted: str | None = None
+) -> FloatArray:
+    """Draw a place (3,) away from walls, arrays and, if given, from another place; in the wanted part, if there is one.
+
+    Rooms whose arrays are at the walls have hardly any place outside them; then any free place is taken.
+    """
     taken = [(spec.centre_m, CLEARANCE_M) for spec in room.arrays]
     if but_m is not None:
         taken.append((but_m, APART_M))
+    tries = 0
     while True:  # far more than half of every room is free
         place_m = rng.uniform(WALL_M, np.array(room.size_m) - WALL_M)
-        if all(np.linalg.norm(place_m - other_m) >= least_m for other_m, least_m in taken):
+        tries += 1
+        if all(np.linalg.norm(place_m - other_m) >= least_m for other_m, least_m in taken) and (
+            wanted is None or tries > _TRIES or where(room, place_m) == wanted
+        ):
             return np.asarray(place_m)
-
-
-def _speech(clips: Sequence[tuple[str, Float32Array]], count: int, rng: np.random.Generator) -> Float32Array:
-    """Return the clips of speech, of equal power, in random order and from a random moment on: (count,)."""
-    order = rng.permutation(len(clips))
-    joined = np.concatenate([clips[index][1] / np.sqrt(np.square(clips[index][1]).mean()) for index in order])
-    return np.asarray(np.resize(np.roll(joined, -int(rng.integers(len(joined)))), count), dtype=np.float32)
-
-
-def _of_unit_power(samples: Float32Array) -> Float32Array:
-    return np.asarray(samples / np.sqrt(np.square(samples).mean(dtype=np.float64)), dtype=np.float32)
 
 
 def _mixed(
@@ -284,16 +359,22 @@ def _mixed(
     return recorded
 
 
-def _active(samples: Float32Array, lead: int, spec: ArraySpec, sample_rate_hz: float) -> BoolArray:
-    """Return which whole frames of 50 ms of an array's recording (K, n) are active: (F,).
+def _course(samples: Float32Array, lead: int, spec: ArraySpec, sample_rate_hz: float) -> tuple[BoolArray, Course]:
+    """Return which whole frames of 50 ms of an array's recording (K, n) are active, (F,), and the course of its sound.
 
     Frames before the sound are quiet, as they are to a node that knows the background. From the frame in which the
     sound is emitted on, the rule applies to the power in the array's band.
     """
     frame = round(FRAME_S * sample_rate_hz)
     first, count = lead // frame, samples.shape[1] // frame
-    powers = [
-        float(band_power(samples[:, k * frame : (k + 1) * frame], sample_rate_hz, spec.band_hz).mean())
-        for k in range(first, count)
-    ]
-    return np.concatenate([np.zeros(first, dtype=np.bool_), exact_mask(np.array(powers))])
+    start = max(0, first - PRE_ROLL_FRAMES)
+    powers = np.array(
+        [
+            float(band_power(samples[:, k * frame : (k + 1) * frame], sample_rate_hz, spec.band_hz).mean())
+            for k in range(start, count)
+        ]
+    )
+    active = np.concatenate([np.zeros(first, dtype=np.bool_), exact_mask(powers[first - start :])])
+    loud = np.flatnonzero(active)
+    frames = np.arange(max(0, int(loud[0]) - PRE_ROLL_FRAMES), int(loud[-1]) + 1)  # as `sound_of` takes them
+    return active, Course(frames, powers[frames - start], int(loud[0]))

@@ -4,89 +4,48 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from livessl.core.locate.confidence import NEAR_M
-from livessl.core.types import BoolArray
-from livessl.lab.evaluate.localizer import METHODS
-from livessl.lab.evaluate.localizer_report import Columns, SummaryRow, read_columns
-from livessl.lab.evaluate.markdown import Block, Heading, Table, as_markdown
-from livessl.lab.evaluate.noise import KINDS, LEAD_S, SENSOR_DB, TALKERS
+from livessl.lab.evaluate.figures.reliability import draw_reliability
+from livessl.lab.evaluate.localizer_report import EDGES, Columns, SummaryRow, read_columns
+from livessl.lab.evaluate.markdown import Block, Heading, Picture, Table, as_markdown
+from livessl.lab.evaluate.noise import LEAD_S, OTHER_NOISE, SENSOR_DB, TALKERS
+from livessl.lab.evaluate.noise_fit import background_fit
 from livessl.lab.evaluate.noise_rooms import NOISE_ROOMS
-from livessl.lab.evaluate.scenarios import NOISE
-from livessl.lab.evaluate.statistics import NINETY_PERCENT, wilson, write_csv
+from livessl.lab.evaluate.noise_sounds import OTHER_SOUNDS
+from livessl.lab.evaluate.noise_summary import (
+    ALL,
+    MOST_WRONG,
+    NEAR_DEG,
+    below_standard,
+    reliability,
+    summary,
+    too_wrong,
+)
+from livessl.lab.evaluate.scenarios import HALVES, NOISE
+from livessl.lab.evaluate.statistics import write_csv
 
-ALL: Final = "all"
-"""Value of a column over which a row of the summary is taken."""
+_PART_TITLES: Final = {"room": "room", "where": "place", "facing": "radiation", "sound": "sound"}
 
 
 def write_noise_report(out: Path) -> list[Path]:
-    """Write `summary.csv` and `report.md` into the folder of a campaign; return their paths."""
+    """Write `summary.csv`, `report.md` and the figure into the folder of a campaign; return the two texts."""
     settings = json.loads((out / "campaign.json").read_text(encoding="utf-8"))["settings"]
-    rows = summary(read_columns(out / "results.parquet"))
+    columns = read_columns(out / "results.parquet")
+    rows = summary(columns)
     write_csv(out / "summary.csv", rows)
-    (out / "report.md").write_text(as_markdown(_blocks(rows, settings)), encoding="utf-8")
+    draw_reliability(out / "figures", reliability(columns)[ALL])
+    (out / "report.md").write_text(as_markdown(_blocks(columns, rows, settings)), encoding="utf-8")
     return [out / name for name in ("summary.csv", "report.md")]
 
 
-def summary(columns: Columns) -> list[SummaryRow]:
-    """Summarize each kind and level of noise by each method, over all rooms and sounds; then each room and each sound.
-
-    `right` is the share of all sounds that are located within `NEAR_M`; `wrong` is the share of the located ones that
-    are further off, and `at_noise` the share of those within `NEAR_M` of a noise source. Intervals are 95 % intervals
-    by Wilson, as if sounds were independent.
-    """
-    levels_db = sorted(set(columns["snr_db"].tolist()), reverse=True)
-    parts: list[dict[str, Any]] = [{"noise": kind, "snr_db": snr_db} for kind in KINDS for snr_db in levels_db]
-    for name in ("room", "sound"):
-        parts += [{name: value} for value in dict.fromkeys(columns[name].tolist())]
-    rows = []
-    for part in parts:
-        here = np.ones(len(columns["method"]), dtype=np.bool_)
-        for name, value in part.items():
-            here &= columns[name] == value
-        head = {"noise": ALL, "snr_db": ALL, "room": ALL, "sound": ALL} | part
-        rows += [
-            head | {"method": method} | _measured(columns, here & (columns["method"] == method)) for method in METHODS
-        ]
-    return rows
-
-
-def _measured(columns: Columns, chosen: BoolArray) -> SummaryRow:
-    located, error_m = columns["located"][chosen], columns["error_m"][chosen]
-    near = error_m <= NEAR_M
-    right, wrong, count = int((located & near).sum()), int((located & ~near).sum()), len(error_m)
-    to_noise_m = columns["to_noise_m"][chosen][located & ~near].astype(np.float64)
-    to_noise_m = to_noise_m[np.isfinite(to_noise_m)]  # white and diffuse noise have no place
-    inside = columns["mahalanobis2"][chosen][located] <= NINETY_PERCENT
-    right_low, right_high = wilson(right, count)
-    wrong_low, wrong_high = wilson(wrong, right + wrong)
-    row: dict[str, float] = {
-        "right": right / count,
-        "right_low": right_low,
-        "right_high": right_high,
-        "wrong": wrong / max(1, right + wrong),
-        "wrong_low": wrong_low,
-        "wrong_high": wrong_high,
-        "median_m": float(np.median(error_m[located])) if located.any() else np.nan,
-        "located": (right + wrong) / count,
-        "near": float(near.mean()),
-        "at_noise": float((to_noise_m <= NEAR_M).mean()) if len(to_noise_m) else np.nan,
-        "confidence": float(columns["confidence"][chosen][located].mean()) if located.any() else np.nan,
-        "inside_90": float(inside.mean()) if located.any() else np.nan,
-    }
-    return {"sounds": count} | {name: round(value, 4) for name, value in row.items()}
-
-
-def _blocks(rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Block]:
+def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Block]:
     levels = ",".join(f"{snr_db:g}" for snr_db in settings["snrs_db"])
-    rooms = [
-        (room.name, " x ".join(f"{edge:g}" for edge in room.size_m) + " m", f"{room.rt60_s:g} s", str(len(room.arrays)))
-        for room in NOISE_ROOMS[settings["half"]]
-    ]
     return [
         Heading(1, "Localization in the noise that rooms have"),
         f"{settings['positions']} positions in the rooms of the {settings['half']} half, one clip of each class at "
@@ -101,20 +60,91 @@ def _blocks(rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Blo
         "task 2.",
         Heading(2, "By kind and level of noise"),
         Table(("noise", "SNR", *_TITLES), [_cells(row, "noise", "snr_db") for row in rows if row["noise"] != ALL]),
-        Heading(2, "By room, over all noise"),
-        Table(("room", *_TITLES), [_cells(row, "room") for row in rows if row["room"] != ALL]),
-        Heading(2, "By sound, over all noise"),
-        Table(("sound", *_TITLES), [_cells(row, "sound") for row in rows if row["sound"] != ALL]),
+        f"More than {100 * MOST_WRONG:g} % of the positions of `onset` are wrong in: {_named(too_wrong(rows))}. It has "
+        f"fewer right sounds than the interval of `srp-phat` begins with in: {_named(below_standard(rows))}.",
+        *(block for name in _PART_TITLES for block in _by(rows, name)),
+        *_others(rows),
+        *_confidence(columns),
+        *_rooms(settings),
+    ]
+
+
+def _named(cells: Sequence[SummaryRow]) -> str:
+    return ", ".join(f"{row['noise']} at {row['snr_db']:g} dB" for row in cells) or "no cell"
+
+
+def _by(rows: Sequence[SummaryRow], name: str) -> list[Block]:
+    here = [row for row in rows if row[name] != ALL and row["sound"] not in OTHER_SOUNDS]
+    title = _PART_TITLES[name]
+    return [Heading(2, f"By {title}, over all noise"), Table((title, *_TITLES), [_cells(row, name) for row in here])]
+
+
+def _others(rows: Sequence[SummaryRow]) -> list[Block]:
+    here = [row for row in rows if row["sound"] in OTHER_SOUNDS]
+    if not here:
+        return []
+    kind, snr_db = OTHER_NOISE
+    cells = [
+        (*_cells(row, "sound"), f"{100 * row['direction']:.0f} %, right {100 * row['right_direction']:.0f} %")
+        for row in here
+    ]
+    return [
+        Heading(2, f"Sounds of every kind, {kind} noise, {snr_db:g} dB"),
+        "One synthesised sound of each kind at each position. *Direction only* is the share of all sounds; a direction "
+        f"is right if it is off by at most {NEAR_DEG:g} degrees at the nearest array.",
+        Table(("sound", *_TITLES, "direction only"), cells),
+    ]
+
+
+def _confidence(columns: Columns) -> list[Block]:
+    classes = [f"{low:g} to {high:g}" for low, high in pairwise(EDGES)]
+    rows = []
+    for name, found in reliability(columns).items():
+        cells = {each["low"]: f"{each['confidence']:.2f}: {each['near']:.2f} of {each['sounds']:g}" for each in found}
+        rows.append([name, *(cells.get(low, "") for low in EDGES[:-1])])
+    return [
+        Heading(2, "Confidence"),
+        "The confidence of all sounds, located or not. For each class of confidence: its mean, the share of sounds "
+        f"within {NEAR_M:g} m, and the number of sounds.",
+        Table(("noise", *classes), rows),
+        "A background that explains the whole power at a position costs log-odds of "
+        f"{background_fit(columns):.1f} by the maximum likelihood of these sounds (the constant in use comes from the "
+        f"{HALVES[0]} half).",
+        Picture("reliability", "Share of sounds within 0.5 m, with its 95 % interval, against the mean confidence"),
+    ]
+
+
+def _rooms(settings: Mapping[str, Any]) -> list[Block]:
+    rooms = [
+        (
+            room.name,
+            " x ".join(f"{edge:g}" for edge in room.size_m) + " m",
+            f"{room.rt60_s:g} s",
+            "equal" if room.has_equal_walls else "unequal",
+            str(len(room.arrays)),
+        )
+        for room in NOISE_ROOMS[settings["half"]]
+    ]
+    return [
         Heading(2, "Rooms and noise"),
-        Table(("room", "size", "RT60", "arrays"), rooms),
+        Table(("room", "size", "RT60", "walls", "arrays"), rooms),
         (
             "*White*: independent at each microphone.",
             "*Fan*: pink noise and the harmonics of the blades, with equal power, from one place in the room.",
+            "*Hum*: harmonics of twice the mains frequency, from one place.",
             f"*Talkers*: clips of speech, one after another, from {TALKERS} places in the room.",
             "*Diffuse*: pink noise that arrives from all directions with equal power.",
+            "*Side*: pink noise from outside one wall or the ceiling: plane waves within 40 degrees of one direction.",
+            "*Music*: synthesised music from a loudspeaker.",
+            "*Intermittent*: pink noise from one place that is on for 0.3 to 1 s and off for 0.4 to 1.6 s; its level "
+            "is the mean over both.",
         ),
-        "Arrays are tetrahedra of 0.5 m, or horizontal squares of 0.2 m where the name says so. Walls are equal and "
-        "rooms are boxes; all sources radiate alike in all directions. The level of the noise is relative to the mean "
+        "Arrays are tetrahedra of 0.5 m, or what the name says: horizontal squares of 0.2 m or 64 mm, lines of four "
+        "with 0.1 m between neighbours, or one of each (*mixed*). Unequal walls absorb 0.4 to 3 times the mean, and "
+        "differently below 500 Hz, above 2 kHz and between. *Inside*, *edge* and *outside* are places less than 0.7 "
+        "times, up to 1.2 times and more than 1.2 times as far from the middle of the arrays, in plan, as the furthest "
+        "array is. Sources radiate alike *all around*, or as a talker who faces the nearest array (*towards*) or turns "
+        "his back to it (*away*); noise sources radiate all around. The level of the noise is relative to the mean "
         "power of the sound over its whole recording, from 100 Hz up. Sensor noise "
         f"{SENSOR_DB:g} dB below the sound is always added. The recording begins {LEAD_S:g} s before the sound, and "
         "the beginning of the sound is known: detection is not part of this measurement.",

@@ -13,6 +13,7 @@ from livessl.clock import Clock
 from livessl.server.alerts.actions import Action, DeliveryError
 from livessl.server.alerts.outbox import Due, Outbox, OutboxError
 from livessl.server.api.encode import JsonObject
+from livessl.server.event_traces import EventTraces
 from livessl.site.alert_models import AlertAction
 
 NS_PER_S: Final = 1_000_000_000
@@ -40,10 +41,21 @@ class Courier:
     action : Action
     outbox : Outbox
     clock : Clock
+    traces : EventTraces or None
+        Adds a span for each attempt; None if nothing is traced.
     """
 
-    def __init__(self, name: str, config: AlertAction, action: Action, outbox: Outbox, clock: Clock) -> None:
+    def __init__(
+        self,
+        name: str,
+        config: AlertAction,
+        action: Action,
+        outbox: Outbox,
+        clock: Clock,
+        traces: EventTraces | None = None,
+    ) -> None:
         self.name = name
+        self._traces = traces
         self._config = config
         self._action = action
         self._outbox = outbox
@@ -104,6 +116,20 @@ class Courier:
             self._outcome = None
 
     async def _deliver(self, alert: JsonObject) -> None:
+        """Deliver an alert, with a span of it if the process is traced."""
+        if self._traces is None:
+            await self._attempted(alert)
+            return
+        began_ns, fault = self._clock.now_ns(), None
+        try:
+            await self._attempted(alert)
+        except DeliveryError as error:
+            fault = str(error)
+            raise
+        finally:
+            self._traces.delivered(alert, self.name, began_ns, self._clock.now_ns(), fault)
+
+    async def _attempted(self, alert: JsonObject) -> None:
         """Deliver an alert; an unexpected fault of the action is a failed attempt like any other."""
         try:
             await self._action.deliver(alert)

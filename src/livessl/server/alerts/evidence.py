@@ -1,4 +1,4 @@
-"""What an action can attach to an alert: its picture, and the clip of its event once it is cut."""
+"""Attachments of alerts: the picture, and the clip of the event once it is cut."""
 
 from __future__ import annotations
 

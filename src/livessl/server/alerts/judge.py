@@ -29,14 +29,14 @@ class _Case(NamedTuple):
         Key of its alert, then further keys under which it may have alerted before.
     decide : callable
         From the rule's state to the verdict and the state after it.
-    tell : callable
+    make : callable
         Makes the alert at a time, in nanoseconds.
     """
 
     rule: str
     keys: Sequence[str]
     decide: Callable[[RuleState], tuple[Verdict, RuleState]]
-    tell: Callable[[int], JsonObject]
+    make: Callable[[int], JsonObject]
 
 
 class Judge:
@@ -130,8 +130,8 @@ class Judge:
                     # any of these keys says that this sound has alerted, as an early event or before a restart
                     keys = [self._messages.key(name, each) for each in (event["id"], *event["replaces"])]
                     decide = partial(judge_event, rule, event=event, time_ns=time_ns, zone=self._zone)
-                    tell = partial(self._messages.of_event, name, event, found, rule.events.count)
-                    yield _Case(name, keys, decide, tell)
+                    make = partial(self._messages.of_event, name, event, found, rule.events.count)
+                    yield _Case(name, keys, decide, make)
 
         return self._judge(events, cases, until_ns)
 
@@ -202,7 +202,7 @@ class Judge:
                     verdict, states[case.rule] = case.decide(states.get(case.rule, self._states[case.rule]))
                     if verdict is Verdict.ALERT:
                         actions = self._rules[case.rule].actions
-                        raised[case.keys[0]] = Raised(case.tell(self._clock.now_ns()), time_ns, actions)
+                        raised[case.keys[0]] = Raised(case.make(self._clock.now_ns()), time_ns, actions)
             return self._commit(list(raised.values()), states, until_ns)
 
     def _observed(self, name: str, arrays: Sequence[JsonObject], set_up: SetUpState) -> Observed:

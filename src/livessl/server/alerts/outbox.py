@@ -84,6 +84,7 @@ class Outbox:
     """
 
     def __init__(self, path: Path | None = None) -> None:
+        self.path = path
         self._lock = threading.Lock()
         try:
             self._db = sqlite3.connect(path or ":memory:", timeout=BUSY_S, check_same_thread=False)

@@ -9,29 +9,28 @@ import asyncio
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.core.types import FRAME_NS
-from livessl.server.alerts.actions import ActionSetting, make_action
+from livessl.errors import RunError
 from livessl.server.alerts.backlog import Backlog, Batch, final_until_ns
 from livessl.server.alerts.courier import NS_PER_S, REST_S, Courier
 from livessl.server.alerts.evidence import ClipSource, Evidence
 from livessl.server.alerts.history import DryRuns, past_pages
-from livessl.server.alerts.judge import Judge
-from livessl.server.alerts.message import AlertMessages
+from livessl.server.alerts.in_force import AlertsInForce, Surroundings, outbox_path
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
 from livessl.server.alerts.rules import RuleState
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
+from livessl.server.event_traces import EventTraces
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
 from livessl.server.zones.shapes import ZoneMap, fixed_zones
-from livessl.site.alert_checks import outbox_file
+from livessl.site.alert_models import AlertsConfig
 from livessl.site.models import Site
 
 POLL_S: Final = 0.5
@@ -44,6 +43,9 @@ DAY_NS: Final = 86_400 * NS_PER_S
 
 STOP_S: Final = 3.0
 """Longest wait, in seconds, for the thread when the server stops."""
+
+TAKE_OVER_S: Final = 10.0
+"""Longest wait, in seconds, for the thread when rules are replaced; it may be judging a long past."""
 
 _log = logging.getLogger(__name__)
 
@@ -71,6 +73,8 @@ class Alerts:
         Returns the zones that are in force; None for those of the site.
     clips : ClipSource or None
         Finds the clips of events; None if the site keeps none.
+    traces : EventTraces or None
+        Adds spans of alerts; None if nothing is traced.
 
     Raises
     ------
@@ -92,44 +96,33 @@ class Alerts:
         url: str = "",
         zones: Callable[[], ZoneMap] | None = None,
         clips: ClipSource | None = None,
+        traces: EventTraces | None = None,
     ) -> None:
         self._site = site
-        self._config = site.alerts
         self._clock = clock
         self._store = store
         self._array_states = array_states
         self._set_up_watch = set_up_watch
         self._site_time = site_time
         self._publish = publish
-        kinds = {rule.kind for rule in self._config.rules.values()}
-        self._judges_events = "events" in kinds
-        self._judges_early = any(rule.events and rule.events.early for rule in self._config.rules.values())
-        self._judges_tracks = "tracks" in kinds
-        self._judges_conditions = not kinds.isdisjoint(("arrays", "findings"))
         zones = fixed_zones(site) if zones is None else zones
-        self.dry_runs = DryRuns(self._config, store, zones)
-        """Tries rules on the history."""
-        self.outbox = Outbox(_outbox_path(site))
+        self.outbox = Outbox(outbox_path(site))
         """Alerts, deliveries and the rules' states."""
-        base = self._config.url or url + site.server.http.root_path
         self.evidence = Evidence(site, zones, clips)
         """Pictures and clips of alerts."""
+        self._around = Surroundings(clock, store, zones, url, self.evidence, traces)
         try:
-            self._judge = Judge(site, clock, self.outbox, AlertMessages(site, base), zones)
-            self.couriers = {
-                name: _courier(name, site, clock, self.outbox, base, self.evidence) for name in self._config.actions
-            }
-            """The courier of each action, by name."""
-            _leave_the_past(self.outbox, self.couriers, None if self._judges_events else site.site)
+            self._in_force = AlertsInForce(site, self.outbox, self._around)
         except BaseException:
             self.outbox.close()
             raise
         self._backlog = Backlog(site.site, store)
         self._expired_ns = 0
         self._is_failing = self._lacks_store = False
-        self._is_caught_up = not self._judges_events
+        self._is_caught_up = not self._in_force.judges_events
         self._live_ns: tuple[int, int] | None = None  # site time that was judged before the past could be read
-        self._news, self._end = asyncio.Event(), asyncio.Event()
+        self._news, self._end, self._replaced = asyncio.Event(), asyncio.Event(), asyncio.Event()
+        self._changing = threading.Lock()  # a rule is armed either before or after it is replaced
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self.failure: BaseException | None = None
@@ -144,23 +137,38 @@ class Alerts:
 
     def take_early(self, event: JsonObject, time_ns: int) -> None:
         """Take in an event that may still be replaced, and its start in site time."""
-        if self._judges_early:
+        if self._in_force.judges_early:
             self._backlog.add_early(event, time_ns)
             self._wake()
 
     def take_final(self, events: Sequence[tuple[JsonObject, int]], until: int) -> None:
         """Take in final events, each with its start, and the frame index before which all events are final."""
-        if self._judges_events:
+        if self._in_force.judges_events:
             self._backlog.add_final(events, until * FRAME_NS)
             self._wake()
 
     def take_change(self, change: JsonObject, time_ns: int) -> None:
         """Take in what a track does in a zone, and its site time; what does not fit is given up, and counted."""
-        if self._judges_tracks:
+        if self._in_force.judges_tracks:
             self._backlog.add_change(change, time_ns)
             self._wake()
 
     # --- for the API
+
+    @property
+    def config(self) -> AlertsConfig:
+        """The rules and actions that are in force."""
+        return self._in_force.config
+
+    @property
+    def dry_runs(self) -> DryRuns:
+        """Tries the rules that are in force on the history."""
+        return self._in_force.dry_runs
+
+    @property
+    def couriers(self) -> Mapping[str, Courier]:
+        """The courier of each action that is in force, by name."""
+        return self._in_force.couriers
 
     @property
     def problems(self) -> list[str]:
@@ -187,11 +195,12 @@ class Alerts:
     @property
     def states(self) -> dict[str, RuleState]:
         """The state of each rule, by name."""
-        return self._judge.states
+        return self._in_force.judge.states
 
     def arm(self, rule: str, armed: bool) -> None:
         """Arm or disarm a rule: see `Judge.arm`."""
-        self._judge.arm(rule, armed)
+        with self._changing:
+            self._in_force.judge.arm(rule, armed)
 
     def resend(self, number: int) -> None:
         """Let a dead letter be delivered again.
@@ -212,11 +221,60 @@ class Alerts:
         self.outbox.resend(number, self._clock.now_ns())
         self._wake_couriers()
 
+    def take_over(self, config: AlertsConfig) -> None:
+        """Judge and deliver by other rules and actions from now on, as after a restart with them.
+
+        States of rules that stay are kept, and so is what waits to be judged or delivered. An alert that is just being
+        delivered is delivered again, under the same key. `outbox` must be that of before.
+
+        Raises
+        ------
+        ConfigError, RunError
+            If an action cannot be made, or the outbox cannot be used; then nothing has changed.
+        """
+        site = self._site.model_copy(update={"alerts": config})
+        loop = self._loop
+        if loop is None:
+            self._replace(site)
+            self.start()
+            return
+        replacing = asyncio.run_coroutine_threadsafe(self._replace_on_thread(site), loop)
+        try:
+            replacing.result(TAKE_OVER_S)
+        except TimeoutError:
+            replacing.cancel()
+            raise RunError(
+                f"alerts: the thread that judges was busy for {TAKE_OVER_S:g} s, and the former rules stay in force; "
+                "reload again later"
+            ) from None
+
+    async def _replace_on_thread(self, site: Site) -> None:
+        """Replace the rules on the thread that judges, between two of its turns."""
+        self._replace(site)
+        self._replaced.set()
+        self._news.set()
+
+    def _replace(self, site: Site) -> None:
+        former, before, path = self.outbox, self._in_force, outbox_path(site)
+        outbox = former if former.path is not None or path is None else Outbox(path)  # the site gets its first rules
+        with self._changing:
+            try:
+                in_force = AlertsInForce(site, outbox, self._around)
+            except BaseException:
+                if outbox is not former:
+                    outbox.close()
+                raise
+            self._site, self._in_force, self.outbox = site, in_force, outbox
+        if outbox is not former:
+            former.close()
+        if in_force.judges_events and not before.judges_events:
+            self._is_caught_up, self._live_ns = False, None
+
     # --- the thread
 
     def start(self) -> None:
         """Begin to judge and to deliver; a site that never had rules needs no thread."""
-        if not self._config.rules and _outbox_path(self._site) is None:
+        if not self.config.rules and self.outbox.path is None:
             return
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, args=(self._loop,), name="alerts", daemon=True)
@@ -241,7 +299,7 @@ class Alerts:
 
     async def _work(self) -> None:
         """Judge and deliver until `stop`."""
-        tasks = [asyncio.create_task(work) for work in (self._judge_all(), *(c.run() for c in self.couriers.values()))]
+        tasks = [asyncio.create_task(work) for work in (self._judge_all(), self._deliver_all())]
         ending = asyncio.create_task(self._end.wait())
         try:
             done, _ = await asyncio.wait([*tasks, ending], return_when=asyncio.FIRST_COMPLETED)
@@ -251,6 +309,22 @@ class Alerts:
             await asyncio.gather(*tasks, ending, return_exceptions=True)
         for task in done:
             task.result()  # raises the error that ended it, if there was one
+
+    async def _deliver_all(self) -> None:
+        """Run the couriers of the actions that are in force, until cancelled."""
+        while True:
+            self._replaced.clear()
+            replaced = asyncio.create_task(self._replaced.wait())
+            couriers = [asyncio.create_task(courier.run()) for courier in self.couriers.values()]
+            try:
+                await asyncio.wait([*couriers, replaced], return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in (*couriers, replaced):
+                    task.cancel()
+                await asyncio.gather(*couriers, replaced, return_exceptions=True)
+            for task in couriers:
+                if not task.cancelled():
+                    task.result()  # raises the error that ended it
 
     async def _judge_all(self) -> None:
         """Judge what comes, and first what came before a restart, until cancelled."""
@@ -279,15 +353,20 @@ class Alerts:
         live_ns, live_until_ns = (final_ns, 0) if self._live_ns is None else self._live_ns
         if judged_ns is not None and (before_ns := min(final_ns, live_ns)) > judged_ns:
             for page, until_ns in past_pages(self._store, judged_ns, before_ns):
-                self._announce(self._judge.judge_events(page, until_ns))
+                self._announce(self._in_force.judge.judge_events(page, until_ns))
         done_ns = max(final_ns if judged_ns is None else judged_ns, live_until_ns)
         if judged_ns is None or done_ns > judged_ns:
-            self._judge.skip(done_ns)
+            self._in_force.judge.skip(done_ns)
 
     def _judge_batch(self, batch: Batch) -> None:
         """Judge events that came; while the past waits, the time before which all are judged stays where it is."""
         until_ns = batch.until_ns if self._is_caught_up else None
-        self._announce(self._judge.judge_events(batch.events, until_ns, early=batch.until_ns is None))
+        began_ns = 0 if self._around.traces is None else self._clock.now_ns()
+        alerts = self._in_force.judge.judge_events(batch.events, until_ns, early=batch.until_ns is None)
+        if self._around.traces is not None:
+            for alert in alerts:
+                self._around.traces.alerted(alert, began_ns, self._clock.now_ns())
+        self._announce(alerts)
         if batch.until_ns is not None and not self._is_caught_up:
             first_ns = min((time_ns for _, time_ns in batch.events), default=batch.until_ns)
             since_ns, newest_ns = (first_ns, 0) if self._live_ns is None else self._live_ns
@@ -312,11 +391,11 @@ class Alerts:
 
     def _turn(self) -> None:
         self._judge_waiting()
-        self._backlog.work_off_changes(lambda changes: self._announce(self._judge.judge_changes(changes)))
+        self._backlog.work_off_changes(lambda changes: self._announce(self._in_force.judge.judge_changes(changes)))
         now_ns = self._clock.now_ns()
-        if self._judges_conditions and not self._site_time.is_replay:
+        if self._in_force.judges_conditions and not self._site_time.is_replay:
             arrays = self._array_states.describe(levels=False)
-            self._announce(self._judge.judge_conditions(arrays, self._set_up_watch.state, now_ns))
+            self._announce(self._in_force.judge.judge_conditions(arrays, self._set_up_watch.state, now_ns))
         days = self._site.store.retention_days
         if days is not None and now_ns - self._expired_ns >= EXPIRE_NS:
             self._expired_ns = now_ns
@@ -343,30 +422,3 @@ class Alerts:
         if loop is not None:
             with suppress(RuntimeError):  # it has just been closed
                 loop.call_soon_threadsafe(work)
-
-
-def _courier(name: str, site: Site, clock: Clock, outbox: Outbox, url: str, evidence: Evidence) -> Courier:
-    alerts, config = site.alerts, site.alerts.actions[name]
-    rules = [rule for rule, each in alerts.rules.items() if name in each.actions]
-    alike = {other for other, each in alerts.actions.items() if each.kind == config.kind}
-    taken = {rule for rule, each in alerts.rules.items() if not alike.isdisjoint(each.actions)}
-    others = sorted((alerts.rules.keys() | outbox.states().keys()) - taken)
-    action = make_action(ActionSetting(name, config, site, clock, rules, others, url, evidence))
-    return Courier(name, config, action, outbox, clock)
-
-
-def _leave_the_past(outbox: Outbox, actions: Iterable[str], unjudged: str | None) -> None:
-    """Close what a former site file began, for a site with these actions.
-
-    `unjudged` is the name of a site without rules on events: rules that come back must not judge the time between.
-    """
-    if unjudged is not None:
-        outbox.forget_judged(unjudged)
-    if gone := outbox.abandon(actions):
-        _log.warning("%d alerts waited for actions that the site file no longer has; they are dead letters", gone)
-
-
-def _outbox_path(site: Site) -> Path | None:
-    """Return the file of the outbox; None for memory. A site without rules uses the one that it had before."""
-    path = outbox_file(site)
-    return path if path is not None and (site.alerts.rules or path.exists()) else None

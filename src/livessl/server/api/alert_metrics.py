@@ -13,7 +13,7 @@ from livessl.server.parts import Parts
 def alert_metrics(parts: Parts) -> Iterator[Metric]:
     """Gauges and counters of rules and deliveries; none for a site without rules."""
     alerts = parts.alerts
-    if not parts.site.alerts.rules:
+    if not alerts.config.rules:
         return
     raised = CounterMetricFamily("livessl_alerts", "Alerts of the rule, restarts included.", labels=["rule"])
     suppressed = CounterMetricFamily(

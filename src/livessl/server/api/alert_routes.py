@@ -20,6 +20,7 @@ from livessl.server.alerts.schedule import is_open
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.routes import as_json
 from livessl.server.parts import Parts
+from livessl.site.alert_models import AlertsConfig
 
 DAY_NS: Final = 86_400_000_000_000
 
@@ -84,8 +85,9 @@ def alert_routes(parts: Parts) -> APIRouter:
     @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
-        states = alerts.states
-        return as_json({"v": API_VERSION, "rules": [_rule(parts, name, state) for name, state in states.items()]})
+        config, states, now_ns = alerts.config, alerts.states, parts.clock.now_ns()
+        found = [_rule(config, name, states[name], now_ns) for name in config.rules if name in states]
+        return as_json({"v": API_VERSION, "rules": found})
 
     @router.put(
         "/rules/{name}/armed",
@@ -112,7 +114,7 @@ def alert_routes(parts: Parts) -> APIRouter:
     ) -> Response:
         """Try a rule on the stored events: how often it would have alerted."""
         _check_rule(parts, name)
-        if parts.site.alerts.rules[name].events is None:
+        if alerts.config.rules[name].events is None:
             raise HTTPException(404, f"rule {name!r} is not on events, and only events are stored")
         now_ns = parts.clock.now_ns()
         since_ns = now_ns - round(days * DAY_NS)
@@ -207,7 +209,7 @@ def dead_letter_routes(parts: Parts) -> APIRouter:
 
 
 def _check_rule(parts: Parts, name: str) -> None:
-    rules = parts.site.alerts.rules
+    rules = parts.alerts.config.rules
     if name not in rules:
         raise HTTPException(404, f"no rule {name!r}; rules are {', '.join(rules) or 'none'}")
 
@@ -233,13 +235,13 @@ def _delivery(delivery: Delivery) -> JsonObject:
     }
 
 
-def _rule(parts: Parts, name: str, state: RuleState) -> JsonObject:
-    rule, config = parts.site.alerts.rules[name], parts.site.alerts
+def _rule(config: AlertsConfig, name: str, state: RuleState, now_ns: int) -> JsonObject:
+    rule = config.rules[name]
     return {
         "name": name,
         "watches": rule.kind,
         "armed": state.armed,
-        "open_now": is_open(rule.schedule, parts.clock.now_ns(), config.timezone),
+        "open_now": is_open(rule.schedule, now_ns, config.timezone),
         "actions": list(rule.actions),
         "alerts": state.alerts,
         "last_utc": None if state.last_ns is None else utc_text(state.last_ns),

@@ -29,6 +29,7 @@ TOKEN_PROTOCOL: Final = "livessl.token."  # noqa: S105 - what stands before a to
 
 HEALTH: Final = "/api/v1/health"
 ACCESS: Final = "/api/v1/access"
+LOG: Final = "/api/v1/log"
 
 ANYONE: Final = Client("anyone", Role.ADMIN)
 """Every client of a site without tokens, whose server listens on the local machine only."""
@@ -202,7 +203,7 @@ def needed_role(method: str, path: str) -> Role | None:
     path = path.removesuffix("\n")
     if method in _READING and (path in ("/", "/docs", "/history", HEALTH) or path.startswith(("/static/", "/docs/"))):
         return None
-    if path == ACCESS:
+    if path in (ACCESS, LOG):
         return Role.ADMIN
     if _SOUND.fullmatch(path):
         return Role.OPERATOR

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from fastapi import APIRouter, Response
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -13,6 +13,7 @@ from livessl.core.commission.finding import Severity
 from livessl.server.api.alert_metrics import alert_metrics
 from livessl.server.api.clip_metrics import clip_metrics
 from livessl.server.api.encode import JsonObject
+from livessl.server.api.operation_metrics import operation_metrics
 from livessl.server.api.report_metrics import report_metrics
 from livessl.server.parts import Parts
 
@@ -24,6 +25,7 @@ def metrics_route(parts: Parts) -> APIRouter:
     router = APIRouter()
     registry = CollectorRegistry()
     registry.register(_Metrics(parts))
+    ProcessCollector(registry=registry)
     registry.register(parts.latency.histogram)
 
     @router.get(
@@ -46,6 +48,7 @@ class _Metrics(Collector):
         self._parts = parts
 
     def collect(self) -> Iterator[Metric]:
+        yield from operation_metrics(self._parts)
         yield from server_metrics(self._parts)
         yield from event_metrics(self._parts)
         yield from alert_metrics(self._parts)
@@ -108,6 +111,9 @@ def event_metrics(parts: Parts) -> Iterator[Metric]:
     stored = parts.store.count()
     if stored is not None:
         yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", stored)
+    if parts.hub_link is not None:
+        yield CounterMetricFamily("livessl_hub_sent", "Messages that the hub's stream has taken.", parts.hub_link.sent)
+        yield GaugeMetricFamily("livessl_hub_waiting", "Messages that wait for the hub.", parts.hub_link.waiting)
     yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not accept.", parts.sinks.failures)
 
 

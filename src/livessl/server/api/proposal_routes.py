@@ -84,24 +84,21 @@ def proposal_routes(parts: Parts) -> APIRouter:
         """Write a proposal into the calibration file and bring it into force, without a restart."""
         with _refusals():
             changed = proposals.accept(accept.id)
-        _log.info("%r has accepted %s", request.scope["client_name"], accept.id)
-        return _changed(parts, changed)
+        return _changed(parts, changed, f"has accepted {accept.id}", request)
 
     @router.post("/api/v1/set-up/undo", response_model=set_up_schema.Changed, responses=_ERRORS)
     def post_undo(request: Request) -> Response:
         """Put back the calibration before the last change, without a restart."""
         with _refusals():
             changed = set_up.undo()
-        _log.info("%r has undone the last calibration", request.scope["client_name"])
-        return _changed(parts, changed)
+        return _changed(parts, changed, "has undone the last calibration", request)
 
     @router.post("/api/v1/set-up/reload", response_model=set_up_schema.Changed, responses=_ERRORS)
     def post_reload(request: Request) -> Response:
         """Read the calibration file again and bring it into force, without a restart."""
         with _refusals():
             changed = set_up.reload()
-        _log.info("%r had the calibration file read again", request.scope["client_name"])
-        return _changed(parts, changed)
+        return _changed(parts, changed, "had the calibration file read again", request)
 
     return router
 
@@ -153,7 +150,13 @@ def _answer(proposal: Proposal) -> Response:
     return as_json({"v": API_VERSION, **describe_proposal(proposal)})
 
 
-def _changed(parts: Parts, changed: list[str]) -> Response:
+def _changed(parts: Parts, changed: list[str], what: str, request: Request) -> Response:
+    """Note who has done what to the poses, and answer with what is in force now."""
+    who = request.scope["client_name"]
+    text = f"{who!r} {what}: {', '.join(changed) or 'no pose'} changed"
+    _log.info("%s", text)
+    if changed:
+        parts.journal.configuration("poses", who, text, {"changed": changed})
     described = {"changed": changed, "calibration": parts.set_up.describe(), "arrays": _arrays(parts)}
     return as_json({"v": API_VERSION, **described})
 

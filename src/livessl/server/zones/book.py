@@ -12,7 +12,7 @@ from livessl.server.zones.shapes import ZoneMap
 from livessl.site.checks import zone_faults
 from livessl.site.models import Site
 from livessl.site.zone_models import Zone
-from livessl.site.zones_file import MAX_DRAWN, write_zones
+from livessl.site.zones_file import MAX_DRAWN, read_zones, write_zones
 
 SITE_FILE: Final = "site-file"
 DRAWN: Final = "drawn"
@@ -98,6 +98,25 @@ class ZoneBook:
                 raise ZoneRefusedError(f"zone {name!r}: rule {users[0]!r} needs it; take it out of the rule first")
             self._set({other: zone for other, zone in drawn.items() if other != name})
 
+    def take_over(self, site: Site) -> bool:
+        """Take over the zones of a site file that was read anew, and of its `zones_file`; return whether any differ.
+
+        Rooms and the name of `zones_file` must be those of before.
+
+        Raises
+        ------
+        ConfigError
+            If `zones_file` cannot be used; then nothing has changed.
+        """
+        with self._lock:  # the file of the drawn zones may have been written since the site was read
+            name = self._site.zones_file
+            drawn = {} if name is None else read_zones(self._site.file(name))
+            self._site = site
+            if self.current.drawn == drawn and self.current.zones == {**site.zones, **drawn}:
+                return False
+            self._show(ZoneMap(site, drawn))
+            return True
+
     def _changeable(self, name: str) -> Mapping[str, Zone]:
         """Return the drawn zones, if the zone of that name may be changed."""
         if name in self._site.zones:
@@ -119,8 +138,12 @@ class ZoneBook:
                 f"zones_file: {path} cannot be written: {error.strerror}; free space on its disk, or make its folder "
                 "writable"
             ) from error
-        self.current = ZoneMap(self._site, drawn)
-        _log.info("%d zones are in force, of which %d are drawn", len(self.current.zones), len(drawn))
+        self._show(ZoneMap(self._site, drawn))
+
+    def _show(self, zones: ZoneMap) -> None:
+        """Put zones in force, and publish them."""
+        self.current = zones
+        _log.info("%d zones are in force, of which %d are drawn", len(zones.zones), len(zones.drawn))
         self._publish({"kind": "zones", "by_name": self.describe()})
 
 

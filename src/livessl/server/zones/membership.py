@@ -234,7 +234,8 @@ class PreparedZones:
         first, last = first / off, (first + lengths[:, None]) / off
         triangles = (np.arctan(last) - np.arctan(first)) / (2.0 * np.pi)
         near = np.abs(off) < FAR
-        triangles[near] += scipy.special.owens_t(off[near], first[near]) - scipy.special.owens_t(off[near], last[near])
+        owen = scipy.special.owens_t
+        triangles[near] += owen(off[near], first[near]) - owen(off[near], last[near])
         masses: FloatArray = np.abs(np.add.reduceat((weights[owner] * triangles).sum(axis=1), _firsts(owner)))
         return masses  # the sums are negative where the corners run clockwise
 

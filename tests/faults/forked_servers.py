@@ -1,4 +1,4 @@
-"""Whole servers, one after the other: `python server_lives.py SITE_FILE` starts one for each line that it reads.
+"""Whole servers, one after the other: `python forked_servers.py SITE_FILE` starts one for each line that it reads.
 
 Each is forked from a process that has loaded everything, so that it begins at once. The process prints the number of
 each server's process, and its exit status when it has ended.

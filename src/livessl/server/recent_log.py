@@ -1,0 +1,58 @@
+"""Keeps the last log lines of a server in memory, for people who cannot reach its machine."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final, NamedTuple
+
+KEPT_LINES: Final = 1000
+"""Most lines that are kept: days of a server without trouble, and the beginning of most troubles."""
+
+MAX_LINE: Final = 2000
+"""Longest message that is kept, in characters, so that the lines take 10 MB at most."""
+
+
+class Line(NamedTuple):
+    """One line of the log: time in nanoseconds since the epoch, level in lower case, logger, and message."""
+
+    time_ns: int
+    level: str
+    logger: str
+    message: str
+
+
+class RecentLog(logging.Handler):
+    """Keeps the last lines of all loggers while it is attached; every thread may read them."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self._lines: deque[Line] = deque(maxlen=KEPT_LINES)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record."""
+        message = record.getMessage()
+        if record.exc_info and record.exc_info[0] is not None:
+            message += f"\n{logging.Formatter().formatException(record.exc_info)}"
+        time_ns = round(record.created * 1e6) * 1000
+        self._lines.append(Line(time_ns, record.levelname.lower(), record.name, message[:MAX_LINE]))
+
+    def lines(self, most: int = KEPT_LINES) -> list[Line]:
+        """Return the newest lines, the oldest of them first."""
+        self.acquire()  # a deque must not change while it is copied
+        try:
+            return list(self._lines)[-most:]
+        finally:
+            self.release()
+
+    @contextmanager
+    def attached(self) -> Iterator[None]:
+        """Keep lines during a context."""
+        root = logging.getLogger()
+        root.addHandler(self)
+        try:
+            yield
+        finally:
+            root.removeHandler(self)
