@@ -76,7 +76,7 @@ def test_both_clients_get_every_event_once(tmp_path: Path) -> None:
     site = write_site(tmp_path, {"server.events_db": "events.sqlite", "server.http.port": port})
     names = {f"small-{number}" for number in range(COUNT)}
     followers = [kind(f"http://127.0.0.1:{port}", names) for kind in (Follower, AsyncFollower)]
-    with server_lives(site) as begin:
+    with server_lives(site, followers=2) as begin:
         for follower in followers:
             follower.start()
         for life in range(KILLS):
