@@ -15,7 +15,7 @@ import yaml
 from alert_desk import PATIENT, alert_site
 from conftest import require
 from prometheus import MISSING, PROMTOOL, Prometheus, running_prometheus
-from server.api.scene_server import capture_scene
+from scene_server import capture_scene
 from small_site import running_server, wait_until
 
 DEPLOY = Path(__file__).parents[1] / "deploy"

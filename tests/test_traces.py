@@ -19,7 +19,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from alert_desk import PATIENT, alert_site
 from livessl.errors import UseError
 from livessl.traces import ENDPOINTS, Traces, event_subject, frame_subject, traced, traces_in_use, use_traces
-from server.api.scene_server import capture_scene
+from scene_server import capture_scene
 from small_site import running_server, wait_until
 
 STEPS = {"event", "reception", "fusion", "estimate", "publish", "alert", "alert.deliver"}

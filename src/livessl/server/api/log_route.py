@@ -8,10 +8,10 @@ from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
 
 from livessl.clock import utc_text
+from livessl.schema.values import UtcTime, Version
 from livessl.server.api.auth import LOG
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.api.schema import UtcTime, Version
 from livessl.server.parts import Parts
 from livessl.server.recent_log import KEPT_LINES
 

@@ -8,10 +8,10 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from pydantic import BaseModel, Field
 
 from livessl.errors import ConfigError, RunError
-from livessl.server.api.answers import errors
+from livessl.schema.answers import errors
+from livessl.schema.values import Version
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.api.schema import Version
 from livessl.server.parts import Parts
 
 _TEXTS = {409: "The site file cannot be used: `detail` has its faults, one a line, and nothing has changed."}
