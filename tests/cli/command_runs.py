@@ -12,7 +12,7 @@ from typing import Any
 from small_site import RATE_HZ
 
 COMMANDS = (
-    "demo", "serve", "events", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan",
+    "demo", "serve", "hub", "events", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan",
     "doctor", "calibrate", "support-bundle", "keys", "init", "check", "config", "devices", "levels",
 )  # fmt: skip
 

@@ -111,7 +111,7 @@ def test_demo_on_a_port_in_use_fails_at_once(capsys: pytest.CaptureFixture[str])
     assert "cannot be used: Address already in use" in capsys.readouterr().err
 
 
-TEXT_ONLY = {"serve", "capture", "record", "simulate", "keys", "calibrate", "init", "config"}
+TEXT_ONLY = {"serve", "hub", "capture", "record", "simulate", "keys", "calibrate", "init", "config"}
 """Commands that print no results; the actions of `keys`, `calibrate` and `config` that do are tested elsewhere."""
 
 

@@ -6,11 +6,13 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 from livessl.core.kernels import with_numba
 from livessl.server.compiling import machine_code_folder
-from small_site import wait_until
+from small_site import started, wait_until
 
 SCRIPT = """
 import logging, shutil, sys, threading
@@ -55,6 +57,18 @@ KernelLoader([sys.executable, "-c", "raise SystemExit('nothing is left to compil
 assert not [thread for thread in threading.enumerate() if thread.name == "compiling"]
 print("kernels of", kernels.NAME, "at once")
 """
+
+COMPILER = """
+from livessl.server import compiling
+compiling.warm_up = lambda: print("compiled" if input() == "done" else "interrupted")
+compiling.main()
+"""
+
+
+def compiler(tmp_path: Path) -> AbstractContextManager[subprocess.Popen[str]]:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    return started(sys.executable, "-c", COMPILER, env=environment, **pipes)
 
 
 def test_compiler_of_a_server_that_is_killed_ends_with_it(tmp_path: Path) -> None:
@@ -120,3 +134,21 @@ def test_kernels_that_were_compiled_before_are_loaded_at_once(tmp_path: Path) ->
     said = run(AGAIN, tmp_path, str(machine_code_folder(with_numba)))
     assert "compiling" not in said
     assert "kernels of numba at once" in said
+
+
+def test_two_compilers_do_the_work_once(tmp_path: Path) -> None:
+    """As when a server was killed while its compiler ran, and is started again."""
+
+    def begun() -> bool:
+        return any(f" {first.pid} " in line for line in locks())
+
+    def locks() -> list[str]:
+        return Path("/proc/locks").read_text(encoding="ascii").splitlines()
+
+    with compiler(tmp_path) as first:
+        wait_until(begun, "the first compiler")
+        with compiler(tmp_path) as second:
+            wait_until(lambda: any("->" in line and f" {second.pid} " in line for line in locks()), "the second one")
+            assert first.communicate("done\n")[0] == "compiled\n"
+            assert second.communicate()[0] == ""
+            assert (first.returncode, second.returncode) == (0, 0)

@@ -25,6 +25,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.event_retention import delete_old_events
 from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.journal import Journal, also
 from livessl.server.latency import Latency
@@ -98,6 +99,11 @@ def assemble(
         See `Receiver`, `Alerts` and `Clips`.
     """
 
+    def publish_to_all(message: JsonObject) -> None:
+        if hub_link is not None and not site_time.is_replay:
+            hub_link.take(message)
+        publish(message)
+
     def publish_event(event: JsonObject) -> None:
         sinks.take(event)
         if on_event is not None:
@@ -111,6 +117,9 @@ def assemble(
         site_time = SiteTime(clock)
         journal = Journal(store, clock)
         journal.site(site)
+        hub_link = None
+        if store.outbox is not None:
+            hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
         zone_book = ZoneBook(site, publish)
 
         def zones() -> ZoneMap:
@@ -122,7 +131,7 @@ def assemble(
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
         found = traces_in_use()
         traces = None if found is None else EventTraces(found)
-        publish_arrays, publish_alert = also(journal.arrays, publish), also(journal.alert, publish)
+        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(journal.alert, publish_to_all)
         array_states = ArrayStates(
             site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
@@ -144,7 +153,7 @@ def assemble(
         tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
         event_log = EventLog(site.site, clock, store, latency, publish_event, alerts, traces)
         publisher = Publisher(
-            publish, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
+            publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
         )
         sound = (listeners,) if clips is None else (listeners, clips)
         engine = Engine(
@@ -184,6 +193,7 @@ def assemble(
         journal=journal,
         presence=presence,
         floor_plan=floor_plan,
+        hub_link=hub_link,
         reloader=reloader,
         recent_log=RecentLog(),
     )
@@ -232,7 +242,7 @@ class Server:
         read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
         self._access = Access(None if http.tokens is None else site.file(http.tokens))
-        certificate = certificate_of(site)
+        certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
         self._kernel_loader = KernelLoader()
@@ -252,7 +262,7 @@ class Server:
             fanout = Fanout(first_seq)
             self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
-        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), site, certificate)
+        self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
         self.endpoint = self.parts.receiver.endpoint
         """The address that nodes connect to."""
@@ -279,6 +289,8 @@ class Server:
             if self.parts.clips is not None:
                 self.parts.clips.stop()
             self.parts.receiver.stop()
+            if self.parts.hub_link is not None:
+                self.parts.hub_link.stop()
             self.parts.store.close()
             self.parts.sinks.close()
             self._listener.close()
@@ -302,6 +314,8 @@ class Server:
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
+        if self.parts.hub_link is not None:
+            self.parts.hub_link.start()
         self.parts.reloader.start()
         if not self._stepped:
             self.parts.store.backlog.start()

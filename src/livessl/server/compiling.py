@@ -5,6 +5,7 @@ python -m livessl.server.compiling      # compile now, for example while install
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import logging
 import os
@@ -112,15 +113,21 @@ def _stamp(compiled: ModuleType) -> Path | None:
 
 
 def main() -> None:
-    """Compile the kernels and note that it was done."""
+    """Compile the kernels and note that it was done; what another process compiles already is waited for."""
     if UNTIL_STDIN_ENDS in sys.argv[1:]:
         threading.Thread(target=_end_with_stdin, name="parent", daemon=True).start()
     os.nice(NICENESS)
     stamp = _stamp(kernels.in_use)
-    warm_up()
-    if stamp is not None:
-        stamp.parent.mkdir(parents=True, exist_ok=True)
-        stamp.touch()
+    if stamp is None:
+        warm_up()
+        return
+    stamp.parent.mkdir(parents=True, exist_ok=True)
+    # a server that was killed leaves its compiler behind, and the next one begins its own
+    with (stamp.parent / "compiling.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not stamp.exists():
+            warm_up()
+            stamp.touch()
 
 
 def _end_with_stdin() -> None:

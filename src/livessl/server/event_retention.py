@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from typing import Final
+from typing import Final, Protocol
 
 from livessl.clock import Clock
-from livessl.server.store import Store, StoreError
+from livessl.server.store import StoreError
 
 EXPIRE_S: Final = 600.0
 """Interval, in seconds, at which old events are deleted."""
@@ -18,7 +18,15 @@ DAY_NS: Final = 86_400_000_000_000
 _log = logging.getLogger(__name__)
 
 
-async def delete_old_events(store: Store, clock: Clock, retention_days: float | None) -> None:
+class Expiring(Protocol):
+    """Something that deletes what is old."""
+
+    def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
+        """Delete what began before a time, or a part of it if `end` is set meanwhile; return how many events it was."""
+        ...
+
+
+async def delete_old_events(store: Expiring, clock: Clock, retention_days: float | None) -> None:
     """Delete events older than `retention_days` every `EXPIRE_S`, until cancelled; return at once if it is None."""
     end = threading.Event()
     try:

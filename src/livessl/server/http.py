@@ -6,9 +6,10 @@ import asyncio
 import logging
 import socket
 import ssl
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import uvicorn
 from fastapi import FastAPI
@@ -21,7 +22,6 @@ from livessl.errors import ConfigError, Fault
 from livessl.server.connections import LimitedListener, TimedRequests
 from livessl.server.receiver import BindError, address_cure
 from livessl.site.addresses import in_url
-from livessl.site.models import Site
 from livessl.site.server_models import HttpConfig
 
 SHUTDOWN_S: Final = 2
@@ -118,32 +118,45 @@ def url_of(listener: socket.socket, *, tls: bool) -> str:
     return f"{'https' if tls else 'http'}://{in_url(host)}:{port}"
 
 
-def certificate_of(site: Site) -> Path | None:
-    """Return the site's certificate file, None if it serves without TLS.
+class Certificate(NamedTuple):
+    """Files of a certificate and of its private key."""
+
+    certificate: Path
+    private_key: Path
+
+
+def certificate_of(http: HttpConfig, file: Callable[[str], Path], where: str = "server.http") -> Certificate | None:
+    """Return the certificate of an HTTP server, None if it serves without TLS.
 
     The certificate is loaded here because uvicorn would find a fault only when it is too late.
+
+    Parameters
+    ----------
+    http : HttpConfig
+    file : callable
+        Returns the path of a file that the configuration names.
+    where : str
+        Place of the configuration, for errors.
 
     Raises
     ------
     ConfigError
         If certificate and private key cannot be read or do not match.
     """
-    http: HttpConfig = site.server.http
     if http.certificate is None or http.private_key is None:
         return None
-    certificate, key = site.file(http.certificate), site.file(http.private_key)
+    certificate, key = file(http.certificate), file(http.private_key)
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
     except (OSError, ssl.SSLError) as error:
         reason = getattr(error, "reason", None) or error.strerror
         what = f"cannot use {certificate} with {key}: {reason}; name a PEM certificate and its key without a passphrase"
-        raise ConfigError([Fault("server.http.certificate", what)]) from error
-    return certificate
+        raise ConfigError([Fault(f"{where}.certificate", what)]) from error
+    return Certificate(certificate, key)
 
 
-def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicorn.Server:
+def uvicorn_server(app: FastAPI, certificate: Certificate | None) -> uvicorn.Server:
     """Return the server of an application, with limits on what clients may take of it."""
-    key = site.server.http.private_key
     return uvicorn.Server(
         uvicorn.Config(
             _Ended(app),
@@ -153,9 +166,9 @@ def uvicorn_server(app: FastAPI, site: Site, certificate: Path | None) -> uvicor
             http=TimedRequests,  # h11 is the implementation that limits the head of a request
             loop="asyncio",  # another loop would not accept connections by `LimitedListener.accept`
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
-            ssl_certfile=certificate,
+            ssl_certfile=None if certificate is None else certificate.certificate,
             ssl_ciphers=CIPHERS,
-            ssl_keyfile=None if key is None else site.file(key),
+            ssl_keyfile=None if certificate is None else certificate.private_key,
             limit_concurrency=MAX_CONNECTIONS + 1,  # it counts the asking connection, which the listener has admitted
             ws_max_size=MAX_INCOMING_BYTES,
             proxy_headers=False,  # the application reads them, by the site's rules

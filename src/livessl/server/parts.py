@@ -12,6 +12,7 @@ from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.fanout import Fanout
+from livessl.server.forwarding.link import HubLink
 from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
@@ -65,6 +66,7 @@ class Parts:
     journal: Journal
     presence: Presence
     floor_plan: FloorPicture | None
+    hub_link: HubLink | None
     reloader: Reloader
     recent_log: RecentLog
 
@@ -73,7 +75,7 @@ class Parts:
         """The error that has ended one of the threads, if any has ended."""
         parts = (
             *(self.engine, self.receiver, self.maps, self.set_up_watch, self.proposals),
-            *(self.alerts, self.clips, self.store.backlog, self.reloader),
+            *(self.alerts, self.clips, self.store.backlog, self.reloader, self.hub_link),
         )
         failures = (thread.failure for thread in parts if thread is not None)
         return next((failure for failure in failures if failure is not None), None)

@@ -15,6 +15,8 @@ from typing import Any, Final, NamedTuple
 import orjson
 from sqlalchemy import func, select
 
+from livessl.server.forwarding import tables as forwarding
+from livessl.server.forwarding.outbox import Outbox, Outgoing
 from livessl.server.history import records
 from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import CURE, Database, StoreError
@@ -83,6 +85,8 @@ class Store:
     ----------
     place : Path, str or None
         The SQLite file, or the URL of a PostgreSQL database; None keeps the newest `MAX_EVENTS_IN_MEMORY` in memory.
+    forwards : bool
+        Whether it has the tables of `livessl.server.forwarding`, and puts final events into the outbox of a hub.
 
     Raises
     ------
@@ -92,13 +96,15 @@ class Store:
         If the driver of PostgreSQL is not installed.
     """
 
-    def __init__(self, place: Path | str | None = None) -> None:
+    def __init__(self, place: Path | str | None = None, *, forwards: bool = False) -> None:
         self._bounded = place is None
         self._life = secrets.randbits(63) if self._bounded else DURABLE
         self._count: int | None = None
         self._counting = threading.Lock()
         self._when_ready: deque[Callable[[], None]] = deque()
-        self._database = Database(place)
+        self._database = Database(place, (forwarding.prepare,) if forwards else ())
+        self.outbox = Outbox(self._database) if forwards else None
+        """Messages for the hub; None for a site without one."""
         self.backlog = Backlog(self.prepare)
         """Events that wait to be stored."""
         try:
@@ -113,7 +119,12 @@ class Store:
     @classmethod
     def of(cls, site: Site) -> Store:
         """Return the store that a site file names."""
-        return cls(history_place(site))
+        return cls(history_place(site), forwards=site.server.hub is not None)
+
+    @property
+    def database(self) -> Database:
+        """The database, for what else is kept in it."""
+        return self._database
 
     @property
     def problem(self) -> str | None:
@@ -184,9 +195,16 @@ class Store:
             change += records.put_events(connection, events)
             if self._bounded:
                 change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
-            records.end_early(connection, frame_index)
+            kept = records.end_early(connection, frame_index)
             records.put_progress(connection, site, frame_index, clocks)
+            if self.outbox is not None:
+                known = {event["id"] for event, _ in events}
+                final = [*events, *((event, time_ns) for event, time_ns in kept if event["id"] not in known)]
+                final.sort(key=lambda each: each[1])
+                self.outbox.put_with(connection, [Outgoing("event", time_ns, event) for event, time_ns in final])
         self._counted(change)
+        if self.outbox is not None:
+            self.outbox.wake()
 
     def finalized(self, site: str) -> Finalized:
         """Return how far the final pass of the site has come."""
@@ -231,6 +249,8 @@ class Store:
             with self._database.writing("delete old events") as connection:
                 some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
                 others = remove_older_entries(connection, before_ns, EXPIRED_AT_ONCE)
+                if self.outbox is not None:
+                    self.outbox.expire_with(connection, before_ns)
             self._counted(-some)
             gone += some
             if max(some, others) < EXPIRED_AT_ONCE:

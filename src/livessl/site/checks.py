@@ -68,16 +68,7 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
     yield from alert_faults(site)
-    if site.privacy == "positions-only" and site.server.listen:
-        yield (
-            ("server", "listen"),
-            "with privacy: positions-only nobody may listen; remove it, or set privacy: recording",
-        )
-    if site.privacy == "positions-only" and site.server.clips is not None:
-        yield (
-            ("server", "clips"),
-            "with privacy: positions-only no sound may be stored on a disk; remove it, or set privacy: recording",
-        )
+    yield from _server_faults(site)
 
 
 def zone_faults(site: Site, name: str, zone: Zone) -> Iterator[Finding]:
@@ -98,6 +89,25 @@ def warnings_of(site: Site) -> tuple[str, ...]:
         *_privacy_gaps(site),
         *alert_warnings(site),
     )
+
+
+def _server_faults(site: Site) -> Iterator[Finding]:
+    if site.server.hub is not None and site.server.events_db is None:
+        yield (
+            ("server", "hub"),
+            "expected server.events_db as well: events wait there while the hub cannot be reached; "
+            "set server.events_db: events.sqlite",
+        )
+    if site.privacy == "positions-only" and site.server.listen:
+        yield (
+            ("server", "listen"),
+            "with privacy: positions-only nobody may listen; remove it, or set privacy: recording",
+        )
+    if site.privacy == "positions-only" and site.server.clips is not None:
+        yield (
+            ("server", "clips"),
+            "with privacy: positions-only no sound may be stored on a disk; remove it, or set privacy: recording",
+        )
 
 
 def unprotected_addresses(site: Site) -> list[Fault]:

@@ -16,6 +16,7 @@ from livessl.site.addresses import (
 )
 from livessl.site.fields import FileName, Model, Positive
 from livessl.site.history_place import check_history_place
+from livessl.site.hub_models import HubLinkConfig
 from livessl.site.sink_types import check_sink_type
 
 
@@ -95,6 +96,7 @@ class ServerConfig(Model):
     sinks: tuple[SinkConfig, ...] = ()
     clips: ClipsConfig | None = None
     listen: bool = False
+    hub: HubLinkConfig | None = None
 
     @field_validator("bind")
     @classmethod

@@ -115,6 +115,9 @@ class Adjusted:
         Where the sounds were, metres.
     misfits_s : (S,) float64
         Root mean square of what remains of each sound's delays, seconds.
+    microphones : mapping of array to (K, 3) float64
+        Where the microphones are, with the errors of their places within the arrays as far as the sounds say these,
+        metres.
     """
 
     poses: Mapping[str, Pose]
@@ -122,6 +125,7 @@ class Adjusted:
     c_std_m_s: float
     places_m: FloatArray
     misfits_s: FloatArray
+    microphones: Microphones
 
 
 def adjust(
@@ -244,7 +248,8 @@ class _Problem:
         """The unknowns as a result, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
-        off = contradictions_s(self._moved(poses, unknowns), self._delays, places_m, speed_m_s)
+        at_m = self._moved(poses, unknowns)
+        off = contradictions_s(at_m, self._delays, places_m, speed_m_s)
         count = sum(np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in self._delays.values())
         misfits_s = np.sqrt((off**2).sum(axis=1) / np.maximum(count, 1))
         found = {}
@@ -254,7 +259,7 @@ class _Problem:
             found[name] = Pose(shift_m, np.degrees(turn), covariance[own, own])
         at = len(self._free) * _UNKNOWNS
         c_std_m_s = float(np.sqrt(covariance[at, at])) if self._freedom.speed_std_m_s > 0.0 else 0.0
-        return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s)
+        return Adjusted(found, speed_m_s, c_std_m_s, places_m, misfits_s, at_m)
 
     def _unpack(self, unknowns: FloatArray) -> tuple[dict[str, tuple[FloatArray, FloatArray]], float, FloatArray]:
         poses, at = {}, 0

@@ -100,7 +100,7 @@ def refine(
     std_s = _delay_std_s(first.misfits_s[used], kept, len(free))
     times = None if arrivals is None else arrivals.of_sounds(np.flatnonzero(shared)[used])
     last = _adjusted(start, kept, search, replace(freedom, microphone_std_m=MICROPHONE_STD_M), std_s, times)
-    placed = {name: last.poses[name].applied(at_m) if name in free else at_m for name, at_m in start.items()}
+    placed = {name: last.microphones[name] if name in free else at_m for name, at_m in start.items()}
     before_s = search.fit(microphones, kept).misfit_s
     after_s = PlaceSearch(bounds_m, last.c_m_s).fit(placed, kept).misfit_s
     poses = {

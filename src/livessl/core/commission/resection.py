@@ -162,7 +162,8 @@ def measure_poses(
     """Measure the poses of all arrays that received enough of the sounds, and the speed of sound.
 
     Each array is measured by itself first. Then all are adjusted together: they share the errors of the places, and the
-    speed of sound.
+    speed of sound. The places of the microphones within their arrays are measured as well; their errors would turn the
+    directions of all sounds.
 
     Parameters
     ----------
@@ -190,9 +191,7 @@ def measure_poses(
     adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
     known = KnownPlaces(places_m, adjusted.c_m_s)
     poses = {
-        name: _against_filed(
-            microphones[name], adjusted.poses[name].applied(rough[name]), adjusted.poses[name], measured, known
-        )
+        name: _against_filed(microphones[name], adjusted.microphones[name], adjusted.poses[name], measured, known)
         for name, measured in enough.items()
     }
     return MeasuredSetUp(poses, adjusted.c_m_s, adjusted.c_std_m_s, adjusted.places_m, _misfit_s(adjusted))
@@ -206,9 +205,9 @@ def received(delays_s: FloatArray) -> BoolArray:
 def described_pose(
     filed_m: FloatArray, measured_m: FloatArray, pose: Pose, misfit_before_s: float, misfit_s: float
 ) -> MeasuredPose:
-    """Describe a measured pose (K, 3) against the filed one, metres; misfits are in seconds."""
+    """Describe measured microphones (K, 3) against the filed ones, metres; misfits are in seconds."""
     turn = turn_between(filed_m, measured_m)
-    covariance = without_spin(pose.covariance, measured_m)
+    covariance = without_spin(pose.covariance, turn.apply(filed_m - filed_m.mean(axis=0)))
     variance = np.maximum(np.diag(covariance), 0.0)
     return MeasuredPose(
         measured_m,

@@ -36,7 +36,7 @@ peak-to-RMS ratio."""
 _WHOLE_SEGMENT_FIT: Final = (-3.56, 10.0, 0.82)
 """The same as `_ONSET_FIT` for evidence that includes whole segments; fitted where onsets alone were not sure."""
 
-_BACKGROUND_FIT: Final = 28.6
+_BACKGROUND_FIT: Final = 36.6
 """Log-odds by which a background that explains the whole power at the position lowers the confidence; fitted by
 `livessl evaluate localizer --scenario noise --half development`."""
 

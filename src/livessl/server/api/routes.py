@@ -166,6 +166,8 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     if (unkept or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
+    if parts.hub_link is not None and parts.hub_link.problem is not None:
+        problems.append(parts.hub_link.problem)
     if problems and status == "ok":
         status = "degraded"
     reasons += problems

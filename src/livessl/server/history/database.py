@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +21,7 @@ from sqlalchemy.pool import QueuePool
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault, RunError
 from livessl.server.history.tables import metadata
+from livessl.server.history.turns import Turns
 
 HEAD: Final = "0003"
 """The newest revision in `migrations/`; a database that has it needs no Alembic."""
@@ -76,6 +76,8 @@ class Database:
     ----------
     place : Path, str or None
         An SQLite file, the URL of a PostgreSQL database, or None for SQLite in memory.
+    further : sequence of callable
+        Each makes or migrates other tables that belong into this database, in the transaction of `prepare`.
 
     Raises
     ------
@@ -85,25 +87,28 @@ class Database:
         If the driver of PostgreSQL is not installed.
     """
 
-    def __init__(self, place: Path | str | None) -> None:
+    def __init__(self, place: Path | str | None, further: Sequence[Callable[[Connection], None]] = ()) -> None:
+        self._further = further
         self.is_remote = isinstance(place, str)
         self.cure = CURE_OF_SERVER if self.is_remote else CURE
         """The cure of a database that cannot be written."""
         self._preparing = threading.Lock()
-        self._turns = _Turns()
+        self._turns = Turns()
         self._is_prepared = False
         self._problem = ""
         if isinstance(place, str):
             self.name = make_url(place).render_as_string(hide_password=True)
-            self._writing = _postgresql(place, readers=0)
+            self._writing: Engine = _postgresql(place, readers=0)
             self._reading = _postgresql(place, readers=READERS)
+            self._sessions: Engine = _postgresql(place, readers=0).execution_options(isolation_level="AUTOCOMMIT")
         elif place is None:
             self.name = "memory"
-            self._writing = self._reading = _sqlite(":memory:", 1, writes=True)
+            self._writing = self._reading = self._sessions = _sqlite(":memory:", 1, writes=True)
         else:
             self.name = str(place)
             self._writing = _sqlite(str(place), 1, writes=True)
             self._reading = _sqlite(f"{place.resolve().as_uri()}?mode=ro", READERS, writes=False)
+            self._sessions = self._reading
         self._in_memory = place is None
 
     @property
@@ -135,6 +140,8 @@ class Database:
                         metadata.create_all(connection)
                     else:
                         _migrate(connection)
+                    for prepare in self._further:
+                        prepare(connection)
             except StoreError as error:
                 self._problem = str(error)
                 raise
@@ -194,6 +201,22 @@ class Database:
             cure = CURE_OF_SERVER if self.is_remote else UNLOCK
             raise StoreError(f"server.events_db: cannot read: {told(error)}; {cure}") from error
 
+    @contextmanager
+    def session(self) -> Iterator[Connection]:
+        """A connection of its own that keeps no transaction open, for locks that last as long as it does.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be reached.
+        """
+        self._check()
+        try:
+            with self._sessions.connect() as connection:
+                yield connection
+        except SQLAlchemyError as error:
+            raise StoreError(f"server.events_db: cannot use {self.name}: {told(error)}; {self.cure}") from error
+
     def erase(self) -> None:
         """Remove deleted rows from an SQLite file's journal; PostgreSQL's own vacuum does it there.
 
@@ -222,31 +245,7 @@ class Database:
         """Release the database."""
         self._reading.dispose()
         self._writing.dispose()
-
-
-class _Turns:
-    """A lock that goes to the thread that has waited longest: one that writes all the time keeps out no other."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._is_taken = False
-        self._waiting: deque[threading.Event] = deque()
-
-    def __enter__(self) -> None:
-        turn = threading.Event()
-        with self._lock:
-            if not self._is_taken:
-                self._is_taken = True
-                return
-            self._waiting.append(turn)
-        turn.wait()
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            if self._waiting:
-                self._waiting.popleft().set()  # the lock stays taken
-            else:
-                self._is_taken = False
+        self._sessions.dispose()
 
 
 def told(error: Exception) -> str:
@@ -263,8 +262,8 @@ def _took_too_long(error: SQLAlchemyError) -> bool:
     )
 
 
-def upgrade(connection: Connection) -> None:
-    """Apply all migrations that the database lacks, in the transaction of the connection.
+def upgrade(connection: Connection, migrations: Path = Path(__file__).parent / "migrations") -> None:
+    """Apply all migrations of a folder that the database lacks, in the transaction of the connection.
 
     Raises
     ------
@@ -276,7 +275,7 @@ def upgrade(connection: Connection) -> None:
     from alembic.util import CommandError
 
     config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.set_main_option("script_location", str(migrations))
     config.attributes["connection"] = connection
     try:
         command.upgrade(config, "head")

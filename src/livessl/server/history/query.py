@@ -65,6 +65,8 @@ class Query:
         Part of the event's id, status, reason, method, zones or arrays, in any case.
     excluded : bool or None
         Whether the event lies in an excluded zone.
+    site : str or None
+        Site that the event comes from, in the history of a hub.
     """
 
     since_ns: int | None = None
@@ -80,6 +82,7 @@ class Query:
     array: str | None = None
     text: str | None = None
     excluded: bool | None = None
+    site: str | None = None
 
 
 class Row(NamedTuple):

@@ -79,14 +79,22 @@ def put_early(connection: Connection, name: str) -> None:
     connection.execute(insert(early), {"id": name})
 
 
-def end_early(connection: Connection, frame_index: int) -> None:
-    """Let the early events before a frame index be final, and forget those that are gone."""
+def end_early(connection: Connection, frame_index: int) -> list[tuple[JsonObject, int]]:
+    """Let the early events before a frame index be final, and forget those that are gone.
+
+    Returns
+    -------
+    list of (JsonObject, int)
+        The events that are final now, each with its start in nanoseconds, oldest first.
+    """
     ids = early_ids(connection)
     if not ids:
-        return
+        return []
     later = select(events.c.id).where(events.c.id.in_(ids), events.c.time_ns >= frame_index * FRAME_NS)
     ended = set(ids) - set(connection.execute(later).scalars())
     connection.execute(delete(early).where(early.c.id.in_(ended)))
+    query = select(events.c.time_ns, events.c.body).where(events.c.id.in_(ended)).order_by(events.c.time_ns)
+    return [(orjson.loads(body), time_ns) for time_ns, body in connection.execute(query)]
 
 
 def early_ids(connection: Connection) -> list[str]:

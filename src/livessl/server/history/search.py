@@ -17,10 +17,10 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
     -------
     Select, FromClause
         The statement, and the table that has `time_ns` and `number` in the order of the index that is searched: with
-        a zone, an array or a flag that of the tags, else that of the events.
+        a zone, an array, a site or a flag that of the tags, else that of the events.
     """
     flag = "excluded" if query.excluded else None
-    named = (("flag", flag), ("zone", query.zone), ("array", query.array))
+    named = (("flag", flag), ("zone", query.zone), ("array", query.array), ("site", query.site))
     wanted = [(kind, name) for kind, name in named if name is not None]
     searched: FromClause = tags if wanted else events
     statement = select(*columns)

@@ -74,8 +74,8 @@ tags: Final = Table(
     PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
     sqlite_with_rowid=False,
 )
-"""Zones, arrays and flags of the events: rows of kind `zone`, `array` and `flag`, with what a search compares besides.
-The only flag is `excluded`."""
+"""Zones, arrays and flags of the events, and at a hub their sites: rows of kind `zone`, `array`, `flag` and `site`,
+with what a search compares besides. The only flag is `excluded`."""
 
 Index("event_tags_number", tags.c.number)
 

@@ -1,0 +1,30 @@
+"""`livessl hub`: run the hub of many sites, its API and its page."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+from typing import Any
+
+from livessl.cli.exits import OK
+from livessl.clock import SystemClock
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    parser.add_argument("--config", type=Path, required=True, help="the hub's file; docs/scaling.md describes it")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from livessl.federation.app import HubServer
+    from livessl.federation.config import load_hub
+
+    server = HubServer(load_hub(arguments.config), SystemClock())
+    logging.info("hub on %s", server.url)
+    try:
+        server.run()
+    except KeyboardInterrupt:
+        logging.info("stopped")
+    return OK

@@ -1,0 +1,220 @@
+"""REST of a hub: the sites, and events, arrays, tracks and alerts of all of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Annotated, Any, Final
+
+import orjson
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from livessl import __version__
+from livessl.core.types import Status
+from livessl.federation import schema
+from livessl.federation.archive import Archive
+from livessl.federation.intake import Intake
+from livessl.schema.answers import errors
+from livessl.server.api.auth import HEALTH
+from livessl.server.api.encode import API_VERSION, JsonObject
+from livessl.server.api.history_routes import Time, cached
+from livessl.server.api.metrics import CONTENT_TYPE
+from livessl.server.api.queries import instant, page_cursor, unprocessable
+from livessl.server.api.routes import as_json
+from livessl.server.history.database import StoreError
+from livessl.server.history.query import Query as EventQuery
+
+_NO_EVENT: Final = errors(404, 503, texts={404: "The site has no event of that id."})
+
+Site = Annotated[str | None, Query(max_length=64, description="only what comes from this site")]
+
+
+def hub_routes(name: str, archive: Archive, intake: Intake) -> APIRouter:
+    """All routes of the API but the metrics."""
+    router = APIRouter()
+    _add_state(router, name, archive, intake)
+    _add_events(router, archive)
+    _add_alerts(router, archive)
+    return router
+
+
+def _add_state(router: APIRouter, name: str, archive: Archive, intake: Intake) -> None:
+    @router.get("/api/v1/sites", tags=["state"], response_model=schema.Sites, responses=errors(503))
+    def get_sites() -> Response:
+        """All sites, with their condition and the time of their last contact."""
+        return as_json({"v": API_VERSION, "sites": archive.sites()})
+
+    @router.get("/api/v1/arrays", tags=["state"], response_model=schema.SiteArrays, responses=errors(503))
+    def get_arrays(site: Site = None) -> Response:
+        """The last change of each array's state."""
+        return as_json({"v": API_VERSION, "arrays": archive.arrays(site)})
+
+    @router.get("/api/v1/tracks", tags=["estimates"], response_model=schema.SiteTracks, responses=errors(503))
+    def get_tracks(site: Site = None) -> Response:
+        """The tracks that have begun and not ended, as they began."""
+        return as_json({"v": API_VERSION, "tracks": archive.tracks(site)})
+
+    @router.get(HEALTH, tags=["state"], response_model=schema.HubHealth | schema.HubHealthStatus)
+    def get_health(request: Request) -> Response:
+        """Condition of the hub; without a token the status alone."""
+        reasons = [] if intake.problem is None else [intake.problem]
+        conditions: dict[str, int] = {}
+        try:
+            conditions = dict(Counter(site["status"] for site in archive.sites()))
+        except StoreError as error:
+            reasons.append(str(error))
+        found: JsonObject = {"v": API_VERSION, "status": "degraded" if reasons else "ok"}
+        if request.scope["client_role"] is not None:
+            found |= {
+                "hub": name,
+                "version": __version__,
+                "takes_in": intake.has_turn,
+                "taken": intake.taken,
+                "rejected": intake.rejected,
+                "sites": conditions,
+                "reasons": reasons,
+            }
+        return as_json(found)
+
+
+def _filters() -> Callable[..., EventQuery]:
+    """The query parameters of searches: those of a site's history, and the site."""
+
+    def filters(
+        since: Annotated[Time | None, Query(description="only events that began then or later; RFC 3339")] = None,
+        until: Annotated[Time | None, Query(description="only events that began then or earlier; RFC 3339")] = None,
+        site: Site = None,
+        zone: Annotated[str | None, Query(description="only events inside a zone of this name")] = None,
+        status: Annotated[Status | None, Query(description="only events of this status")] = None,
+        min_confidence: Annotated[
+            float | None, Query(ge=0, le=1, description="only events of at least this confidence")
+        ] = None,
+        array: Annotated[
+            str | None, Query(description="only events that an array of this name detected or contributed to")
+        ] = None,
+    ) -> EventQuery:
+        for name, value in (("site", site), ("zone", zone), ("array", array)):
+            if value is not None and "\0" in value:
+                raise unprocessable(name, f"{name}: expected a text without NUL")
+        return EventQuery(
+            since_ns=instant("since", since),
+            until_ns=instant("until", until),
+            site=site,
+            zone=zone,
+            status=None if status is None else str(status),
+            min_confidence=min_confidence,
+            array=array,
+        )
+
+    return filters
+
+
+def _add_events(router: APIRouter, archive: Archive) -> None:
+    searched: Any = Depends(_filters())
+
+    @router.get("/api/v1/events", tags=["estimates"], response_model=schema.SiteEventPage, responses=errors(503))
+    def get_events(
+        request: Request,
+        query: EventQuery = searched,
+        limit: Annotated[int, Query(ge=1, le=1000, description="most events on a page")] = 50,
+        cursor: Annotated[
+            str | None, Query(description="`next_cursor` of a page, unchanged: the events after its last one")
+        ] = None,
+        after: Annotated[
+            str | None, Query(description="`previous_cursor` of a page, unchanged: the events before its first one")
+        ] = None,
+    ) -> Response:
+        """Final events of all sites, the latest start first."""
+        if cursor is not None and after is not None:
+            raise unprocessable("after", "after: expected cursor or after, got both; leave one out")
+        query = replace(query, limit=limit, before=page_cursor(cursor), after=page_cursor(after, "after"))
+        page = archive.store.page(query)
+        head = {
+            "v": API_VERSION,
+            "next_cursor": None if page.older is None else str(page.older),
+            "previous_cursor": None if page.newer is None else str(page.newer),
+        }
+        listed = ",".join(row.body for row in page.rows).encode()
+        return cached(request, orjson.dumps(head)[:-1] + b',"events":[' + listed + b"]}")
+
+    @router.get(
+        "/api/v1/sites/{site}/events/{event_id}",
+        tags=["estimates"],
+        response_model=schema.OneSiteEvent,
+        responses=_NO_EVENT,
+    )
+    def get_event(site: str, event_id: str, request: Request) -> Response:
+        """One event of a site."""
+        event = archive.event(site, event_id)
+        if event is None:
+            raise HTTPException(404, f"site {site!r} has no event {event_id!r}")
+        return cached(request, orjson.dumps({"v": API_VERSION, **event}))
+
+
+def _add_alerts(router: APIRouter, archive: Archive) -> None:
+    @router.get("/api/v1/alerts", tags=["alerts"], response_model=schema.SiteAlertPage, responses=errors(503))
+    def get_alerts(
+        site: Site = None,
+        limit: Annotated[int, Query(ge=1, le=1000, description="most alerts on a page")] = 50,
+        before: Annotated[int | None, Query(ge=0, lt=2**63, description="`next_before` of a page")] = None,
+    ) -> Response:
+        """Alerts of all sites, those that the hub received last first."""
+        found = archive.alerts(site, limit, before)
+        following = found[-1][0] if len(found) == limit else None
+        return as_json({"v": API_VERSION, "alerts": [alert for _, alert in found], "next_before": following})
+
+
+def metrics_route(archive: Archive, intake: Intake) -> APIRouter:
+    """`GET /metrics`."""
+    router, registry = APIRouter(), CollectorRegistry()
+    registry.register(_Metrics(archive, intake))
+
+    @router.get(
+        "/metrics",
+        tags=["state"],
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **errors(503)},
+    )
+    def get_metrics() -> Response:
+        """Metrics in the text format of Prometheus."""
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE)
+
+    return router
+
+
+class _Metrics(Collector):
+    """Counts and states of the hub and its sites."""
+
+    def __init__(self, archive: Archive, intake: Intake) -> None:
+        self._archive = archive
+        self._intake = intake
+
+    def describe(self) -> list[Metric]:
+        """Promise nothing, so that registering asks no database."""
+        return []
+
+    def collect(self) -> list[Metric]:
+        intake = self._intake
+        site_up = GaugeMetricFamily("livessl_site_up", "1 unless the site is away.", labels=["site"])
+        age = GaugeMetricFamily("livessl_site_age_seconds", "Seconds since the site's last contact.", labels=["site"])
+        waiting = GaugeMetricFamily("livessl_site_waiting", "Messages that waited at the site.", labels=["site"])
+        missing = CounterMetricFamily("livessl_site_missing", "Messages that never came.", labels=["site"])
+        for site in self._archive.sites():
+            labels = [site["site"]]
+            site_up.add_metric(labels, float(site["status"] != "away"))
+            age.add_metric(labels, site["age_s"])
+            waiting.add_metric(labels, site["waiting"])
+            missing.add_metric(labels, site["missing"])
+        return [
+            GaugeMetricFamily("livessl_hub_takes_in", "1 while this hub takes messages in.", float(intake.has_turn)),
+            CounterMetricFamily("livessl_hub_taken", "Messages taken in.", intake.taken),
+            CounterMetricFamily("livessl_hub_rejected", "Messages that could not be stored.", intake.rejected),
+            site_up,
+            age,
+            waiting,
+            missing,
+        ]

@@ -1,0 +1,336 @@
+"""The link of a site's server to a hub: a thread sends what waits in the outbox to a JetStream stream, in order.
+
+No other thread waits for it. It sends a window of messages at a time and goes on when the stream has acknowledged all
+of them. After a failure it sends again from the first one without an acknowledgement; ids prevent duplicates.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import orjson
+
+from livessl import __version__
+from livessl.clock import Clock, utc_ns, utc_text
+from livessl.server.api.encode import API_VERSION, JsonObject
+from livessl.server.forwarding.outbox import Outbox, Outgoing, Unsent
+from livessl.server.forwarding.stream import (
+    HEALTH,
+    MESSAGE_ID,
+    RECONNECT_S,
+    STREAM,
+    Place,
+    connect_options,
+    connected,
+    message_id,
+    nats_library,
+    subject,
+)
+from livessl.server.history.backlog import Backlog, Write
+from livessl.server.history.database import StoreError
+from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.js.api import PubAck
+
+WINDOW: Final = 500
+"""Most messages that are sent before the first of them is acknowledged: about 750 kB, 40 ms at 150 Mbit/s."""
+
+ACKNOWLEDGED_S: Final = 5.0
+"""Longest wait, in seconds, for the acknowledgement of a window."""
+
+RETRY_S: Final = 0.25
+"""Wait, in seconds, after a window was not acknowledged."""
+
+REST_S: Final = 1.0
+"""Wait, in seconds, after the outbox could not be read or written."""
+
+REPORT_S: Final = 5.0
+"""Interval, in seconds, at which a site reports on itself; also the longest wait before the outbox is read again."""
+
+STOP_S: Final = 3.0
+"""Longest wait, in seconds, for the thread when the server stops."""
+
+PLACE: Final = "server.hub"
+
+_log = logging.getLogger(__name__)
+
+
+class HubLink:
+    """Forwards results to the hub.
+
+    Every thread may call `take`; messages of replays are to be kept from it.
+
+    Parameters
+    ----------
+    site : Site
+        Has `server.hub`.
+    clock : Clock
+    outbox : Outbox
+    backlog : Backlog
+        Writes into the outbox, in order with the events, without anyone waiting for it.
+    arrays : callable
+        Returns the states of the arrays as `GET arrays` does.
+
+    Raises
+    ------
+    ConfigError
+        If nats-py is not installed, or a file of `server.hub` cannot be used.
+    """
+
+    def __init__(
+        self, site: Site, clock: Clock, outbox: Outbox, backlog: Backlog, arrays: Callable[[], list[JsonObject]]
+    ) -> None:
+        config = site.server.hub
+        assert config is not None
+        self._nats = nats_library(PLACE)
+        self._options = connect_options(config, site.file, PLACE) | {"name": f"livessl {site.site}"}
+        self._site = site.site
+        self._location_deg = config.location_deg
+        self._clock = clock
+        self._outbox = outbox
+        self._backlog = backlog
+        self._arrays = arrays
+        self._states: dict[str, tuple[str, str | None]] = {}
+        self._sending = threading.Lock()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._news, self._end = asyncio.Event(), asyncio.Event()
+        self._problem: str | None = "not connected yet"
+        self._complaint: str | None = None  # what NATS has said since the last window was sent
+        self.sent = 0
+        """Messages that the stream has acknowledged since the start."""
+        self.waiting = 0
+        """Messages that wait in the outbox, as of the last look at it."""
+        self.failure: BaseException | None = None
+        """The error that has ended the thread, if one has."""
+
+    @property
+    def problem(self) -> str | None:
+        """Why messages wait, as a sentence for the reasons of `health`; None while they are sent."""
+        if self._problem is None:
+            return None
+        return f"{PLACE}: {self._problem}; {self.waiting} messages wait for the hub"
+
+    def take(self, message: JsonObject) -> None:
+        """Take in a message for subscribers; what a hub needs of it is put into the outbox.
+
+        Of tracks these are the beginning and the end, of arrays the changes of their states. Final events come to the
+        outbox by the store.
+        """
+        match message["kind"]:
+            case "alert":
+                self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message)])
+            case "track" if message["state"] != "update" and message["time_utc"] is not None:
+                self._put([Outgoing("track", utc_ns(message["time_utc"]), message)])
+            case "arrays":
+                self._take_arrays(message)
+
+    def start(self) -> None:
+        """Begin to send."""
+        now_ns = self._clock.now_ns()
+        self._put([Outgoing("start", now_ns, {"kind": "start", "time_utc": utc_text(now_ns), "version": __version__})])
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, args=(self._loop,), name="hub", daemon=True)
+        self._thread.start()
+        self._outbox.on_put(partial(self._call, self._news.set))
+
+    def stop(self) -> None:
+        """Stop; what waits is sent after the next start."""
+        if self._thread is not None:
+            self._call(self._end.set)
+            self._thread.join(timeout=STOP_S)
+
+    def _take_arrays(self, message: JsonObject) -> None:
+        """Put the arrays whose state or its reason has changed into the outbox."""
+        changed = []
+        with self._sending:
+            for array in message["arrays"]:
+                state = array["state"], array["reason"]
+                if self._states.get(array["name"]) != state:
+                    self._states[array["name"]] = state
+                    changed.append(array)
+        if changed:
+            time_ns = utc_ns(message["now_utc"])
+            fields = ("name", "state", "reason", "node", "enabled")
+            self._put(
+                [
+                    Outgoing(
+                        "array",
+                        time_ns,
+                        {"kind": "array", "time_utc": message["now_utc"], **{name: array[name] for name in fields}},
+                    )
+                    for array in changed
+                ]
+            )
+
+    def _put(self, messages: Sequence[Outgoing]) -> None:
+        self._backlog.put(Write(partial(self._outbox.put, messages), 0, is_final=False), self._clock.monotonic_ns())
+
+    # --- the thread
+
+    def _run(self, loop: asyncio.AbstractEventLoop) -> None:
+        try:
+            loop.run_until_complete(self._work())
+        except BaseException as error:
+            self.failure = error
+            _log.exception("the thread of the link to the hub has failed; the server ends")
+            raise
+        finally:
+            loop.close()
+
+    def _call(self, work: Callable[[], None]) -> None:
+        """Have something done on the thread's loop, if it runs."""
+        loop = self._loop
+        if loop is not None:
+            with suppress(RuntimeError):  # it has just been closed
+                loop.call_soon_threadsafe(work)
+
+    async def _work(self) -> None:
+        """Send until `stop`."""
+        sending, ending = asyncio.create_task(self._stay_connected()), asyncio.create_task(self._end.wait())
+        try:
+            done, _ = await asyncio.wait((sending, ending), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (sending, ending):
+                task.cancel()
+            await asyncio.gather(sending, ending, return_exceptions=True)
+        if sending in done:
+            sending.result()  # raises the error that ended it
+
+    async def _stay_connected(self) -> None:
+        """Connect, send as long as the connection lasts, and connect again, until cancelled."""
+        lost = asyncio.Event()
+
+        async def failed(error: Exception) -> None:
+            self._complaint = _told(error)
+            self._note(self._complaint)
+
+        async def end() -> None:
+            lost.set()
+            self._news.set()
+
+        while True:
+            lost.clear()
+            try:
+                async with connected(self._nats, self._options, failed, end) as client:
+                    await self._send_while_connected(client, lost)
+            except (self._nats.errors.Error, OSError, TimeoutError) as error:
+                self._note(_told(error))
+            await asyncio.sleep(RECONNECT_S)
+
+    async def _send_while_connected(self, client: Client, lost: asyncio.Event) -> None:
+        reporting = asyncio.create_task(self._report(client))
+        try:
+            await self._send_all(client, lost)
+        finally:
+            reporting.cancel()
+            await asyncio.gather(reporting, return_exceptions=True)
+
+    async def _send_all(self, client: Client, lost: asyncio.Event) -> None:
+        """Send what waits and what comes, until the connection is lost."""
+        while not lost.is_set():
+            self._news.clear()
+            wait_s = REPORT_S
+            try:
+                head = await asyncio.to_thread(self._outbox.head)
+                window = await asyncio.to_thread(self._outbox.unsent, WINDOW)
+                self.waiting = head.last - head.acknowledged if window else 0
+                if window:
+                    count = await self._send(client, head.outbox, window, lost)
+                    if count:
+                        await asyncio.to_thread(self._outbox.acknowledge, window[count - 1].number)
+                        self.sent += count
+                    if count == len(window):
+                        self._note(None)
+                        continue
+                    wait_s = RETRY_S
+                elif not lost.is_set():
+                    self._note(None)
+            except StoreError as error:
+                self._note(str(error))
+                wait_s = REST_S
+            with suppress(TimeoutError):
+                async with asyncio.timeout(wait_s):
+                    await self._news.wait()
+
+    async def _send(self, client: Client, outbox: str, window: Sequence[Unsent], lost: asyncio.Event) -> int:
+        """Send messages; return how many of the first ones the stream has acknowledged without a gap."""
+        stream = client.jetstream()
+        waiting: list[asyncio.Future[PubAck]] = []
+        losing = asyncio.create_task(lost.wait())
+        self._complaint = None
+        try:
+            for message in window:
+                headers = {MESSAGE_ID: message_id(Place(outbox, message.number)), "Nats-Expected-Stream": STREAM}
+                address = subject(self._site, message.kind)
+                waiting.append(await stream.publish_async(address, message.body.encode(), headers=headers))
+            done = asyncio.gather(*waiting, return_exceptions=True)
+            await asyncio.wait((done, losing), timeout=ACKNOWLEDGED_S, return_when=asyncio.FIRST_COMPLETED)
+        except self._nats.errors.Error as error:
+            self._note(_told(error))
+        finally:
+            losing.cancel()
+        count = next((place for place, each in enumerate(waiting) if not _is_acknowledged(each)), len(waiting))
+        if count < len(waiting):
+            refusal = _error_of(waiting[count])
+            unknown = self._complaint or "the stream did not acknowledge a message in time"
+            self._note(unknown if refusal is None else _told(refusal))
+        for each in waiting:
+            each.cancel()
+        return count
+
+    async def _report(self, client: Client) -> None:
+        """Publish a report of the site on itself at every `REPORT_S`, until cancelled; none is kept for later."""
+        while True:
+            with suppress(self._nats.errors.Error):
+                await client.publish(subject(self._site, HEALTH), orjson.dumps(self._described()))
+            await asyncio.sleep(REPORT_S)
+
+    def _described(self) -> JsonObject:
+        return {
+            "v": API_VERSION,
+            "kind": HEALTH,
+            "site": self._site,
+            "version": __version__,
+            "now_utc": utc_text(self._clock.now_ns()),
+            "waiting": self.waiting,
+            "location_deg": self._location_deg,
+            "arrays": {array["name"]: array["state"] for array in self._arrays()},
+        }
+
+    def _note(self, problem: str | None) -> None:
+        """Remember why messages wait, and log it if that is news."""
+        if problem == self._problem:
+            return
+        if problem is None:
+            _log.info("%s: the hub's stream takes messages", PLACE)
+        else:
+            _log.warning("%s: %s; messages wait in the database, and are sent later", PLACE, problem)
+        self._problem = problem
+
+
+def _is_acknowledged(sent: asyncio.Future[PubAck]) -> bool:
+    return sent.done() and not sent.cancelled() and sent.exception() is None
+
+
+def _error_of(sent: asyncio.Future[PubAck]) -> BaseException | None:
+    return sent.exception() if sent.done() and not sent.cancelled() else None
+
+
+def _told(error: BaseException) -> str:
+    """Return what an error of NATS means, with its cure where that is known."""
+    match type(error).__name__:
+        case "NoStreamResponseError" | "NoRespondersError":
+            return f"no stream {STREAM!r} takes this site's messages; start `livessl hub`, which makes it"
+        case "AuthorizationError":
+            return "NATS refuses the user or password; correct server.hub.user, password or credentials"
+        case _:
+            return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

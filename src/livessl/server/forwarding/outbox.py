@@ -1,0 +1,123 @@
+"""The outbox: messages for the hub, in order, in the database of the history, until the stream has acknowledged them.
+
+What a final pass stores and what it sends are written in one transaction, so neither exists without the other.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+import orjson
+from sqlalchemy import Connection, delete, insert, select, update
+
+from livessl.server.forwarding.tables import outbox, outbox_head
+from livessl.server.history.database import Database
+from livessl.server.history.query import JsonObject
+
+MAX_UNSENT: Final = 2_000_000
+"""Most messages that wait, about 3 GB: three weeks of a site with 100 000 events a day. Beyond it the oldest are given
+up; their numbers are missing at the hub, which counts them."""
+
+
+class Outgoing(NamedTuple):
+    """A message for the hub: its kind, its site time in nanoseconds, and its JSON."""
+
+    kind: str
+    time_ns: int
+    message: JsonObject
+
+
+class Unsent(NamedTuple):
+    """A message that waits, with its number, and its JSON as text."""
+
+    number: int
+    kind: str
+    body: str
+
+
+class Head(NamedTuple):
+    """The name of an outbox, and the numbers of its last message and of the last acknowledged one."""
+
+    outbox: str
+    last: int
+    acknowledged: int
+
+
+class Outbox:
+    """The outbox in a database; every thread may call it.
+
+    Every method but `wake` raises `StoreError` if the database cannot be used.
+
+    Parameters
+    ----------
+    database : Database
+        Has the tables of `livessl.server.forwarding.tables`.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._on_put: Callable[[], None] | None = None
+
+    def on_put(self, call: Callable[[], None]) -> None:
+        """Have something called after messages were put, on any thread."""
+        self._on_put = call
+
+    def wake(self) -> None:
+        """Report that the transaction of `put_with` has ended."""
+        if self._on_put is not None:
+            self._on_put()
+
+    def put(self, messages: Sequence[Outgoing]) -> None:
+        """Append messages, all or nothing."""
+        with self._database.writing(f"store {len(messages)} messages for the hub") as connection:
+            self.put_with(connection, messages)
+        self.wake()
+
+    def put_with(self, connection: Connection, messages: Sequence[Outgoing]) -> None:
+        """Append messages in a transaction that stores what they report; call `wake` after its end."""
+        if not messages:
+            return
+        head = _head(connection)
+        rows = [
+            {"number": number, "kind": kind, "time_ns": time_ns, "body": orjson.dumps(message).decode()}
+            for number, (kind, time_ns, message) in enumerate(messages, head.last + 1)
+        ]
+        connection.execute(insert(outbox), rows)
+        last = head.last + len(rows)
+        connection.execute(update(outbox_head).values(last=last))
+        connection.execute(delete(outbox).where(outbox.c.number <= last - MAX_UNSENT))
+
+    def head(self) -> Head:
+        """Return the name of the outbox, and how far it has come."""
+        with self._database.writing("name the outbox of the hub") as connection:
+            return _head(connection)
+
+    def unsent(self, most: int) -> list[Unsent]:
+        """Return the messages that wait, the oldest first, a limited number of them."""
+        query = select(outbox.c.number, outbox.c.kind, outbox.c.body).order_by(outbox.c.number).limit(most)
+        with self._database.reading() as connection:
+            return [Unsent(*row) for row in connection.execute(query)]
+
+    def acknowledge(self, number: int) -> None:
+        """Forget the messages up to a number: the stream has them."""
+        with self._database.writing("note what the hub's stream has acknowledged") as connection:
+            connection.execute(delete(outbox).where(outbox.c.number <= number))
+            connection.execute(
+                update(outbox_head).where(outbox_head.c.acknowledged < number).values(acknowledged=number)
+            )
+
+    def expire_with(self, connection: Connection, before_ns: int) -> None:
+        """Delete messages about what happened before a time, in the transaction that deletes old events."""
+        connection.execute(delete(outbox).where(outbox.c.time_ns < before_ns))
+
+
+def _head(connection: Connection) -> Head:
+    columns = (outbox_head.c.outbox, outbox_head.c.last, outbox_head.c.acknowledged)
+    row = connection.execute(select(*columns)).one_or_none()
+    if row is not None:
+        return Head(*row)
+    head = Head(secrets.token_hex(8), 0, 0)
+    connection.execute(insert(outbox_head), {"only": 1, **head._asdict()})
+    return head

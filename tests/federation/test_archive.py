@@ -1,0 +1,197 @@
+"""The hub's archive: each message once and in order, however often and in whatever order it is delivered."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+import orjson
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from alert_desk import encoded, sound
+from history_places import Place as DatabasePlace
+from livessl.clock import SystemClock, utc_text
+from livessl.federation.archive import Archive, Delivery
+from livessl.server.api.encode import JsonObject
+from livessl.server.forwarding import tables
+from livessl.server.forwarding.stream import Place
+from livessl.server.history.query import Query
+
+PATIENCE = 3
+
+
+@pytest.fixture
+def archive(place: DatabasePlace) -> Iterator[Archive]:
+    assert place is not None
+    made = Archive(place, SystemClock())
+    yield made
+    made.close()
+
+
+def event(number: int, site: str = "lab") -> JsonObject:
+    return encoded(sound(number, event_id=f"{site}-{number}"))
+
+
+def delivery(
+    number: int,
+    body: JsonObject | None = None,
+    *,
+    site: str = "lab",
+    kind: str = "event",
+    box: str = "a",
+    tries: int = 1,
+) -> Delivery:
+    message = event(number, site) if body is None else body
+    return Delivery(site, kind, Place(box, number), orjson.dumps(message), tries)
+
+
+def stored(archive: Archive, site: str = "lab") -> list[str]:
+    """The ids of a site's events in the order in which they were stored."""
+    rows = sorted(archive.store.page(Query(site=site, limit=1000)).rows, key=lambda row: row.number)
+    return [row.event["id"] for row in rows]
+
+
+def names(first: int, last: int, site: str = "lab") -> list[str]:
+    return [f"{site}-{number}" for number in range(first, last + 1)]
+
+
+def site_of(archive: Archive, name: str = "lab") -> JsonObject:
+    return next(site for site in archive.sites() if site["site"] == name)
+
+
+def test_the_migrations_make_the_tables_that_the_code_names(archive: Archive) -> None:
+    def ours(_object: object, name: str | None, kind: str, _reflected: bool, _other: object) -> bool:
+        return kind != "table" or name in tables.metadata.tables
+
+    options = {"compare_type": True, "include_object": ours, "version_table": tables.VERSION_TABLE}
+    with archive.store.database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection, opts=options), tables.metadata) == []
+    folder = str(tables.__file__).removesuffix("tables.py") + "migrations"
+    assert ScriptDirectory(folder).get_current_head() == tables.HEAD
+
+
+def test_messages_are_taken_in_once_and_in_order(archive: Archive) -> None:
+    late = archive.take([delivery(3), delivery(2)], PATIENCE)
+    assert (late.done, [each.place.number for each in late.early]) == ([], [2, 3])
+    first = archive.take([delivery(4), delivery(1), delivery(2)], PATIENCE)
+    assert [each.place.number for each in first.done] == [1, 2]
+    assert [each.place.number for each in first.early] == [4]
+    again = archive.take([delivery(number) for number in (4, 1, 3, 2)], PATIENCE)
+    assert (len(again.done), again.early) == (4, [])
+    assert stored(archive) == names(1, 4)
+
+
+def test_sites_and_outboxes_do_not_wait_for_each_other(archive: Archive) -> None:
+    """A site with a new database begins to number anew, and its events are not taken for known ones."""
+    archive.take([delivery(1), delivery(1, site="yard"), delivery(2)], PATIENCE)
+    taken = archive.take([delivery(1, event(7), box="b"), delivery(2, event(1), box="b")], PATIENCE)
+    assert len(taken.done) == 2
+    assert stored(archive) == ["lab-1", "lab-2", "lab-7"]  # the second is known by its id
+    assert stored(archive, "yard") == ["yard-1"]
+
+
+def test_two_sites_may_use_the_same_ids(archive: Archive) -> None:
+    archive.take([delivery(1, event(5)), delivery(1, event(5), site="yard")], PATIENCE)
+    assert stored(archive) == stored(archive, "yard") == ["lab-5"]
+    assert [each["site"] for each in (archive.event("lab", "lab-5"), archive.event("yard", "lab-5")) if each] == [
+        "lab",
+        "yard",
+    ]
+
+
+def test_a_gap_that_is_never_filled_is_waited_for_a_while_and_counted(archive: Archive) -> None:
+    archive.take([delivery(1)], PATIENCE)
+    assert archive.take([delivery(4, tries=PATIENCE - 1)], PATIENCE).done == []
+    assert len(archive.take([delivery(4, tries=PATIENCE)], PATIENCE).done) == 1
+    assert len(archive.take([delivery(5)], PATIENCE).done) == 1
+    assert (stored(archive), site_of(archive)["missing"]) == (["lab-1", "lab-4", "lab-5"], 2)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"id": "lab-2", "confidence": 0.9},
+        {"id": "lab-2", "confidence": 0.9, "time_utc": "yesterday"},
+        {"id": "lab-2", "confidence": 0.9, "time_utc": "2026-01-01T00:00:00Z", "position_m": [1.0]},
+        {"id": "lab-\0-2", "confidence": 0.9, "time_utc": "2026-01-01T00:00:00Z", "reason": "a\0b"},
+    ],
+)
+def test_a_message_that_cannot_be_stored_holds_up_no_other(archive: Archive, body: JsonObject) -> None:
+    taken = archive.take([delivery(1), delivery(2, body), delivery(3)], PATIENCE)
+    assert taken.early == []
+    assert {"lab-1", "lab-3"} <= set(stored(archive))
+    if taken.rejected:  # SQLite stores a NUL, and PostgreSQL does not
+        assert [each.place.number for each in taken.rejected] == [2]
+        assert stored(archive) == ["lab-1", "lab-3"]
+    else:
+        assert "\0" in str(body["id"])
+
+
+def test_states_tracks_and_alerts_follow_the_messages(archive: Archive) -> None:
+    now = utc_text(SystemClock().now_ns())
+    track = {"kind": "track", "id": 7, "state": "new", "time_utc": now}
+    array = {"kind": "array", "name": "north", "state": "lost", "time_utc": now}
+    alert = {"kind": "alert", "key": "alert_1", "raised_utc": now}
+    bodies: list[tuple[str, JsonObject]] = [
+        ("start", {}),
+        ("track", track),
+        ("track", {**track, "id": 8}),
+        ("array", array),
+        ("alert", alert),
+    ]
+    archive.take([delivery(n, body, kind=kind) for n, (kind, body) in enumerate(bodies, 1)], PATIENCE)
+    assert [each["id"] for each in archive.tracks("lab")] == [7, 8]
+    assert archive.arrays(None) == [{**array, "site": "lab"}]
+    assert site_of(archive)["status"] == "degraded"
+    bodies = [("track", {**track, "state": "end"}), ("array", {**array, "state": "healthy"}), ("alert", alert)]
+    archive.take([delivery(n, body, kind=kind) for n, (kind, body) in enumerate(bodies, 6)], PATIENCE)
+    assert [each["id"] for each in archive.tracks("lab")] == [8]
+    assert [each["key"] for _, each in archive.alerts("lab", 10, None)] == ["alert_1"]
+    assert site_of(archive)["status"] == "ok"
+    archive.take([delivery(9, {}, kind="start")], PATIENCE)
+    assert archive.tracks("lab") == []  # a server that starts follows no track of before
+
+
+def test_old_events_and_alerts_are_deleted(archive: Archive) -> None:
+    alert = {"kind": "alert", "key": "old", "raised_utc": event(1)["time_utc"]}
+    newer = {"kind": "alert", "key": "new", "raised_utc": event(3)["time_utc"]}
+    archive.take([delivery(1), delivery(2, event(3)), delivery(3, alert, kind="alert")], PATIENCE)
+    archive.take([delivery(4, newer, kind="alert")], PATIENCE)
+    assert archive.expire(sound(2).start_ns) == 1
+    assert stored(archive) == ["lab-3"]
+    assert [each["key"] for _, each in archive.alerts(None, 10, None)] == ["new"]
+
+
+def test_only_one_hub_at_a_time_has_the_turn(place: DatabasePlace, archive: Archive) -> None:
+    if not isinstance(place, str):
+        pytest.skip("the hubs of an SQLite file are not kept apart")
+    other = Archive(place, SystemClock())
+    with archive.turn() as first, other.turn() as second:
+        assert (first is not None, second) == (True, None)
+    with other.turn() as second:
+        assert second is not None
+        second.check()
+    other.close()
+
+
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 8))
+def test_any_order_and_repetition_of_deliveries_ends_in_the_same_history(
+    archive: Archive, seed: int, count: int
+) -> None:
+    """Batches are drawn at random, as if from a stream that gives again what is not acknowledged."""
+    chance, box = random.Random(seed), f"{seed}-{count}"
+    site = f"site-{box}"
+    waiting = dict.fromkeys(range(1, count + 1), 0)
+    while waiting:
+        drawn = chance.choices(sorted(waiting), k=chance.randint(1, count)) + chance.choices(range(1, count + 1))
+        taken = archive.take([delivery(number, site=site, box=box) for number in drawn], 10**6)
+        for each in taken.done:
+            waiting.pop(each.place.number, None)
+    assert stored(archive, site) == names(1, count, site)
+    assert site_of(archive, site)["missing"] == 0
