@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from livessl.cli.options import BESIDE_THE_SITE
 from livessl.cli.output import complain
 from livessl.cli.server_answers import order
 from livessl.clock import SystemClock
@@ -16,25 +17,8 @@ if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredSetUp
     from livessl.site.models import CalibratedArray, CalibrationFile, Site
 
-BESIDE_THE_SITE: Final = Path()
-"""Value of --write without a file: the file that the site file names, or else calibration/SITE.yaml."""
-
 TAKE_OVER_S: Final = 60.0
 """Longest wait, in seconds, for a server that takes over a calibration: it computes its tables anew."""
-
-
-def add_file(parser: Any) -> None:
-    """Add --write and --undo."""
-    parser.add_argument(
-        "--write",
-        type=Path,
-        nargs="?",
-        const=BESIDE_THE_SITE,
-        metavar="FILE",
-        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
-        "calibration/SITE.yaml beside the site file)",
-    )
-    parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
 
 
 def write(arguments: argparse.Namespace, site: Site, action: str, measured: MeasuredSetUp) -> Path:
