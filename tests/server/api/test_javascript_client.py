@@ -6,12 +6,8 @@ import os
 import signal
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
-from typing import Any
 
 import httpx
 import pytest
@@ -19,6 +15,7 @@ from playwright.sync_api import Browser
 
 from browser import faultless_page, running_browser
 from livessl.site.tokens import add_token
+from other_origin import other_server
 from publishing_lives import FINAL, free_port, server_lives
 from small_site import HANG_S, wait_until, write_site
 
@@ -30,24 +27,6 @@ KILLS = 2
 def browser() -> Iterator[Browser]:
     with running_browser() as browser:
         yield browser
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    """Serves a folder without log lines."""
-
-    def log_message(self, *_: Any) -> None:
-        pass
-
-
-@contextmanager
-def other_server(folder: Path) -> Iterator[str]:
-    """Serve a folder at an origin of its own."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
-        thread = Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
 
 
 PAGE = """<!doctype html><title>another page</title><script type="module">
