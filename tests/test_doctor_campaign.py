@@ -120,6 +120,7 @@ def test_plugs_in_other_inputs_are_observed_as_if_they_were_recorded_so(monkeypa
         by_array = {one.array: one for one in routed}
         assert by_array.keys() == {one.array for one in recorded}
         for one in recorded:
-            assert by_array[one.array].delays_s == pytest.approx(one.delays_s, abs=1e-7)
+            # correlations in single precision; delays have a standard deviation of 6 us
+            assert by_array[one.array].delays_s == pytest.approx(one.delays_s, abs=1e-6)
             assert (by_array[one.array].inverted == one.inverted).all()
             assert by_array[one.array].powers == pytest.approx(one.powers, rel=1e-4)
