@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from conftest import require
+from livessl.federation.config import parse_hub
 from livessl.site.load import load_site
 from mosquitto import running_mosquitto
 from prometheus import MISSING, PROMTOOL
@@ -277,6 +278,8 @@ def test_hub_in_kubernetes_finds_its_files_and_is_not_root() -> None:
     for container in (init, hub):
         assert {mount["name"] for mount in container["volumeMounts"]} <= volumes
         assert container["securityContext"]["readOnlyRootFilesystem"]
+    hub_file = parse_hub(config["data"]["hub.yaml"])
+    assert (hub_file.settings.stream.replicas, hub_file.settings.hub) == (3, "hub")
     settings = yaml.safe_load(config["data"]["hub.yaml"])
     assert settings["http"]["port"] == hub["ports"][0]["containerPort"]
     for secret in (settings["nats"]["password"], settings["nats"]["ca"], settings["http"]["tokens"]):

@@ -322,8 +322,8 @@ def _put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -
 
 def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     rows: dict[str, dict[str, Any]] = {}
-    for message in messages:
-        key = f"{message['site']}/{message['id']}"
+    known_as = {f"{message['site']}/{message['id']}": message for message in messages}
+    for key, message in known_as.items():
         rows[key] = {**history.event_row(message, utc_ns(message["time_utc"])), "id": key}
     query = select(history.events.c.id).where(history.events.c.id.in_(list(rows)))
     for known in connection.execute(query).scalars().all():
@@ -331,11 +331,11 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     if not rows:
         return
     connection.execute(insert(history.events), list(rows.values()))
-    columns = history.events.c.number, history.events.c.id, history.events.c.body
-    stored = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
+    columns = history.events.c.number, history.events.c.id
+    numbers = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
     tags: list[dict[str, Any]] = []
-    for number, key, body in stored:
-        message, row = orjson.loads(body), rows[key]
+    for number, key in numbers:
+        message, row = known_as[key], rows[key]
         tags += history.tag_rows(message, row, number)
         compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
         tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
