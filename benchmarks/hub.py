@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import random
 import sys
 import threading
@@ -61,10 +62,10 @@ ARRAYS: Final = 8
 
 def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
     """Cut, kill, and measure until everything is shown again."""
-    each = -(-events // len(world.links))
+    each = -(-events // ((cuts + 2) * len(world.links)))  # a part for each cut and each death
     world.finish(10)
     world.wait_until_shown()
-    returns = []
+    returns, processor_s = [], []
     for _ in range(cuts):
         for link in world.links.values():
             link.cut()
@@ -72,7 +73,9 @@ def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
         wait_until(lambda: not any(desk.store.backlog.unsaved for desk in world.desks.values()), "stored events")
         for link in world.links.values():
             link.mend()
+        before_s = _processor_s()
         returns.append(_until_shown(world))
+        processor_s.append(_processor_s() - before_s)
     world.cluster[-1].kill()
     world.finish(each)
     nats_killed_s = _until_shown(world)
@@ -86,12 +89,30 @@ def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
         "events": sum(world.sent.values()),
         "waiting_at_each_return": each * len(world.links),
         "shown_after_return_s": [round(seconds, 3) for seconds in returns],
+        "processor_time_of_each_return_s": [round(seconds, 3) for seconds in processor_s],
         "shown_after_a_nats_server_died_s": round(nats_killed_s, 3),
         "shown_after_the_hub_at_work_died_s": round(hub_killed_s, 3),
         "each_once": {name: sorted(ids) for name, ids in stored.items()}
         == {name: sorted(ids) for name, ids in wanted.items()},
         "in_order": stored == wanted,
     }
+
+
+def _processor_s() -> float:
+    """Return the processor time so far, in seconds, of this process and all that it has started and that still run."""
+    parents, times = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            continue
+        parents[int(folder.name)] = int(fields[1])
+        times[int(folder.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    ours, more = set(), {os.getpid()}
+    while more:
+        ours |= more
+        more = {process for process, parent in parents.items() if parent in more} - ours
+    return sum(times[process] for process in ours)
 
 
 def _until_shown(world: HubWorld) -> float:
@@ -254,8 +275,8 @@ def loaded_hub(folder: Path, postgresql: PostgreSQL | None) -> Iterator[tuple[Na
 def main() -> int:
     """Run one of the two benchmarks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--events", type=int, default=1000, help="events that wait for each return (default: 1000)")
-    parser.add_argument("--cuts", type=int, default=5, help="how often the links are cut (default: 5)")
+    parser.add_argument("--events", type=int, default=1000, help="events in all (default: 1000)")
+    parser.add_argument("--cuts", type=int, default=3, help="how often the links are cut (default: 3)")
     parser.add_argument("--sites", type=int, default=0, help="simulate the load of so many sites instead")
     parser.add_argument("--rate", type=float, default=0.0, help="events a second of all sites (default: all that goes)")
     parser.add_argument("--seconds", type=float, default=60.0, help="how long they are published (default: 60)")

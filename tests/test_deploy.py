@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 import sysconfig
@@ -19,9 +21,12 @@ import pytest
 import yaml
 
 from conftest import require
+from livessl.federation.config import parse_hub
+from livessl.lab.processes import free_port
 from livessl.site.load import load_site
-from mosquitto import running_mosquitto
+from mosquitto import MOSQUITTO
 from prometheus import MISSING, PROMTOOL
+from small_site import started, wait_until
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
@@ -238,10 +243,20 @@ def test_stack_listens_on_this_machine_alone_and_mounts_what_is_there() -> None:
 
 
 def test_broker_of_the_stack_starts_with_its_file(tmp_path: Path) -> None:
-    text = (STACK.parent / "mosquitto.conf").read_text(encoding="utf-8")
-    further = [line for line in text.splitlines() if not line.startswith(("#", "listener", "persistence"))]
-    with running_mosquitto(tmp_path, further="\n".join(further)):
-        pass
+    require(MOSQUITTO is not None, "Mosquitto is not installed (Debian: apt install mosquitto)")
+    text, port = (STACK.parent / "mosquitto.conf").read_text(encoding="utf-8"), free_port()
+    here = text.replace("listener 1883 ", f"listener {port} ").replace("/mosquitto/data/", f"{tmp_path}/")
+    assert here.count(str(port)) == here.count(str(tmp_path)) == 1
+    user = "user root\n" if os.getuid() == 0 else ""  # otherwise root's broker cannot write into a test's folder
+    (tmp_path / "mosquitto.conf").write_text(user + here, encoding="utf-8")
+    with started(str(MOSQUITTO), "-c", tmp_path / "mosquitto.conf") as broker:
+
+        def answers() -> bool:
+            assert broker.poll() is None, "Mosquitto has ended"
+            with socket.socket() as probe:
+                return probe.connect_ex(("127.0.0.1", port)) == 0
+
+        wait_until(answers, "Mosquitto")
 
 
 def test_prometheus_accepts_its_file() -> None:
@@ -277,6 +292,8 @@ def test_hub_in_kubernetes_finds_its_files_and_is_not_root() -> None:
     for container in (init, hub):
         assert {mount["name"] for mount in container["volumeMounts"]} <= volumes
         assert container["securityContext"]["readOnlyRootFilesystem"]
+    hub_file = parse_hub(config["data"]["hub.yaml"])
+    assert (hub_file.settings.stream.replicas, hub_file.settings.hub) == (3, "hub")
     settings = yaml.safe_load(config["data"]["hub.yaml"])
     assert settings["http"]["port"] == hub["ports"][0]["containerPort"]
     for secret in (settings["nats"]["password"], settings["nats"]["ca"], settings["http"]["tokens"]):

@@ -206,7 +206,7 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int) -> Out
 
 def _finished(site: Forked, receiver: Receiver, operator: Operator, kills: int, end_s: float) -> Outcome:
     site.sleep_until(end_s + 1.0)
-    wait_for(site.is_settled, "the last events", WITHIN_S)
+    wait_for(lambda: all(site.is_settled() for _ in range(3)), "the last events", 2.0 * WITHIN_S)
     messages = AlertMessages(load_site(site.site), "")
     events = site.events()
     alerting = [event for event in events if event["status"] == "located" and not event["excluded"]]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import orjson
-from sqlalchemy import Connection, delete, func, insert, select, text, tuple_, update
+from sqlalchemy import Connection, bindparam, delete, func, insert, select, text, tuple_, update
 
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.federation.received import RECEIVED
@@ -31,6 +31,18 @@ LOCK: Final = 0x11_7E_55_2
 
 AWAY_S: Final = 30.0
 """Silence, in seconds, after which a site counts as away; it reports on itself every 5 s."""
+
+_RAISE: Final = (
+    update(received)
+    .where(received.c.site == bindparam("of_site"), received.c.outbox == bindparam("of_outbox"))
+    .where(received.c.last < bindparam("number"))
+    .values(last=bindparam("number"))
+)
+_HEARD: Final = (
+    update(sites)
+    .where(sites.c.site == bindparam("of_site"))
+    .values(contact_ns=bindparam("now_ns"), missing=sites.c.missing + bindparam("more"))
+)
 
 _log = logging.getLogger(__name__)
 
@@ -148,9 +160,8 @@ class Archive:
                 missing[delivery.site] = missing.get(delivery.site, 0) + gap
                 last[key] = delivery.place.number
             _put(connection, batch)
-            for (site, outbox), number in last.items():
-                mine = (received.c.site == site) & (received.c.outbox == outbox)
-                connection.execute(update(received).where(mine, received.c.last < number).values(last=number))
+            raised = [{"of_site": site, "of_outbox": box, "number": number} for (site, box), number in last.items()]
+            connection.execute(_RAISE, raised)
             self._touch(connection, {site for site, _ in places}, missing)
         return taken
 
@@ -175,13 +186,13 @@ class Archive:
         """Note that sites were heard of now, and how many of their messages are missing."""
         known = set(connection.execute(select(sites.c.site).where(sites.c.site.in_(names))).scalars())
         now_ns = self._clock.now_ns()
-        for site in sorted(names):
-            if site in known:
-                change = {"contact_ns": now_ns, "missing": sites.c.missing + missing.get(site, 0)}
-                connection.execute(update(sites).where(sites.c.site == site).values(change))
-            else:
-                row = {"site": site, "contact_ns": now_ns, "missing": missing.get(site, 0), "report": "{}"}
-                connection.execute(insert(sites), row)
+        rows = [{"site": site, "contact_ns": now_ns, "missing": missing.get(site, 0)} for site in sorted(names)]
+        new = [{**row, "report": "{}"} for row in rows if row["site"] not in known]
+        if new:
+            connection.execute(insert(sites), new)
+        if known:
+            heard = [{"of_site": row["site"], "now_ns": now_ns, "more": row["missing"]} for row in rows]
+            connection.execute(_HEARD, [row for row in heard if row["of_site"] in known])
 
     # --- which hub takes messages in
 
@@ -291,11 +302,10 @@ def _locked(connection: Connection, places: set[tuple[str, str]]) -> dict[tuple[
     columns = received.c.site, received.c.outbox
     query = select(*columns, received.c.last).where(tuple_(*columns).in_(sorted(places))).order_by(*columns)
     last = {(row.site, row.outbox): int(row.last) for row in connection.execute(query.with_for_update())}
-    for site, outbox in sorted(places - last.keys()):
-        # another hub that does the same at this moment makes this one fail, and try again
-        connection.execute(insert(received), {"site": site, "outbox": outbox, "last": 0})
-        last[site, outbox] = 0
-    return last
+    new = sorted(places - last.keys())
+    if new:  # another hub that does the same at this moment makes this one fail, and try again
+        connection.execute(insert(received), [{"site": site, "outbox": box, "last": 0} for site, box in new])
+    return last | dict.fromkeys(new, 0)
 
 
 def _read(delivery: Delivery) -> JsonObject | None:
@@ -322,8 +332,8 @@ def _put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -
 
 def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     rows: dict[str, dict[str, Any]] = {}
-    for message in messages:
-        key = f"{message['site']}/{message['id']}"
+    known_as = {f"{message['site']}/{message['id']}": message for message in messages}
+    for key, message in known_as.items():
         rows[key] = {**history.event_row(message, utc_ns(message["time_utc"])), "id": key}
     query = select(history.events.c.id).where(history.events.c.id.in_(list(rows)))
     for known in connection.execute(query).scalars().all():
@@ -331,11 +341,11 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     if not rows:
         return
     connection.execute(insert(history.events), list(rows.values()))
-    columns = history.events.c.number, history.events.c.id, history.events.c.body
-    stored = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
+    columns = history.events.c.number, history.events.c.id
+    numbers = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
     tags: list[dict[str, Any]] = []
-    for number, key, body in stored:
-        message, row = orjson.loads(body), rows[key]
+    for number, key in numbers:
+        message, row = known_as[key], rows[key]
         tags += history.tag_rows(message, row, number)
         compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
         tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
