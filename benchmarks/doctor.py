@@ -8,10 +8,11 @@ The rooms and the faults are those of `doctor_rooms.py`; seeds from 1000 on are 
 the report. A fault counts as named if a finding has its code, its array and, where it has one, its channel. With
 `--live` the events go one by one to the examination of a running server, which is looked at after each.
 
-The examinations of two arrays use what they observed beside the third one, and those of plugs in other inputs what is
-observed with the plugs where they belong: a test shows that it is the same. Rows are appended to `rows.jsonl` as they
-come, and those that are there already are not made again, so that a campaign can be interrupted. Observations are kept
-in `--cache`, if given: then only conclusions are drawn again.
+The examinations of two arrays use what they observed beside the third one (clocks, too), and those of plugs in other
+inputs what is observed with the plugs where they belong: a test shows that it differs by less than the delays' errors,
+and `--live` does localize them. Rows are appended to `rows.jsonl` as they come, and those that are there already are not
+made again, so that a campaign can be interrupted. Observations are kept in `--cache`, if given: then only conclusions
+are drawn again.
 """
 
 from __future__ import annotations

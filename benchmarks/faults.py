@@ -191,7 +191,7 @@ def alerted(folder: Path, kills: int, seed: int) -> int:
     """Kill a whole server that alerts, and print what became of the alerts and of what operators changed."""
     recordings = folder / f"recordings-{kills}"
     if not recordings.exists():
-        make_recordings(recordings, 6 * kills, gap_s=1.2)
+        make_recordings(recordings, 4 * kills, gap_s=1.2)
     shutil.rmtree(folder / "site", ignore_errors=True)
     outcome = play_killed(recordings, folder / "site", kills, seed)
     counts = {name: getattr(outcome, name) for name in ("kills", "sounds", "changes", "differing", "copies")}

@@ -37,12 +37,19 @@ def _compiled() -> None:
 
 LONGEST_FIRST = (
     "test_processes.py",
-    "test_campaign.py",
-    "test_release.py",
     "test_live.py",
-    "test_clocks_and_backfill.py",
-    "test_localizer.py",
+    "test_recorded_files.py",
+    "test_release.py",
+    "test_install.py",
+    "test_real_recordings.py",
+    "test_soak.py",
+    "test_examples.py",
+    "test_replayed_faults.py",
     "test_sessions.py",
+    "test_localizer.py",
+    "test_campaign.py",
+    "test_clocks_and_backfill.py",
+    "test_overloaded_server.py",
 )
 """Files that take minutes: begun first, no worker is left with one of them when the others are done."""
 

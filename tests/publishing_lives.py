@@ -1,4 +1,4 @@
-"""A server that is killed again and again: `python publishing_lives.py SITE_FILE`, one life for each line it reads.
+"""A server that is killed again and again: `python publishing_lives.py SITE_FILE FOLLOWERS`, one life for each line.
 
 Each life publishes the events that are not final yet, and goes on serving. It is forked from a process that has loaded
 everything, so that a life begins at once.
@@ -30,9 +30,6 @@ EARLY, FINAL = 0.5, 0.9
 CLOCKS: JsonObject = {"heard": {}, "frames": {}, "known": {}}
 """What is known of the nodes' clocks: nothing."""
 
-FOLLOWERS = 2
-"""Clients that a life waits for after half of its events: the first half they miss, as after a real restart."""
-
 PAUSE_S = 0.004
 """Time between two events, in seconds."""
 
@@ -45,12 +42,13 @@ def free_port() -> int:
 
 
 @contextmanager
-def server_lives(site: Path) -> Iterator[Callable[[int], int]]:
+def server_lives(site: Path, followers: int) -> Iterator[Callable[[int], int]]:
     """Yield a function that begins a life of a server, once the one before was killed, and returns its process.
 
-    It gets the number of events that are published when the life has done its work.
+    It gets the number of events that are published when the life has done its work. A life waits for the followers
+    after half of its events: the first half they miss, as after a real restart.
     """
-    command = (sys.executable, __file__, site)
+    command = (sys.executable, __file__, site, str(followers))
     with started(*command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as lives:
 
         def begin(count: int) -> int:
@@ -62,7 +60,7 @@ def server_lives(site: Path) -> Iterator[Callable[[int], int]]:
         yield begin
 
 
-def live(site_file: str, count: int) -> None:
+def live(site_file: str, followers: int, count: int) -> None:
     """Publish what is not final; each fifth event has an early answer before."""
     site = load_site(Path(site_file))
     server = Server(site, SystemClock(), stepped=True)
@@ -76,7 +74,7 @@ def live(site_file: str, count: int) -> None:
         time.sleep(0.001)
     begin = stored - len(early)
     for number in range(begin, count):
-        while number > (begin + count) / 2 and parts.fanout.clients < FOLLOWERS:
+        while number > (begin + count) / 2 and parts.fanout.clients < followers:
             time.sleep(0.005)
         if number % 5 == 4:
             parts.event_log.add_early(sound(number, confidence=EARLY), messages)
@@ -92,7 +90,7 @@ def main() -> None:
     for line in sys.stdin:
         process = os.fork()
         if process == 0:
-            live(sys.argv[1], int(line))
+            live(sys.argv[1], int(sys.argv[2]), int(line))
             return
         print(process, flush=True)
         os.waitpid(process, 0)

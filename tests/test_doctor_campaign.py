@@ -12,6 +12,7 @@ import doctor_rooms
 from doctor_rooms import ARRAYS, FAULTS, RATE_HZ, Fault, Room
 from livessl import offline
 from livessl.core.commission.finding import Finding, Severity
+from livessl.core.commission.tolerance import DELAY_STD_S
 from livessl.examination import gather
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -120,6 +121,6 @@ def test_plugs_in_other_inputs_are_observed_as_if_they_were_recorded_so(monkeypa
         by_array = {one.array: one for one in routed}
         assert by_array.keys() == {one.array for one in recorded}
         for one in recorded:
-            assert by_array[one.array].delays_s == pytest.approx(one.delays_s, abs=1e-7)
+            assert by_array[one.array].delays_s == pytest.approx(one.delays_s, abs=DELAY_STD_S)
             assert (by_array[one.array].inverted == one.inverted).all()
-            assert by_array[one.array].powers == pytest.approx(one.powers, rel=1e-4)
+            assert by_array[one.array].powers == pytest.approx(one.powers, rel=0.05)

@@ -17,7 +17,7 @@ from livessl.client import Event, Options, Received, aconnect, connect
 from publishing_lives import FINAL, free_port, server_lives
 from small_site import HANG_S, wait_until, write_site
 
-KILLS = 5
+KILLS = 3
 SHARE = 40
 """Events of each life."""
 
@@ -76,7 +76,7 @@ def test_both_clients_get_every_event_once(tmp_path: Path) -> None:
     site = write_site(tmp_path, {"server.events_db": "events.sqlite", "server.http.port": port})
     names = {f"small-{number}" for number in range(COUNT)}
     followers = [kind(f"http://127.0.0.1:{port}", names) for kind in (Follower, AsyncFollower)]
-    with server_lives(site) as begin:
+    with server_lives(site, followers=2) as begin:
         for follower in followers:
             follower.start()
         for life in range(KILLS):

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from livessl.client import resumption
 from livessl.client.options import Options, Wanted
 from livessl.client.resumption import (
-    COMPARED,
-    REMEMBERED,
     Deliver,
     Get,
     Memory,
@@ -258,34 +257,29 @@ def test_stored_events_come_first_and_once() -> None:
     assert [message.id for message in client.delivered] == [event["id"] for event in stored]
 
 
-def test_memory_is_bounded_and_the_log_is_read_in_time() -> None:
+def test_memory_is_bounded_and_the_log_is_read_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resumption, "COMPARED", 10)
+    monkeypatch.setattr(resumption, "REMEMBERED", 25)
     server = ModelServer(is_durable=True)
     client = ModelClient(server)
     client.settle()
-    reads = 0
-    answer = server.answer
+    reads, answer = 0, server.answer
 
     def counted(step: Get) -> bytes | None:
         nonlocal reads
         reads += 1
-        server.log = server.log[-1:]  # the older ones were read before
         return answer(step)
 
     server.answer = counted  # type: ignore[method-assign]
-    count = 3 * COMPARED
-    for k in range(count):
+    for k in range(60):
         server.publish(event_message(id=f"small-{k}"))
         server.store()
         client.settle()
-    assert len(client.delivered) == count
-    assert reads >= 3
-    memory = Memory()
-    text = json.dumps({"v": 1, "seq": 1, **event_message()})
-    event = parse(text)
-    for k in range(REMEMBERED + 10):
-        assert memory.is_news(event.model_copy(update={"id": f"small-{k}"}))
-    assert not memory.is_news(event.model_copy(update={"id": f"small-{REMEMBERED}"}))
-    assert memory.is_news(event.model_copy(update={"id": "small-0"}))  # forgotten
+    assert len(client.delivered) == 60
+    assert reads >= 6
+    newest, oldest = client.delivered[-1], client.delivered[0]
+    assert not client.memory.is_news(newest)
+    assert client.memory.is_news(oldest)  # forgotten
 
 
 def test_gap_in_other_messages_is_delivered() -> None:

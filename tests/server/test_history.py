@@ -106,7 +106,12 @@ def test_migration_that_fails_leaves_the_older_file_as_it_was(tmp_path: Path) ->
 def test_migrations_make_the_tables_that_the_code_names(opened: Callable[[], Store]) -> None:
     store = opened()
     with store._database.reading() as connection:
-        assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+
+        def is_made_here(_thing: object, name: str | None, *_: object) -> bool:
+            return name != "event_tags_search" or connection.dialect.name == "postgresql"
+
+        options = {"compare_type": True, "include_object": is_made_here}
+        assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
 
 
 def test_the_newest_migration_is_the_one_that_the_code_expects() -> None:
@@ -298,6 +303,7 @@ def test_events_of_before_the_journal_are_found_by_their_exclusion(place: Path |
         for sql in (
             "DELETE FROM event_tags WHERE kind = 'flag'",
             "DROP TABLE journal",
+            "DROP INDEX IF EXISTS event_tags_search",
             "UPDATE alembic_version SET version_num = '0002'",
         ):
             connection.execute(text(sql))

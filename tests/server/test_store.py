@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Thread, Timer
 from typing import Any
 
 import pytest
@@ -14,6 +14,8 @@ from sqlalchemy import text
 
 from livessl.core.types import FRAME_NS
 from livessl.server.api.encode import JsonObject
+from livessl.server.history import records
+from livessl.server.history.backlog import Write
 from livessl.server.history.database import READERS
 from livessl.server.store import MAX_EVENTS_IN_MEMORY, Cursor, Query, Store, StoreError
 from small_site import HANG_S
@@ -321,6 +323,42 @@ def test_deletion_ends_when_the_server_does(store: Store, monkeypatch: pytest.Mo
     monkeypatch.setattr(store, "_counted", lambda _: end.set())  # after the first batch
     assert store.expire(START_NS + 7 * NS, end) == 3
     assert store.expire(START_NS + 7 * NS, end) == 0
+
+
+@pytest.mark.parametrize("batches", [1, 3])
+def test_deletion_gives_way_to_events_that_are_to_be_stored(
+    opened: Callable[[], Store], monkeypatch: pytest.MonkeyPatch, batches: int
+) -> None:
+    """Before every batch; otherwise each event would wait for a batch, and a busy store would fall behind."""
+    monkeypatch.setattr("livessl.server.store.GIVE_WAY_S", HANG_S)
+    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 2)
+    store, done = opened(), list[str]()
+    fill(store, 2 * batches)
+    store.backlog.start()
+    settle, remove_older = store.backlog.settle, records.remove_older
+
+    def settle_with_an_event(within_s: float) -> None:
+        """An event comes that takes a while to be stored; only then it is waited for."""
+        begun, gate = Event(), Event()
+
+        def work() -> None:
+            begun.set()
+            gate.wait(HANG_S)
+            done.append("stored")
+
+        store.backlog.put(Write(work, 1, is_final=False), 0)
+        assert begun.wait(HANG_S)
+        Timer(0.05, gate.set).start()
+        settle(within_s)
+
+    def delete(*given: Any) -> int:
+        done.append("deleted")
+        return remove_older(*given)
+
+    monkeypatch.setattr(store.backlog, "settle", settle_with_an_event)
+    monkeypatch.setattr(records, "remove_older", delete)
+    assert store.expire(START_NS + 10**6 * NS) == 2 * batches
+    assert done == ["stored", "deleted"] * (batches + 1)
 
 
 def test_nothing_is_older_than_any_time_that_can_be_stored(store: Store) -> None:

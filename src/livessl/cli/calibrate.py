@@ -9,7 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from livessl.cli import argument, calibration_file, progress
+from livessl.cli import argument, progress
 from livessl.cli.calibration_words import (
     clap_line,
     clap_object,
@@ -20,7 +20,7 @@ from livessl.cli.calibration_words import (
 )
 from livessl.cli.doctor import add_recordings, finding_line, recordings_given
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_json, read_site
+from livessl.cli.options import add_calibration_file, add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
 from livessl.errors import ConfigError, UseError
@@ -90,7 +90,7 @@ def add_arguments(parser: Any) -> None:
         metavar="M",
         help="how exactly you know the places, standard deviation in metres (default 0.03)",
     )
-    calibration_file.add_file(sub)
+    add_calibration_file(sub)
     add_json(sub, "print one JSON object for each clap, each array and the speed of sound")
     sub = action(
         "refine",
@@ -120,7 +120,7 @@ def add_arguments(parser: Any) -> None:
         metavar="N",
         help=f"number of sounds to wait for with a running server (default {REFINED_SOUNDS})",
     )
-    calibration_file.add_file(sub)
+    add_calibration_file(sub)
     add_json(sub, "print one JSON object for each array and the speed of sound")
 
 
@@ -131,6 +131,7 @@ def _add_places(parser: Any, text: str) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.calibration import MOST_CLAPS
+    from livessl.cli import calibration_file
 
     if getattr(arguments, "undo", False):
         path = calibration_file.undo(arguments)
@@ -318,6 +319,7 @@ def _told(
     arguments: argparse.Namespace, site: Site, measured: MeasuredSetUp, action: str, cure: Callable[[], str]
 ) -> int:
     """Print what was measured, store it if that is wanted, and return the exit code."""
+    from livessl.cli import calibration_file
     from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M
 
     for name, pose in measured.poses.items():

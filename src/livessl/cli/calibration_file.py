@@ -7,43 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from livessl.cli.options import BESIDE_THE_SITE
 from livessl.cli.output import complain
 from livessl.cli.server_answers import order
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, RunError, UseError
-from livessl.site.calibration_file import (
-    calibration_path,
-    default_name,
-    extended,
-    kept_path,
-    read_calibration,
-    undo_calibration,
-    write_calibration,
-)
-from livessl.site.models import CalibratedArray, CalibrationFile, Site
 
 if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredSetUp
-
-BESIDE_THE_SITE: Final = Path()
-"""Value of --write without a file: the file that the site file names, or else calibration/SITE.yaml."""
+    from livessl.site.models import CalibratedArray, CalibrationFile, Site
 
 TAKE_OVER_S: Final = 60.0
 """Longest wait, in seconds, for a server that takes over a calibration: it computes its tables anew."""
-
-
-def add_file(parser: Any) -> None:
-    """Add --write and --undo."""
-    parser.add_argument(
-        "--write",
-        type=Path,
-        nargs="?",
-        const=BESIDE_THE_SITE,
-        metavar="FILE",
-        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
-        "calibration/SITE.yaml beside the site file)",
-    )
-    parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
 
 
 def write(arguments: argparse.Namespace, site: Site, action: str, measured: MeasuredSetUp) -> Path:
@@ -57,6 +32,7 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
         If it cannot be written.
     """
     from livessl.site.build.calibrated import measured_arrays
+    from livessl.site.calibration_file import calibration_path, extended, write_calibration
 
     path = _path(arguments, site)
     arrays = measured_arrays(site, measured)
@@ -97,6 +73,8 @@ def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> N
     path : Path
         The file.
     """
+    from livessl.site.calibration_file import read_calibration
+
     later = "it takes effect when the server starts, or by Set-up on its dashboard"
     if url is None:
         complain(f"no address of a running server is known; {later}", kind="note")
@@ -129,6 +107,8 @@ def undo(arguments: argparse.Namespace) -> Path:
     UseError
         If there is none.
     """
+    from livessl.site.calibration_file import kept_path, undo_calibration
+
     if arguments.write in (None, BESIDE_THE_SITE) and arguments.site is None:
         raise UseError("--undo: expected --site FILE, or --write FILE, the calibration file to put back")
     given: Path | None = arguments.write
@@ -150,6 +130,7 @@ def _named(site_file: Path) -> Path:
     """Return the calibration file of a site file, which need not be valid: its calibration may be what is wrong."""
     import yaml
 
+    from livessl.site.calibration_file import default_name
     from livessl.site.findings import read_yaml
 
     try:
@@ -167,6 +148,8 @@ def _named(site_file: Path) -> Path:
 
 
 def _path(arguments: argparse.Namespace, site: Site | None) -> Path:
+    from livessl.site.calibration_file import default_name
+
     given: Path | None = arguments.write
     if given is not None and given != BESIDE_THE_SITE:
         return given
@@ -177,6 +160,9 @@ def _path(arguments: argparse.Namespace, site: Site | None) -> Path:
 
 def _before(path: Path) -> CalibrationFile:
     """Return the calibration that is replaced: its arrays that were not measured now stay as they are."""
+    from livessl.site.calibration_file import read_calibration
+    from livessl.site.models import CalibrationFile
+
     try:
         return read_calibration(path)
     except ConfigError:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from livessl.cli import argument
 from livessl.core.methods import METHODS
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from livessl.site.models import Site
 
 T = TypeVar("T")
+
+BESIDE_THE_SITE: Final = Path()
+"""Value of --write without a file: the file that the site file names, or else calibration/SITE.yaml."""
 
 
 def add_site(parser: Any) -> None:
@@ -31,6 +34,20 @@ def add_method(parser: Any) -> None:
         metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
         help="localization method; MODULE:NAME imports one of your own (default: the site's)",
     )
+
+
+def add_calibration_file(parser: Any) -> None:
+    """Add --write and --undo."""
+    parser.add_argument(
+        "--write",
+        type=Path,
+        nargs="?",
+        const=BESIDE_THE_SITE,
+        metavar="FILE",
+        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
+        "calibration/SITE.yaml beside the site file)",
+    )
+    parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
 
 
 def import_from_here() -> None:

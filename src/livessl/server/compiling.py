@@ -25,6 +25,9 @@ from livessl.core.locate.peak_search import warm_up
 COMPILE: Final = (sys.executable, "-m", "livessl.server.compiling")
 """The command that compiles the kernels and exits."""
 
+UNTIL_STDIN_ENDS: Final = "--until-stdin-ends"
+"""Argument that makes the command end with whoever holds its standard input: a server that is killed cannot stop it."""
+
 NICENESS: Final = 10
 """By how much the compiler gives way to the server, as of nice(1)."""
 
@@ -60,7 +63,8 @@ class KernelLoader:
         with self._lock:
             if self._is_stopped:
                 return
-            self._compiler = subprocess.Popen(self._command, stdin=subprocess.DEVNULL)  # noqa: S603 - this package
+            command = (*self._command, UNTIL_STDIN_ENDS)
+            self._compiler = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603 - this package
         _log.info(
             "First start: compiling kernels in the background, a minute or so; "
             "until then NumPy does their work, slower."
@@ -78,7 +82,8 @@ class KernelLoader:
             self._compiler.wait()
 
     def _wait(self, compiler: subprocess.Popen[bytes], compiled: ModuleType) -> None:
-        code = compiler.wait()
+        with compiler:  # which closes its standard input at the end
+            code = compiler.wait()
         if self._is_stopped:
             return
         if code:
@@ -109,6 +114,8 @@ def _stamp(compiled: ModuleType) -> Path | None:
 
 def main() -> None:
     """Compile the kernels and note that it was done; what another process compiles already is waited for."""
+    if UNTIL_STDIN_ENDS in sys.argv[1:]:
+        threading.Thread(target=_end_with_stdin, name="parent", daemon=True).start()
     os.nice(NICENESS)
     stamp = _stamp(kernels.in_use)
     if stamp is None:
@@ -121,6 +128,11 @@ def main() -> None:
         if not stamp.exists():
             warm_up()
             stamp.touch()
+
+
+def _end_with_stdin() -> None:
+    sys.stdin.buffer.read()
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,10 @@ _log = logging.getLogger(__name__)
 Follower = Callable[[Site], None]
 """Takes over the poses of a site; called on any thread."""
 
-_TAKEN: Final = ("arrays", "calibration", "temperature_c", "speed_of_sound_m_s", "c_m_s", "specs", "processed")
+_TAKEN: Final = (
+    *("arrays", "uncertainty", "calibration", "temperature_c", "speed_of_sound_m_s"),
+    *("c_m_s", "specs", "processed"),
+)
 """What is taken over of a site that was loaded anew."""
 
 

@@ -44,8 +44,12 @@ JsonObject = dict[str, Any]
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """Most events kept in memory, about 10 MB, and most entries of the journal; a database on a disk has no such limit."""
 
-EXPIRED_AT_ONCE: Final = 1000
+EXPIRED_AT_ONCE: Final = 200
 """Old events that are deleted in one transaction: the longest that a new event waits for their deletion."""
+
+GIVE_WAY_S: Final = 2.0
+"""Longest wait, in seconds, of such a transaction for new events that are to be stored: each of these would wait for
+one, and a store that is busy with both would fall behind. A store that is behind all the time deletes slowly."""
 
 SCANNED_AT_ONCE: Final = 1000
 """Events that an export reads at a time."""
@@ -241,6 +245,7 @@ class Store:
         gone, end = 0, threading.Event() if end is None else end
         before_ns = max(before_ns, 0)  # a database has no number for a time long before 1970
         while not end.is_set():
+            self.backlog.settle(GIVE_WAY_S)
             with self._database.writing("delete old events") as connection:
                 some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
                 others = remove_older_entries(connection, before_ns, EXPIRED_AT_ONCE)

@@ -15,9 +15,7 @@ from livessl.site.findings import Locator, duplicate_keys, nodes_of, reason, val
 from livessl.site.secret_files import NAME, write_whole
 from livessl.site.zone_models import Zone
 
-HEAD: Final = (
-    "# Written by livessl: the zones that operators draw on the dashboard. Edit it only while the server is stopped.\n"
-)
+HEAD: Final = "# Written by livessl: the zones that operators draw on the dashboard. Reload the server after edits.\n"
 
 MAX_DRAWN: Final = 100
 """Most zones that operators can draw: each costs time for every event."""

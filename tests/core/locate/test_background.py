@@ -87,3 +87,4 @@ def test_the_confidence_falls_with_the_share_of_the_background() -> None:
     assert shares[0] == clear.confidence
     assert shares[2] < LEAST_CONFIDENCE < shares[0]
     assert not replace(clear, background=1.0).is_sure
+    assert replace(clear, background=1e6).confidence < 1e-9  # and no warning of an overflow

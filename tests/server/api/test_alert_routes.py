@@ -10,7 +10,6 @@ from typing import Any
 
 import httpx
 import pytest
-from scene_server import capture_scene, replay_scene
 from websockets.sync.client import connect
 
 from alert_desk import ELSEWHERE, PATIENT, after, alert_site, encoded, key_of, refused, sound
@@ -20,6 +19,7 @@ from livessl.core.types import Event
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
+from scene_server import capture_scene, replay_scene
 from small_site import HANG_S, Changes, running_server, wait_until
 
 DOOR = {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["run"]}

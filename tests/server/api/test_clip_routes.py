@@ -11,7 +11,6 @@ import httpx
 import numpy as np
 import pytest
 import soundfile
-from scene_server import capture_scene, replay_scene
 
 from livessl.clock import utc_ns
 from livessl.core.stream.load_policy import LoadPolicy
@@ -19,6 +18,7 @@ from livessl.core.types import Float32Array
 from livessl.errors import ConfigError
 from livessl.server.app import Server
 from livessl.site.tokens import Role, add_token
+from scene_server import capture_scene, replay_scene
 from small_site import RATE_HZ, Changes, heard, running_server, scene, site_of, wait_until
 
 CLIPS: Changes = {"server.clips": {"folder": "clips", "pre_s": 0.6, "post_s": 0.2}}

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Dialog, Page, expect
-from scene_server import capture_scene
 
 from browser import faultless_page, running_browser, visit
 from livessl.core.stream.load_policy import LoadPolicy
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
+from scene_server import capture_scene
 from small_site import HANG_S, Changes, running_server, site_of, wait_until
 
 pytestmark = [pytest.mark.browser]

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import httpx
 import pytest
-from scene_server import get
 
 from livessl.server.app import Server
 from livessl.server.history.log import LogPosition
 from livessl.server.store import Query, Store, StoreError
 from messages import START_NS, event_message
+from scene_server import get
 from small_site import running_server, site_of
 
 

@@ -21,6 +21,7 @@ from websockets.sync.client import connect
 from conftest import require
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
+from livessl.server.api.app import STATIC
 from livessl.server.app import Server
 from small_site import HANG_S, running_server, scene_recordings, site_of
 
@@ -44,6 +45,26 @@ export async function positions(url: string): Promise<number[][]> {
   console.log(started, page.next_cursor);
   return located.map((event) => event.position_m ?? []);
 }
+"""
+
+
+FOLLOWER = """\
+import { follow, type LiveEvent } from "./follow";
+
+const events: LiveEvent[] = [];
+const stop: () => void = follow("http://127.0.0.1:8000", {
+  kinds: ["event", "alert"],
+  zone: "door",
+  onMessage: (message) => {
+    if (message.kind === "event") events.push(message);
+    else if (message.kind === "gap") console.log(message.missed);
+    // @ts-expect-error: not every message has a position
+    message.position_m.length;
+  },
+});
+// @ts-expect-error: there is no such kind
+follow("http://127.0.0.1:8000", { kinds: ["smell"], onMessage: () => {} });
+stop();
 """
 
 
@@ -149,8 +170,10 @@ def test_typescript_client_compiles(server: Server, npm: Path, tmp_path: Path) -
     programs = npm / "node_modules" / ".bin"
     _run(programs / "openapi-typescript", description, "--output", tmp_path / "api.d.ts", cwd=tmp_path)
     (tmp_path / "client.ts").write_text(TYPESCRIPT_CLIENT, encoding="utf-8")
+    (tmp_path / "follow.d.ts").write_bytes((STATIC / "client.d.ts").read_bytes())
+    (tmp_path / "follower.ts").write_text(FOLLOWER, encoding="utf-8")
     options = ("--noEmit", "--strict", "--target", "es2022", "--lib", "es2022,dom")
-    _run(programs / "tsc", *options, "client.ts", cwd=tmp_path)
+    _run(programs / "tsc", *options, "client.ts", "follower.ts", cwd=tmp_path)
 
 
 def test_message_classes_read_real_messages(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scene_server import capture_scene
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -18,6 +17,7 @@ from livessl.errors import ConfigError
 from livessl.server.app import Server
 from livessl.server.clips.listeners import FULL_SCALE, HEADER, MOST_LISTENERS, MOST_QUEUED, Listeners
 from livessl.site.tokens import add_token
+from scene_server import capture_scene
 from small_site import HANG_S, RATE_HZ, frame, heard, mark, running_server, site_of, wait_until
 
 LISTEN = {"server.listen": True}

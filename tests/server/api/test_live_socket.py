@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
-from scene_server import CLOCK, capture_scene, live, located_scene
 from websockets.exceptions import ConnectionClosed
 
 from livessl.clock import utc_ns
 from livessl.server import http
 from livessl.server.app import Server
+from scene_server import CLOCK, capture_scene, live, located_scene
 from small_site import HANG_S, running_server, site_of, wait_until
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from scene_server import get, located_scene, replay_scene, watch
 from websockets.exceptions import ConnectionClosed
 
 from livessl.clock import utc_ns
 from livessl.server.app import Server
+from scene_server import get, located_scene, replay_scene, watch
 from small_site import HANG_S, running_server, scene, site_of
 
 

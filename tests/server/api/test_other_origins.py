@@ -6,11 +6,11 @@ from pathlib import Path
 
 import httpx
 import pytest
-from scene_server import live
 from websockets.exceptions import ConnectionClosed
 
 from livessl.errors import ConfigError
 from livessl.site.tokens import add_token
+from scene_server import live
 from small_site import HANG_S, Changes, running_server, site_of
 
 PAGE = "https://intranet.example"

@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from scene_server import capture_scene, get, live
 
 from known_sounds import events, finish, places_m
 from livessl.server.app import Server
 from livessl.site.build import set_up
 from livessl.site.load import load_site
+from scene_server import capture_scene, get, live
 from small_site import HANG_S, running_server, scene, site_of, wait_until, write_site
 
 WRONG = {"arrays.south.orientation_deg": {"yaw": 25.0}, "arrays.south.position_m": [2.35, 3.7, 1.55]}

@@ -18,7 +18,6 @@ import httpx
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from scene_server import CLOCK, get, live, located_scene, replay_scene
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -29,6 +28,7 @@ from livessl.server.app import Server
 from livessl.server.event_log import EventLog
 from livessl.server.store import Store
 from livessl.site.tokens import add_token
+from scene_server import CLOCK, get, live, located_scene, replay_scene
 from small_site import HANG_S, SMALL, running_server, scene, site_of, wait_until
 
 PUBLIC = {"host": "0.0.0.0", "port": 0, "tokens": "tokens.yaml"}

@@ -9,11 +9,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from scene_server import capture_scene, get
 
 from known_sounds import events, finish, places_m
 from livessl.server.app import Server
 from livessl.site.build import set_up
+from scene_server import capture_scene, get
 from small_site import running_server, scene, site_of, wait_until
 
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from scene_server import replay_scene
 
 from browser import faultless_page, running_browser, visit
 from known_sounds import events, finish, places_m
 from livessl.core.types import Event
 from livessl.server.app import Server
+from scene_server import replay_scene
 from small_site import HANG_S, running_server, site_of
 
 pytestmark = [pytest.mark.browser]

@@ -11,7 +11,6 @@ from typing import Any
 
 import httpx
 import pytest
-from scene_server import live
 
 from livessl.server import connections
 from livessl.server.api import stream
@@ -19,6 +18,7 @@ from livessl.server.app import Server
 from livessl.server.fanout import BACKLOG
 from livessl.site.tokens import add_token, revoke_token
 from messages import event_message, update_message
+from scene_server import live
 from small_site import HANG_S, running_server, site_of, wait_until
 
 

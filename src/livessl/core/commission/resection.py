@@ -39,6 +39,9 @@ NEAREST_M: Final = 0.1
 CLAP_STD_S: Final = 12e-6
 """Standard deviation of the delays of a clap, seconds: it is short and loud, and its delays are sharper than others."""
 
+LEAST_CLAP_STD_S: Final = 2e-6
+"""Least standard deviation of the delays of claps that is assumed where they fit that well, seconds."""
+
 SPEED_STD_M_S: Final = 3.0
 """Standard deviation of the filed speed of sound, m/s: five degrees of temperature."""
 
@@ -189,12 +192,26 @@ def measure_poses(
     }
     freedom = Freedom(dict.fromkeys(rough, (UNKNOWN_M, UNKNOWN_DEG)), SPEED_STD_M_S, MICROPHONE_STD_M)
     adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, CLAP_STD_S)
+    # how exact the delays are decides how far the microphones may be from where they were built
+    std_s = min(max(_delay_std_s(adjusted, enough), LEAST_CLAP_STD_S), CLAP_STD_S)
+    adjusted = adjust(rough, enough, places_m, c_m_s, freedom, place_std_m, std_s)
     known = KnownPlaces(places_m, adjusted.c_m_s)
     poses = {
         name: _against_filed(microphones[name], adjusted.microphones[name], adjusted.poses[name], measured, known)
         for name, measured in enough.items()
     }
     return MeasuredSetUp(poses, adjusted.c_m_s, adjusted.c_std_m_s, adjusted.places_m, _misfit_s(adjusted))
+
+
+def _delay_std_s(adjusted: Adjusted, delays: Delays) -> float:
+    """Estimate the standard deviation of delays, seconds, from what a set-up leaves of them.
+
+    The misfits are root mean squares per delay; each pose takes six of the delays, the speed of sound one.
+    """
+    counts = np.sum([np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in delays.values()], axis=0)
+    rows = int(counts.sum())
+    squares = float((adjusted.misfits_s**2 * counts).sum())
+    return float(np.sqrt(squares / max(rows - 6 * len(delays) - 1, 1)))
 
 
 def received(delays_s: FloatArray) -> BoolArray:

@@ -36,13 +36,16 @@ peak-to-RMS ratio."""
 _WHOLE_SEGMENT_FIT: Final = (-3.56, 10.0, 0.82)
 """The same as `_ONSET_FIT` for evidence that includes whole segments; fitted where onsets alone were not sure."""
 
-_BACKGROUND_FIT: Final = 28.6
+_BACKGROUND_FIT: Final = 36.6
 """Log-odds by which a background that explains the whole power at the position lowers the confidence; fitted by
 `livessl evaluate localizer --scenario noise --half development`."""
 
 _BACKGROUND_RMS: Final = 2.5
 """Power of a background at a position, relative to its root mean square elsewhere, that is there by chance: it is known
 from some tenths of a second, and the position is where the background adds to the sound."""
+
+_LEAST_LOG_ODDS: Final = -100.0
+"""Log-odds below which a probability is 0 for every purpose; a background may be any number of times the power."""
 
 _DISTANCE_FIT: Final = (-0.04, 62.2)
 """Log-odds that no position further along the line of sight is as good: intercept, weight of the margin. It matters for
@@ -296,7 +299,7 @@ def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:
 
 
 def _probability(log_odds: float) -> float:
-    return float(1.0 / (1.0 + np.exp(-log_odds)))
+    return float(1.0 / (1.0 + np.exp(-max(log_odds, _LEAST_LOG_ODDS))))
 
 
 def peak_to_rms(evidence: Evidence, power: float) -> float:

@@ -44,9 +44,9 @@ BACKGROUND: Final = 0.05
 subtracted and the sound is looked for beneath it."""
 
 
-FAR_BELOW: Final = 0.1
-COMPARABLE: Final = 0.2
-"""Power of a background relative to that of the sound, 10 and 7 dB below, from which on it counts, and counts in full.
+FAR_BELOW: Final = 0.05
+COMPARABLE: Final = 0.1
+"""Power of a background relative to that of the sound, 13 and 10 dB below, from which on it counts, and counts in full.
 What a room still gives of an earlier sound from the same place is usually weaker."""
 
 

@@ -104,6 +104,10 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     async def history_page() -> FileResponse:
         return FileResponse(STATIC / "history.html")
 
+    @app.get("/embed", include_in_schema=False)
+    async def embedded_map() -> FileResponse:
+        return FileResponse(STATIC / "embed.html")
+
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     if access.wanted:
         _describe_tokens(app.openapi())

@@ -43,6 +43,9 @@ CLOSE_S: Final = 1.0
 _SOUND: Final = re.compile(r"/api/v1/(events/[^/]*/clips/.+|listen)", re.DOTALL)
 """Addresses of recordings and of live sound: sound is for operators, whoever may see where it was."""
 
+_OPEN: Final = frozenset({"/", "/docs", "/embed", "/history", HEALTH})
+"""Addresses that everyone may read: pages without data, and the status."""
+
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 
 _log = logging.getLogger(__name__)
@@ -201,7 +204,7 @@ def needed_role(method: str, path: str) -> Role | None:
     pattern of a route ignores it.
     """
     path = path.removesuffix("\n")
-    if method in _READING and (path in ("/", "/docs", "/history", HEALTH) or path.startswith(("/static/", "/docs/"))):
+    if method in _READING and (path in _OPEN or path.startswith(("/static/", "/docs/"))):
         return None
     if path in (ACCESS, LOG):
         return Role.ADMIN

@@ -273,7 +273,7 @@ class SetUp(BaseModel):
 
     v: Version
     calibration: Calibration
-    arrays: dict[str, PlacedMicrophones]
+    arrays: dict[str, PlacedMicrophones] = Field(description="Where each array is now, by its name.")
     next_place_m: PlaceM | None = Field(description="Where to clap first; null if no place is free.")
     refinement: Refinement
 
@@ -284,4 +284,4 @@ class Changed(BaseModel):
     v: Version
     changed: list[str] = Field(description="Arrays whose poses are other ones now.", examples=[["south"]])
     calibration: Calibration
-    arrays: dict[str, PlacedMicrophones]
+    arrays: dict[str, PlacedMicrophones] = Field(description="Where each array is now, by its name.")

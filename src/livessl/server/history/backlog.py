@@ -109,13 +109,13 @@ class Backlog:
         if self._thread is None and self._waiting and now_ns - self._tried_ns >= RETRY_NS:
             self._try(now_ns)
 
-    def settle(self) -> None:
-        """Return when all that was put before is written, after `SETTLE_S`, or at once if the database fails."""
+    def settle(self, within_s: float = SETTLE_S) -> None:
+        """Return when all that was put before is written, after a time in seconds, or at once if the database fails."""
         if self._thread is None or self._thread is threading.current_thread():
             return
         with self._changed:
             wanted = self._put
-            self._changed.wait_for(lambda: self._done >= wanted or self.is_failing or self._is_ending, SETTLE_S)
+            self._changed.wait_for(lambda: self._done >= wanted or self.is_failing or self._is_ending, within_s)
 
     def start(self) -> None:
         """Start the thread."""

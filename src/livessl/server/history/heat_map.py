@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, select, text
+from sqlalchemy import Connection, and_, case, func, text
 
 from livessl.server.history.query import Query
 from livessl.server.history.search import matching
@@ -59,13 +59,17 @@ def count_by_cell(connection: Connection, query: Query, cells: Cells) -> HeatMap
     Those on the last edges are in the last cells. The pages of the query do not matter.
     """
     places = [events.c.x_mm, events.c.y_mm]
-    indices = [(place - low) // cells.spacing_mm for place, low in zip(places, cells.low_mm, strict=True)]
+    limits = zip(places, cells.low_mm, cells.high_mm, strict=True)
+    is_inside = and_(*(place.between(low, high) for place, low, high in limits))
+    indices = [
+        case((is_inside, (place - low) // cells.spacing_mm), else_=None)
+        for place, low in zip(places, cells.low_mm, strict=True)
+    ]
     statement, _ = matching(query, *indices, func.count())
-    for place, low, high in zip(places, cells.low_mm, cells.high_mm, strict=True):
-        statement = statement.where(place >= low, place <= high)
-    counts = np.zeros(cells.shape, dtype=np.int64)
+    counts, elsewhere = np.zeros(cells.shape, dtype=np.int64), 0
     for i, j, count in connection.execute(statement.group_by(text("1"), text("2"))):
-        counts[min(i, cells.shape[0] - 1), min(j, cells.shape[1] - 1)] += count
-    everything, _ = matching(query, events.c.number)
-    total = connection.execute(select(func.count()).select_from(everything.subquery())).scalar_one()
-    return HeatMap(counts, int(total) - int(counts.sum()))
+        if i is None:
+            elsewhere += count
+        else:
+            counts[min(i, cells.shape[0] - 1), min(j, cells.shape[1] - 1)] += count
+    return HeatMap(counts, elsewhere)

@@ -78,6 +78,11 @@ tags: Final = Table(
 with what a search compares besides. The only flag is `excluded`."""
 
 Index("event_tags_number", tags.c.number)
+Index(
+    "event_tags_search",
+    *(tags.c[name] for name in ("kind", "name", "time_ns", "number")),
+    postgresql_include=["confidence", "status", "level_dbfs"],
+).ddl_if(dialect="postgresql")  # SQLite keeps the rows in the order of the key, with all that is compared
 
 early: Final = Table("early", metadata, Column("id", String, nullable=False), PrimaryKeyConstraint("id"))
 """Ids of events that a final pass may still replace."""

@@ -1,4 +1,4 @@
-"""The journal, and a tag on the events that lie in excluded zones, by which they are found or left out."""
+"""The journal, a tag on the events in excluded zones, and an index with all that PostgreSQL compares in a search."""
 
 from __future__ import annotations
 
@@ -32,4 +32,7 @@ def upgrade() -> None:
     )
     op.create_index("journal_time", "journal", ["time_ns", "number"])
     op.create_index("journal_kind", "journal", ["kind", "time_ns", "number"])
+    if op.get_bind().dialect.name == "postgresql":  # SQLite keeps the rows in the order of the key
+        keys, compared = ["kind", "name", "time_ns", "number"], ["confidence", "status", "level_dbfs"]
+        op.create_index("event_tags_search", "event_tags", keys, postgresql_include=compared)
     op.get_bind().execute(COPY_TAGS, {"part": '%"excluded":true%'})
