@@ -84,6 +84,7 @@ def test_messages_are_taken_in_once_and_in_order(archive: Archive) -> None:
     again = archive.take([delivery(number) for number in (4, 1, 3, 2)], PATIENCE)
     assert (len(again.done), again.early) == (4, [])
     assert stored(archive) == names(1, 4)
+    assert site_of(archive)["newest_event_utc"] == event(4)["time_utc"]
 
 
 def test_sites_and_outboxes_do_not_wait_for_each_other(archive: Archive) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import orjson
-from sqlalchemy import Connection, bindparam, delete, func, insert, select, text, tuple_, update
+from sqlalchemy import Connection, bindparam, case, delete, insert, select, text, tuple_, update
 
 from livessl.clock import Clock, utc_ns, utc_text
 from livessl.federation.received import RECEIVED
@@ -41,7 +41,11 @@ _RAISE: Final = (
 _HEARD: Final = (
     update(sites)
     .where(sites.c.site == bindparam("of_site"))
-    .values(contact_ns=bindparam("now_ns"), missing=sites.c.missing + bindparam("more"))
+    .values(
+        contact_ns=bindparam("now_ns"),
+        missing=sites.c.missing + bindparam("more"),
+        newest_ns=case((sites.c.newest_ns < bindparam("newest"), bindparam("newest")), else_=sites.c.newest_ns),
+    )
 )
 
 _log = logging.getLogger(__name__)
@@ -162,7 +166,11 @@ class Archive:
             _put(connection, batch)
             raised = [{"of_site": site, "of_outbox": box, "number": number} for (site, box), number in last.items()]
             connection.execute(_RAISE, raised)
-            self._touch(connection, {site for site, _ in places}, missing)
+            newest: dict[str, int] = {}
+            for site, kind, message in batch:
+                if kind == "event":
+                    newest[site] = max(newest.get(site, 0), utc_ns(message["time_utc"]))
+            self._touch(connection, {site for site, _ in places}, missing, newest)
         return taken
 
     def _skip(self, delivery: Delivery) -> Taken:
@@ -178,20 +186,33 @@ class Archive:
     def note_report(self, site: str, report: JsonObject) -> None:
         """Keep a site's newest report on itself."""
         with self._database.writing(f"store the report of site {site!r}") as connection:
-            self._touch(connection, {site}, {})
+            self._touch(connection, {site}, {}, {})
             body = orjson.dumps(report).decode()
             connection.execute(update(sites).where(sites.c.site == site).values(report=body))
 
-    def _touch(self, connection: Connection, names: set[str], missing: Mapping[str, int]) -> None:
-        """Note that sites were heard of now, and how many of their messages are missing."""
+    def _touch(
+        self, connection: Connection, names: set[str], missing: Mapping[str, int], newest: Mapping[str, int]
+    ) -> None:
+        """Note that sites were heard of now, how many messages are missing, and the starts of their newest events."""
         known = set(connection.execute(select(sites.c.site).where(sites.c.site.in_(names))).scalars())
         now_ns = self._clock.now_ns()
-        rows = [{"site": site, "contact_ns": now_ns, "missing": missing.get(site, 0)} for site in sorted(names)]
+        rows = [
+            {
+                "site": site,
+                "contact_ns": now_ns,
+                "missing": missing.get(site, 0),
+                "newest_ns": newest.get(site, 0),
+            }
+            for site in sorted(names)
+        ]
         new = [{**row, "report": "{}"} for row in rows if row["site"] not in known]
         if new:
             connection.execute(insert(sites), new)
         if known:
-            heard = [{"of_site": row["site"], "now_ns": now_ns, "more": row["missing"]} for row in rows]
+            heard = [
+                {"of_site": row["site"], "now_ns": now_ns, "more": row["missing"], "newest": row["newest_ns"]}
+                for row in rows
+            ]
             connection.execute(_HEARD, [row for row in heard if row["of_site"] in known])
 
     # --- which hub takes messages in
@@ -224,17 +245,9 @@ class Archive:
             for row in connection.execute(select(arrays.c.site, arrays.c.body)):
                 array = orjson.loads(row.body)
                 states.setdefault(row.site, {})[array["name"]] = array["state"]
-            newest = {
-                row.site: connection.execute(
-                    select(func.max(history.tags.c.time_ns)).where(
-                        history.tags.c.kind == "site", history.tags.c.name == row.site
-                    )
-                ).scalar()
-                for row in rows
-            }
-        return [self._described(row, states[row.site], newest[row.site]) for row in rows]
+        return [self._described(row, states[row.site]) for row in rows]
 
-    def _described(self, row: Any, states: Mapping[str, str], newest_ns: int | None) -> JsonObject:
+    def _described(self, row: Any, states: Mapping[str, str]) -> JsonObject:
         report = orjson.loads(row.report)
         age_s = (self._clock.now_ns() - row.contact_ns) / 1e9
         current = {**states, **report.get("arrays", {})}
@@ -248,7 +261,7 @@ class Archive:
             "arrays": current,
             "waiting": report.get("waiting", 0),
             "missing": row.missing,
-            "newest_event_utc": None if newest_ns is None else utc_text(newest_ns),
+            "newest_event_utc": utc_text(row.newest_ns) if row.newest_ns else None,
         }
 
     def event(self, site: str, event_id: str) -> JsonObject | None:

@@ -73,10 +73,12 @@ sites: Final = Table(
     Column("site", String, nullable=False),
     Column("contact_ns", BigInteger, nullable=False),
     Column("missing", BigInteger, nullable=False),
+    Column("newest_ns", BigInteger, nullable=False),
     Column("report", Text, nullable=False),
     PrimaryKeyConstraint("site"),
 )
-"""Sites of the hub: last contact, messages that never came, and the site's last report on itself as JSON."""
+"""Sites of the hub: last contact, messages that never came, start of the newest event (0 for none), and the last report
+of the site on itself as JSON."""
 
 received: Final = Table(
     "hub_received",

@@ -32,7 +32,7 @@ def upgrade() -> None:
     op.create_table(
         "hub_sites",
         sa.Column("site", sa.String, nullable=False),
-        *(sa.Column(name, sa.BigInteger, nullable=False) for name in ("contact_ns", "missing")),
+        *(sa.Column(name, sa.BigInteger, nullable=False) for name in ("contact_ns", "missing", "newest_ns")),
         sa.Column("report", sa.Text, nullable=False),
         sa.PrimaryKeyConstraint("site", name="hub_sites_key"),
     )
