@@ -136,8 +136,8 @@ def _save(server: Server, name: str, folder: Path) -> Path:
 def test_python_client_returns_typed_events(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     description = _save(server, "openapi.json", tmp_path)
     config = tmp_path / "config.json"  # as docs/api.md says
-    sounds = dict.fromkeys(("audio/flac", "audio/wav"), "application/octet-stream")
-    config.write_text(json.dumps({"content_type_overrides": sounds}))
+    binary = dict.fromkeys(("audio/flac", "audio/wav", "image/png"), "application/octet-stream")
+    config.write_text(json.dumps({"content_type_overrides": binary}))
     done = _run(
         *(sys.executable, "-m", "openapi_python_client", "generate", "--fail-on-warning", "--config", config),
         *("--path", description, "--meta", "none", "--output-path", tmp_path / "generated_client"),

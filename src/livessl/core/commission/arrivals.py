@@ -25,14 +25,17 @@ class Arrivals:
     times_s : (S, A) float64
         Mean time over the microphones of each array, seconds, up to a constant for each sound; NaN where an array did
         not receive it.
+    std_s : float
+        Standard deviation of a difference of two times, seconds.
     """
 
     arrays: tuple[str, ...]
     times_s: FloatArray
+    std_s: float = ARRIVAL_STD_S
 
     def of_sounds(self, used: IntArray) -> Arrivals:
         """Return the times of some of the sounds."""
-        return Arrivals(self.arrays, self.times_s[used])
+        return Arrivals(self.arrays, self.times_s[used], self.std_s)
 
     def contradictions_s(self, microphones: Microphones, positions_m: FloatArray, c_m_s: float) -> FloatArray:
         """Return the differences (S, A) between predicted and measured times of sounds at places (S, 3), seconds."""

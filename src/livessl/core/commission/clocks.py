@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from livessl.core.commission.envelopes import HOP_S
 from livessl.core.commission.finding import Finding, Severity

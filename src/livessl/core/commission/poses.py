@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from livessl.core.commission.arrivals import ARRIVAL_STD_S, Arrivals
+from livessl.core.commission.arrivals import Arrivals
 from livessl.core.commission.places import Delays, Microphones, contradictions_s, slopes_s_m
 from livessl.core.types import FloatArray
 
@@ -137,6 +137,7 @@ def adjust(
     place_std_m: float = UNKNOWN_M,
     delay_std_s: float = DELAY_STD_S,
     arrivals: Arrivals | None = None,
+    begin: Adjusted | None = None,
 ) -> Adjusted:
     """Find the poses, the speed of sound and the places that explain delays best.
 
@@ -157,11 +158,13 @@ def adjust(
         Standard deviation of the delays, seconds.
     arrivals : Arrivals or None
         Times between arrays that share a clock.
+    begin : Adjusted or None
+        Result of another adjustment of the same set-up, at which this one begins.
     """
     problem = _Problem(microphones, delays, places_m, c_m_s, freedom, place_std_m, delay_std_s, arrivals)
     solved = least_squares(
         problem.residuals,
-        problem.start,
+        problem.start if begin is None else problem.at(begin),
         problem.slopes,
         x_scale=problem.scale,
         loss="soft_l1",
@@ -201,6 +204,18 @@ class _Problem:
         self.start = np.concatenate([np.zeros(len(few)), places_m.ravel()])
         self.scale = np.array(few + [1.0] * places_m.size)
 
+    def at(self, adjusted: Adjusted) -> FloatArray:
+        """Return the unknowns of a result, with the microphones where they were built."""
+        unknowns = self.start.copy()
+        for index, name in enumerate(self._free):
+            pose = adjusted.poses[name]
+            first = index * _UNKNOWNS
+            unknowns[first : first + _UNKNOWNS] = [*pose.shift_m, *np.radians(pose.turn_deg)]
+        if self._freedom.speed_std_m_s > 0.0:
+            unknowns[len(self._free) * _UNKNOWNS] = adjusted.c_m_s - self._c_m_s
+        unknowns[-self._places_m.size :] = adjusted.places_m.ravel()
+        return unknowns
+
     def residuals(self, unknowns: FloatArray) -> FloatArray:
         """Delays and priors, in standard deviations."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
@@ -215,7 +230,7 @@ class _Problem:
             parts.append(self._offsets(unknowns) / self._freedom.microphone_std_m)
         if self._arrivals is not None:
             off_s = self._arrivals.contradictions_s(at_m, places_m, speed_m_s)
-            parts.append(off_s.ravel() / ARRIVAL_STD_S)
+            parts.append(off_s.ravel() / self._arrivals.std_s)
         parts.append(((places_m - self._places_m) / self._place_std_m).ravel())
         return np.concatenate(parts)
 
@@ -237,7 +252,7 @@ class _Problem:
         blocks = slopes[: len(sounds) * rows, few:].reshape(len(sounds), rows, len(sounds), 3)
         blocks[sounds, :, sounds] = of_places
         if self._arrivals is not None:
-            of_times = self._arrivals.slopes_s_m(at_m, places_m, speed_m_s) / ARRIVAL_STD_S
+            of_times = self._arrivals.slopes_s_m(at_m, places_m, speed_m_s) / self._arrivals.std_s
             count = of_times.shape[0] * of_times.shape[1]
             rows_of_times = slopes[-places_m.size - count : -places_m.size, few:]
             rows_of_times.reshape(len(sounds), -1, len(sounds), 3)[sounds, :, sounds] = of_times

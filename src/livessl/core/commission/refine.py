@@ -32,6 +32,10 @@ OUTLIER: Final = 3.5
 LEAST_OUTLIER_S: Final = 30e-6
 """Misfit, in seconds, below which no sound is an outlier."""
 
+CONTRADICTION: Final = 3.0
+"""Misfit with the times between arrays, in misfits without them, from which they contradict the delays. Then they
+are left out, and positions are no better known than in the site file."""
+
 LEAST_STD_S: Final = 5e-6
 """Least standard deviation of the delays that is assumed, seconds."""
 
@@ -99,7 +103,17 @@ def refine(
     kept = {name: measured[used] for name, measured in delays.items()}
     std_s = _delay_std_s(first.misfits_s[used], kept, len(free))
     times = None if arrivals is None else arrivals.of_sounds(np.flatnonzero(shared)[used])
-    last = _adjusted(start, kept, search, replace(freedom, microphone_std_m=MICROPHONE_STD_M), std_s, times)
+    exact = replace(freedom, microphone_std_m=MICROPHONE_STD_M)
+    last = _adjusted(start, kept, search, exact, std_s)
+    if times is not None:
+        # poses that fit all times between arrays, but not the delays within them, are another lowest point far away
+        with_times = _adjusted(start, kept, search, exact, std_s, times, last)
+        off_s = times.contradictions_s(with_times.microphones, with_times.places_m, with_times.c_m_s)
+        if _rms(off_s) > times.std_s:  # an array received some sounds by an echo
+            times = replace(times, std_s=_rms(off_s))
+            with_times = _adjusted(start, kept, search, exact, std_s, times, with_times)
+        if _rms(with_times.misfits_s) <= max(CONTRADICTION * _rms(last.misfits_s), LEAST_STD_S):
+            last = with_times
     placed = {name: last.microphones[name] if name in free else at_m for name, at_m in start.items()}
     before_s = search.fit(microphones, kept).misfit_s
     after_s = PlaceSearch(bounds_m, last.c_m_s).fit(placed, kept).misfit_s
@@ -118,9 +132,16 @@ def _adjusted(
     freedom: Freedom,
     delay_std_s: float = DELAY_STD_S,
     arrivals: Arrivals | None = None,
+    begin: Adjusted | None = None,
 ) -> Adjusted:
     places_m = search.fit(start, delays).positions_m
-    return adjust(start, delays, places_m, search.c_m_s, freedom, delay_std_s=delay_std_s, arrivals=arrivals)
+    return adjust(
+        start, delays, places_m, search.c_m_s, freedom, delay_std_s=delay_std_s, arrivals=arrivals, begin=begin
+    )
+
+
+def _rms(misfits_s: FloatArray) -> float:
+    return float(np.sqrt(np.mean(misfits_s**2)))
 
 
 def _turned(
