@@ -97,6 +97,7 @@ class Engine:
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._prepare: Callable[[], None] | None = None
+        self._has_turned = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
@@ -131,8 +132,13 @@ class Engine:
         self._coming.append((site, set_up))
 
     def wait_idle(self) -> None:
-        """Return when the running replay has ended and its last event is published."""
-        while self._site_time.replay_is_running and self.failure is None and self._thread.is_alive():
+        """Return when the replay that was sent has ended and its last event is published.
+
+        The first turn comes after what computes is loaded; until then it is not known whether a replay was sent.
+        """
+        while self.failure is None and self._thread.is_alive():
+            if self._has_turned.is_set() and not self._site_time.replay_is_running:
+                return
             self._stop.wait(WAIT_S)
 
     def turn(self) -> None:
@@ -176,6 +182,7 @@ class Engine:
                 self._prepare()
             while not self._stop.is_set():
                 self.turn()
+                self._has_turned.set()
         except BaseException as error:
             self.failure = error
             _log.exception("the fusion thread has failed; the server ends")
