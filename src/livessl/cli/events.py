@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add = parser.add_argument
     add("--url", default=URL, help=f"address of the server (default: {URL})")
-    add("--token-file", type=Path, metavar="FILE", help="file that holds a token, if the server wants one")
+    add("--token-file", type=Path, metavar="FILE", help="file that holds a token, if the server requires one")
     add("--ca-file", type=Path, metavar="FILE", help="PEM file of the authority of the server's certificate")
     add(
         "--kinds",
@@ -36,10 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--zone", help="print only what is inside this zone")
     add("--min-confidence", type=float, metavar="C", help="least confidence of events and updates, 0 to 1")
-    add("--track", type=argument.count, metavar="N", help="of tracks, print only this one")
-    add("--max-rate", type=argument.above_zero, metavar="HZ", help="most states a second of one sound or track")
+    add("--track", type=argument.count, metavar="N", help="print no tracks but number N")
+    add(
+        "--max-rate",
+        type=argument.above_zero,
+        metavar="HZ",
+        help="at most HZ updates a second of each sound, track and array",
+    )
     add("--since", type=_time, metavar="TIME", help="begin with the stored events from this time on (RFC 3339)")
-    add("--limit", type=argument.positive, metavar="N", help="end after so many messages")
+    add("--limit", type=argument.positive, metavar="N", help="end after N messages")
     add_json(parser, "print one JSON object per message")
 
 

@@ -25,7 +25,7 @@ LEAST_GUIDED: Final = 6
 """Fewest claps after which the poses may be good enough: with four or five, one bad clap is not noticed."""
 
 MOST_GUIDED: Final = 12
-"""Most claps that are asked for where no place is given."""
+"""Largest number of proposed places, if the user gives none."""
 
 
 def ask_for(text: str) -> None:

@@ -13,7 +13,9 @@ from livessl.clock import SystemClock
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--config", type=Path, required=True, help="the hub's file; docs/scaling.md describes it")
+    parser.add_argument(
+        "--config", type=Path, required=True, help="the hub's settings (YAML); docs/scaling.md describes them"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

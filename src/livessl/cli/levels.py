@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--device", metavar="NAME", help="name, or part of it, as `livessl devices` prints it")
-    parser.add_argument("--site", type=Path, help="site file; --node chooses whose device to meter")
+    parser.add_argument("--site", type=Path, help="site file; meters the device of the node given by --node")
     parser.add_argument("--node", help="name of the node in the site file")
     parser.add_argument("--wav", type=Path, metavar="FILE", help="meter a WAV or FLAC file instead of a device")
     parser.add_argument(
@@ -37,7 +37,7 @@ def add_arguments(parser: Any) -> None:
         metavar="FILE",
         help="new WAV file that --listen writes (default: input-CH.wav in this folder)",
     )
-    add_json(parser, "print one JSON object per input and second, per tap and per problem")
+    add_json(parser, "print one JSON object for each input every second, each tap and each problem")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,7 +70,7 @@ def _check(arguments: argparse.Namespace) -> Site | None:
     if arguments.inputs is not None and arguments.wav is not None:
         faults.append(Fault("--inputs", "applies to a device only; remove it"))
     if arguments.out is not None and arguments.listen is None:
-        faults.append(Fault("--out", "is the file of --listen, which is not given; add --listen CH, or remove it"))
+        faults.append(Fault("--out", "needs --listen; add --listen CH, or remove --out; add --listen CH, or remove it"))
     if arguments.listen is not None and arguments.out.exists():
         faults.append(Fault(f"--out {arguments.out}", "expected a new file, but it exists; choose another name"))
     if faults:

@@ -41,8 +41,8 @@ class Command:
 COMMANDS: Final = (
     Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
-    Command("hub", "run the hub of many sites", "livessl hub --config hub.yaml"),
-    Command("events", "follow the events of a running server", "livessl events --zone door --json"),
+    Command("hub", "show the events of many sites together", "livessl hub --config hub.yaml"),
+    Command("events", "print live messages of a running server", "livessl events --zone door --json"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
         "locate",
@@ -83,7 +83,7 @@ COMMANDS: Final = (
     ),
     Command(
         "support-bundle",
-        "collect what helps others to find a fault, without secrets",
+        "write a zip with logs, settings and versions for whoever helps you",
         "livessl support-bundle --site site.yaml",
     ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),

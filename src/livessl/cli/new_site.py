@@ -50,7 +50,7 @@ def write(arguments: argparse.Namespace) -> int:
     _refuse_to_overwrite(path, arguments.force)
     questions = Questions(ask=not arguments.yes and sys.stdin.isatty())
     if not (questions.asks or arguments.yes):
-        logging.info("the input is no terminal: nothing is asked, as with --yes")
+        logging.info("stdin is not a terminal, so defaults are used, as with --yes")
     draft = _draft(arguments, questions)
     text = site_text(draft)
     warnings = _parsed(draft).warnings
@@ -157,7 +157,7 @@ def _room(arguments: argparse.Namespace, questions: Questions) -> tuple[Position
 
 
 def _in_the_middle(room_m: Position) -> DraftArray:
-    """Return a small array with which a site of this room is complete and without faults of its own."""
+    """Return a small array as a placeholder, so that the room can be checked alone."""
     x, y, z = room_m
     return DraftArray("array", "tetrahedron", min(room_m) / 10.0, 4, (x / 2.0, y / 2.0, z / 2.0), 0.0)
 

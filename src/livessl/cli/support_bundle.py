@@ -64,7 +64,7 @@ class Bundle:
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--site", type=Path, required=True, help="site file; it need not be valid")
-    add_server(parser, "default: the address that the site file gives, on this machine")
+    add_server(parser, "default: this machine, with the port of the site file")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: livessl-support-TIME.zip)")
     add_json(parser, "print one JSON object: the file, its parts with their sizes, and what is missing and why")
 

@@ -30,7 +30,7 @@ class NoSiteFileError(RunError):
 
 
 class Poses(Protocol):
-    """Holds where the microphones are while a server runs."""
+    """Holds where the microphones are while a server runs: `SetUpInForce`."""
 
     @property
     def site(self) -> Site:

@@ -58,7 +58,13 @@ def test_client_that_returns_gets_what_it_missed(server: Server) -> None:
 @pytest.mark.parametrize(
     ("query", "reason"),
     [
-        ("?kinds=events", "kinds: expected some of alert, arrays, event, track, update, zone, zones, got 'events'"),
+        (
+            "?kinds=events",
+            "kinds: expected some of alert, arrays, event, poses, track, update, zone, zones, got 'events'",
+        ),
+            "?kinds=events",
+            "kinds: expected some of alert, arrays, event, poses, track, update, zone, zones, got 'events'",
+        ),
         ("?since_seq=-1", "since_seq: expected the seq of a message, got '-1'"),
         ("?since_seq=x", "since_seq: expected the seq of a message, got 'x'"),
         ("?zone=hall", "zone: no zone 'hall'; zones are door, room"),

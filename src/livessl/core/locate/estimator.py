@@ -1,4 +1,4 @@
-"""Estimators: what one is given, what it returns, and how a method of one's own is added to the built-in ones.
+"""The interface of estimators, and the registry to which you add your own.
 
 `Estimator` is the protocol. `livessl.core.locate.map_estimator.MapEstimator` is a base class that leaves only
 `locate` to write.
@@ -120,7 +120,7 @@ class Localization:
     features : ConfidenceFeatures or None
         What the confidence was computed from; None if it is no probability.
     refused : str or None
-        Why the position should not be relied on, in words; None if it may be.
+        Why the position should not be relied on, in words; None if the position can be relied on.
     outliers : mapping of str to float, or None
         Arrays that disagree with the others and were left out of the position, and the angle in degrees between each
         one's own direction and the position. None if the estimator does not look for outliers.
