@@ -212,7 +212,7 @@ def test_input_that_is_no_terminal_is_not_read(tmp_path: Path) -> None:
         os.close(reader)
         os.close(writer)
     assert done.returncode == 0, done.stderr
-    assert "nothing is asked" in done.stderr
+    assert "defaults are used" in done.stderr
     assert load_site(tmp_path / "site.yaml").warnings == ()
 
 
