@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from livessl.client import resumption
 from livessl.client.options import Options, Wanted
+from livessl.client.reading import NewerServerError
 from livessl.client.resumption import (
     Deliver,
     Get,
     Memory,
-    NewerServerError,
     Receive,
     Steps,
     conversation,

@@ -4,7 +4,8 @@
 
     with client.connect("http://127.0.0.1:8000", kinds=["event"]) as live:
         for event in live:
-            print(event.time_utc, event.status, event.position_m)
+            if isinstance(event, client.Event):  # a Gap comes whichever kinds are asked for
+                print(event.time_utc, event.status, event.position_m)
 
 `aconnect` does the same with `async with` and `async for`. This package needs Pydantic and `websockets`, and nothing of
 the server. Each name below is loaded when it is first used, so that the import takes no time.
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from livessl.client.address import RefusedError, UnreachableError
     from livessl.client.aio import AsyncClient, aconnect
     from livessl.client.options import Options
-    from livessl.client.resumption import NewerServerError, Received
+    from livessl.client.reading import ForeignAnswerError, NewerServerError
+    from livessl.client.resumption import Received
     from livessl.client.sync import Client, connect
     from livessl.schema.alerts import Alert
     from livessl.schema.answers import Arrays, Health, HealthStatus, Site, Tracks
@@ -44,6 +46,7 @@ __all__ = [
     "Client",
     "Event",
     "EventMessage",
+    "ForeignAnswerError",
     "Gap",
     "Health",
     "HealthStatus",
@@ -68,7 +71,8 @@ _HOMES: Final = {
     "client.address": ("RefusedError", "UnreachableError"),
     "client.aio": ("AsyncClient", "aconnect"),
     "client.options": ("Options",),
-    "client.resumption": ("NewerServerError", "Received"),
+    "client.reading": ("ForeignAnswerError", "NewerServerError"),
+    "client.resumption": ("Received",),
     "client.sync": ("Client", "connect"),
     "schema.alerts": ("Alert",),
     "schema.answers": ("Arrays", "Health", "HealthStatus", "Site", "Tracks"),

@@ -17,6 +17,7 @@ from websockets.asyncio.client import connect as open_socket
 from livessl.client.address import Address, UnavailableError, UnreachableError
 from livessl.client.options import Options, Wanted
 from livessl.client.questions import event_query, health_of
+from livessl.client.reading import read_answer
 from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, Steps, conversation, live_query
 from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience
 from livessl.schema.answers import Arrays, EventPage, Health, HealthStatus, OneEvent, Site, Tracks
@@ -154,7 +155,7 @@ class AsyncClient:
         return health_of(await asyncio.to_thread(self._address.get, "health"))
 
     async def _ask(self, path: str, model: type[M], query: dict[str, str] | None = None) -> M:
-        return model.model_validate_json(await asyncio.to_thread(self._address.get, path, query))
+        return read_answer(model, await asyncio.to_thread(self._address.get, path, query), path)
 
     async def _converse(self, patience: Patience) -> AsyncGenerator[Received, None]:
         """Carry out the steps of one connection."""

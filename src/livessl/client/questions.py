@@ -6,9 +6,10 @@ from datetime import datetime
 from functools import cache
 from typing import Any, Final
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from livessl.client.options import rfc3339
+from livessl.client.reading import unreadable
 from livessl.schema.answers import Health, HealthStatus
 
 PAGE: Final = 500
@@ -33,8 +34,17 @@ def event_query(
 
 
 def health_of(body: bytes) -> Health | HealthStatus:
-    """Return the condition of a server, of which it says less without a token."""
-    found: Health | HealthStatus = _health().validate_json(body)
+    """Return the condition of a server, of which it says less without a token.
+
+    Raises
+    ------
+    NewerServerError, ForeignAnswerError
+        See `read_answer`.
+    """
+    try:
+        found: Health | HealthStatus = _health().validate_json(body)
+    except ValidationError as error:
+        raise unreadable(error, "health") from error
     return found
 
 

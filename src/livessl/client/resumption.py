@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from livessl.client.options import Wanted
-from livessl.errors import RunError
+from livessl.client.reading import NewerServerError, read_answer
 from livessl.schema.alerts import Alert
 from livessl.schema.answers import EventLog, EventPage
 from livessl.schema.messages import (
@@ -63,10 +63,6 @@ Received = (
     | Gap
 )
 """What a client delivers. An event is an `EventMessage` if it came live, and an `Event` if it was missed."""
-
-
-class NewerServerError(RunError):
-    """A message that this client cannot read, because the server is newer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +186,7 @@ def _read_log(memory: Memory, wanted: Wanted) -> Steps:
         body = yield Get("event-log", {**wanted.filters, "after": memory.position, "limit": str(PAGE)})
         if body is None:
             return
-        page = EventLog.model_validate_json(body)
+        page = read_answer(EventLog, body, "event-log")
         if not page.complete:
             reason = "the server does not have all events since the connection was lost; it may have lost its history"
             yield Deliver(Gap(kind="gap", v=1, missed=None, reason=reason))
@@ -206,13 +202,13 @@ def _begin(memory: Memory, wanted: Wanted) -> Steps:
     body = yield Get("event-log", {})
     if body is None:
         return
-    begin, events, cursor = EventLog.model_validate_json(body), list[Event](), ""
+    begin, events, cursor = read_answer(EventLog, body, "event-log"), list[Event](), ""
     while wanted.since is not None and cursor is not None:
         query = {**wanted.filters, "since": wanted.since, "limit": str(PAGE)}
         body = yield Get("events", query if cursor == "" else {**query, "cursor": cursor})
         if body is None:
             return
-        page = EventPage.model_validate_json(body)
+        page = read_answer(EventPage, body, "events")
         events += page.events
         cursor = page.next_cursor  # type: ignore[assignment]
     memory.position, memory.is_behind = begin.position, begin.unsaved > 0  # there is no further request that could fail

@@ -16,6 +16,7 @@ from websockets.sync.client import connect as open_socket
 from livessl.client.address import Address, UnavailableError, UnreachableError
 from livessl.client.options import Options, Wanted
 from livessl.client.questions import event_query, health_of
+from livessl.client.reading import read_answer
 from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, Steps, conversation, live_query
 from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience
 from livessl.schema.answers import Arrays, EventPage, Health, HealthStatus, OneEvent, Site, Tracks
@@ -152,7 +153,7 @@ class Client:
         return health_of(self._address.get("health"))
 
     def _ask(self, path: str, model: type[M], query: dict[str, str] | None = None) -> M:
-        return model.model_validate_json(self._address.get(path, query))
+        return read_answer(model, self._address.get(path, query), path)
 
     def _converse(self, patience: Patience) -> Generator[Received, None, None]:
         """Carry out the steps of one connection."""

@@ -123,18 +123,22 @@ class Contribution(Model):
         ge=0, description="Distance from the array's centre to the position, in metres.", examples=[2.6]
     )
     agrees: bool | None = Field(
+        default=None,
         description="Whether the array agrees with the others. One that does not is an outlier and has no part in the "
         "position. Null where this cannot be decided.",
         examples=[True],
     )
     off_deg: float | None = Field(
+        default=None,
         ge=0,
         le=180,
         description="Angle in degrees between its own direction and the position, for an outlier; otherwise null.",
         examples=[None],
     )
     asked: bool = Field(
-        description="Whether it did not detect the sound and its frames were requested from its node.", examples=[False]
+        default=False,
+        description="Whether it did not detect the sound and its frames were requested from its node.",
+        examples=[False],
     )
 
 
@@ -189,7 +193,10 @@ class Membership(Model):
 
 
 class Event(Model):
-    """A finished sound: the accurate answer."""
+    """A finished sound: the accurate answer.
+
+    Every live event has all fields. A stored one may lack those with a default if an older release has stored it.
+    """
 
     kind: Literal["event"]
     id: str = Field(description="Name of the event; it never changes.", examples=["small-1767225600000-1"])
@@ -219,25 +226,29 @@ class Event(Model):
     )
     contributions: list[Contribution] = Field(description="One entry for each array that was used.")
     zones: Zones
-    membership: list[Membership] = Field(description="Zones from which it came with a probability of at least 0.05.")
+    membership: list[Membership] = Field(
+        default=[], description="Zones from which it came with a probability of at least 0.05."
+    )
     excluded: bool = Field(
+        default=False,
         description="Whether its position lies in an excluded zone, or does with a probability of at least 0.5. It "
         "alerts nobody.",
         examples=[False],
     )
-    excluded_by: list[str] = Field(description="Names of these zones.", examples=[[]])
+    excluded_by: list[str] = Field(default=[], description="Names of these zones.", examples=[[]])
     late_frames: int = Field(ge=0, description="Frames that missed their window's deadline.", examples=[0])
     latency_s: LatencyS
     latency_stages_s: StagesOrNull
     late: bool = Field(description="Whether it was published again because sound arrived late.", examples=[False])
     replaces: list[str] = Field(description="Ids of events published before that this one replaces.", examples=[[]])
     source: int = Field(
+        default=1,
         ge=1,
         le=2,
         description="1, or 2 for the second of two simultaneous sources, each of which has an event of its own.",
         examples=[1],
     )
-    candidates: Candidates
+    candidates: Candidates = Field(default=[])
 
 
 class OtherSource(Model):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import httpx
 import pytest
@@ -114,6 +115,21 @@ def test_event_that_is_stored_unchanged_stays_where_it_is(store: Store) -> None:
 def test_events_that_wait_are_counted(server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server.parts.store.backlog, "unsaved", 3)
     assert get(client, "event-log")["unsaved"] == 3
+
+
+def test_event_that_is_stored_while_the_page_is_read_is_announced(
+    server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backlog, log = server.parts.store.backlog, server.parts.store.log
+    monkeypatch.setattr(backlog, "unsaved", 1)
+
+    def log_and_store(*given: Any) -> Any:
+        page = log(*given)
+        backlog.unsaved = 0
+        return page
+
+    monkeypatch.setattr(server.parts.store, "log", log_and_store)
+    assert get(client, "event-log")["unsaved"] == 1
 
 
 def test_log_of_a_store_that_fails_is_unavailable(

@@ -48,12 +48,13 @@ def event_log_route(parts: Parts) -> APIRouter:
             place = None if after is None else LogPosition.parse(after)
         except ValueError as error:
             raise unprocessable("after", f"after: {error}") from error
+        unsaved = parts.event_log.unsaved  # before the page, which may lack what is stored in between
         page = parts.store.log(EventQuery(zone=zone, min_confidence=min_confidence, limit=limit), place)
         head = {
             "v": API_VERSION,
             "position": str(page.position),
             "more": page.has_more,
-            "unsaved": parts.event_log.unsaved,
+            "unsaved": unsaved,
             "complete": page.is_complete,
         }
         listed = ",".join(row.body for row in page.rows).encode()
