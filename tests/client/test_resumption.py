@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -122,6 +123,7 @@ class ModelClient:
     steps: Steps | None = None
     pending: Any = None
     queue: list[str] = field(default_factory=list)
+    now_s: float = 0.0
 
     def cut(self) -> None:
         self.steps = None
@@ -130,13 +132,14 @@ class ModelClient:
         """Carry out a step, and deliver what it yields; return False if the client waits for a message."""
         if self.steps is None:
             self.queue = self.server.connect(live_query(self.memory, self.wanted))
-            self.steps = conversation(self.memory, self.wanted)
+            self.steps = conversation(self.memory, self.wanted, lambda: self.now_s)
             self.pending = next(self.steps)
         match self.pending:
             case Receive() if not self.queue and self.pending.patience_s is None:
                 return False
             case Receive():
                 result: Any = self.queue.pop(0) if self.queue else None
+                self.now_s += 0.001 if result is not None else self.pending.patience_s or 0.0
             case Get():
                 result = self.server.answer(self.pending)
         self.pending = self.steps.send(result)
@@ -280,6 +283,39 @@ def test_memory_is_bounded_and_the_log_is_read_in_time(monkeypatch: pytest.Monke
     newest, oldest = client.delivered[-1], client.delivered[0]
     assert not client.memory.is_news(newest)
     assert client.memory.is_news(oldest)  # forgotten
+
+
+def test_failing_log_is_not_read_for_every_message() -> None:
+    server = ModelServer(is_durable=True, is_available=False)
+    client = ModelClient(server)
+    asked: list[float] = []
+    answer = server.answer
+
+    def noted(step: Get) -> bytes | None:
+        asked.append(client.now_s)
+        return answer(step)
+
+    server.answer = noted  # type: ignore[method-assign]
+    client.step()
+    for k in range(100):
+        server.publish(event_message(id=f"small-{k}"))
+    for _ in range(120):
+        client.step()
+    assert len(client.delivered) == 100
+    assert len(asked) < 15
+    assert min(later - before for before, later in pairwise(asked)) >= 0.99 * resumption.RETRY_S
+    assert client.memory.is_behind
+    server.is_available = True
+    client.settle()
+    assert not client.memory.is_behind
+
+
+def test_withdrawal_is_another_answer() -> None:
+    """The event alone is the same; that it replaces the second source is news."""
+    memory = Memory()
+    for replaces, is_news in (([], True), (["small-2"], True), (["small-2"], False), ([], False)):
+        text = json.dumps({"v": 1, "seq": 4, **event_message(id="small-1", replaces=replaces)})
+        assert memory.is_news(parse(text)) == is_news
 
 
 def test_gap_in_other_messages_is_delivered() -> None:

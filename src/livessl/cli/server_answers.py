@@ -9,6 +9,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Final
 
+from livessl.client.address import open_url, redirection
 from livessl.errors import RunError, UseError
 
 ANSWER_S: Final = 10.0
@@ -98,12 +99,13 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
         headers["Authorization"] = f"Bearer {read_token(token_file)}"
     request = urllib.request.Request(address, body, headers)  # noqa: S310 - the address begins with http
     try:
-        with urllib.request.urlopen(request, timeout=wait_s) as response:  # noqa: S310
+        with open_url(request, wait_s) as response:
             answer: bytes = response.read()
             return answer
     except urllib.error.HTTPError as error:
+        said = redirection(error) or _reason(error)
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
-        raise RunError(f"{address}: the server answered {error.code} {error.reason}{_reason(error)}{cure}") from error
+        raise RunError(f"{address}: the server answered {error.code} {error.reason}{said}{cure}") from error
     except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error

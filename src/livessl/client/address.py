@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlencode
+from urllib.parse import urlencode, urlsplit
 
 from livessl.errors import RunError, UseError
 
@@ -20,6 +20,10 @@ ANSWER_S: Final = 30.0
 
 SHOWN_BYTES: Final = 300
 """Longest part of an answer, in bytes, that an error repeats."""
+
+
+TEMPORARY: Final = frozenset({408, 425, 429})
+"""Statuses below 500 that may be gone at the next attempt."""
 
 
 class UnreachableError(RunError):
@@ -60,8 +64,7 @@ class Address:
         UseError
             If the URL is none of HTTP, or the file with certificates cannot be used.
         """
-        if not url.startswith(("http://", "https://")):
-            raise UseError(f"url: expected an address such as http://127.0.0.1:8000, got {url!r}")
+        _check(url)
         if token is not None and not (token.isascii() and token.isprintable()):
             raise UseError("token: expected the text that `livessl keys token` printed, got other characters")
         secure = url.startswith("https://")
@@ -95,12 +98,13 @@ class Address:
         address = f"{self.url}/api/v1/{path}" + (f"?{urlencode(query)}" if query else "")
         request = urllib.request.Request(address, headers=self.headers)  # noqa: S310 - `of` has checked the scheme
         try:
-            with urllib.request.urlopen(request, timeout=ANSWER_S, context=self.context) as response:  # noqa: S310
+            with open_url(request, ANSWER_S, self.context) as response:
                 return bytes(response.read())
         except urllib.error.HTTPError as error:
             with error:
-                what = f"{address}: the server answered {error.code}: {_detail(error.read(SHOWN_BYTES))}"
-            if error.code >= 500 or error.code == 429:
+                said = redirection(error) or f": {_detail(error.read(SHOWN_BYTES))}"
+            what = f"{address}: the server answered {error.code}{said}"
+            if may_pass(error.code):
                 raise UnavailableError(what) from error
             raise RefusedError(what + self.cure(error.code)) from error
         except (OSError, http.client.HTTPException) as error:
@@ -113,12 +117,59 @@ class Address:
         return "; give a token" if self.token is None else "; give a token that is valid and has the role"
 
     def lost(self, error: Exception) -> RunError:
-        """Return the error to raise for one of the connection: a wrong certificate does not mend itself."""
-        reason = getattr(error, "reason", error)
+        """Return the error to raise for one of the connection: a wrong certificate or address does not mend itself."""
+        reason = error.reason if isinstance(error, urllib.error.URLError) else error
+        if isinstance(reason, ssl.SSLError) and reason.reason in _NO_TLS:
+            return RefusedError(f"{self.url}: what answers does not speak TLS ({reason.reason}); try http://")
         if isinstance(reason, ssl.SSLCertVerificationError):
             cure = "name the certificate of its authority as ca_file"
             return RefusedError(f"{self.url}: its certificate is not trusted: {reason.verify_message}; {cure}")
         return UnreachableError(f"{self.url}: no answer from a server ({reason}); check that it runs and its address")
+
+
+_NO_TLS: Final = frozenset({"WRONG_VERSION_NUMBER", "HTTP_REQUEST", "PACKET_LENGTH_TOO_LONG", "RECORD_LAYER_FAILURE"})
+"""Reasons of OpenSSL where the other end answers in plain text."""
+
+
+class _Unredirected(urllib.request.HTTPRedirectHandler):
+    """Makes an error of every redirect: urllib would send the token to whatever host it names."""
+
+    def redirect_request(self, *_: Any) -> None:
+        """Follow nothing."""
+
+
+def open_url(request: urllib.request.Request, wait_s: float, context: ssl.SSLContext | None = None) -> Any:
+    """Return the answer to a request, which is a context manager; a redirect is not followed but is an `HTTPError`."""
+    handlers: list[Any] = [_Unredirected()]
+    if context is not None:
+        handlers.append(urllib.request.HTTPSHandler(context=context))
+    return urllib.request.build_opener(*handlers).open(request, timeout=wait_s)
+
+
+def redirection(error: urllib.error.HTTPError) -> str:
+    """Return where an answer sends the client, and what to do, as the rest of a sentence; empty if it does not."""
+    target = error.headers.get("Location") if 300 <= error.code < 400 else None
+    return "" if target is None else f", a redirect to {target}; give that server's address if you trust it"
+
+
+def may_pass(status: int) -> bool:
+    """Return whether a request that was answered with this status may succeed later."""
+    return status >= 500 or status in TEMPORARY
+
+
+def _check(url: str) -> None:
+    """Raise `UseError` unless `url` names a server."""
+    example = "url: expected an address such as http://127.0.0.1:8000"
+    try:
+        parts = urlsplit(url)
+        port, host = parts.port, parts.hostname
+        (host or "").encode("idna")
+    except ValueError as error:  # of a port, of brackets, or of a name with an empty part
+        raise UseError(f"{example}, got {url!r}: {error}") from error
+    if parts.scheme not in ("http", "https") or not host or port == 0 or not url.isprintable() or " " in url:
+        raise UseError(f"{example}, got {url!r}")
+    if parts.username is not None or parts.query or parts.fragment:
+        raise UseError(f"{example}, without a user, a query or a fragment, got one; give the token by itself")
 
 
 def _detail(body: bytes) -> str:

@@ -11,19 +11,26 @@ from typing import Self, TypeVar, Unpack
 from urllib.parse import quote
 
 from pydantic import BaseModel
-from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as open_socket
+from websockets.asyncio.client import ClientConnection, connect
 
-from livessl.client.address import Address, UnavailableError, UnreachableError
+from livessl.client.address import Address, UnreachableError
 from livessl.client.options import Options, Wanted
 from livessl.client.questions import event_query, health_of
 from livessl.client.reading import read_answer
 from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, Steps, conversation, live_query
-from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience
+from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience, monotonic_s, socket_log
 from livessl.schema.answers import Arrays, EventPage, Health, HealthStatus, OneEvent, Site, Tracks
 from livessl.schema.values import Event
 
 M = TypeVar("M", bound=BaseModel)
+
+
+class _Opening(connect):
+    """Opens a WebSocket, and follows no redirect: another host must not get the token."""
+
+    def process_redirect(self, exc: Exception) -> Exception | str:
+        """Return the answer as an error."""
+        return exc
 
 
 def aconnect(url: str, token: str | None = None, **options: Unpack[Options]) -> AsyncClient:
@@ -159,24 +166,27 @@ class AsyncClient:
 
     async def _converse(self, patience: Patience) -> AsyncGenerator[Received, None]:
         """Carry out the steps of one connection."""
-        async with open_socket(
+        async with _Opening(
             self._address.live(live_query(self._memory, self._wanted)),
             additional_headers=self._address.headers,
             ssl=self._address.context,
             max_size=MAX_MESSAGE_BYTES,
             ping_interval=SILENCE_S,
             ping_timeout=SILENCE_S,
+            logger=socket_log(),
         ) as socket:
             self._socket = socket
-            steps: Steps = conversation(self._memory, self._wanted)
+            patience.opened()
+            steps: Steps = conversation(self._memory, self._wanted, monotonic_s)
             answer: str | bytes | None = None
             while not self._closed.is_set():
                 step = steps.send(answer)
                 answer = None
                 match step:
                     case Receive():
+                        if not self._memory.is_behind:
+                            patience.proven()
                         answer = await _receive(socket, step.patience_s)
-                        patience.connected()
                     case Get():
                         answer = await self._get(step)
                     case Deliver():
@@ -185,7 +195,7 @@ class AsyncClient:
     async def _get(self, step: Get) -> bytes | None:
         try:
             return await asyncio.to_thread(self._address.get, step.path, step.query)
-        except UnavailableError:
+        except UnreachableError:  # the connection itself may work all the same
             return None
 
 

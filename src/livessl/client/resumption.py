@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final, NamedTuple, get_args
@@ -43,7 +43,7 @@ COMPARED: Final = 1000
 """Events after which the log is read although no connection was lost."""
 
 RETRY_S: Final = 2.0
-"""Seconds after which the log is read again if the server could not answer."""
+"""Seconds after which the log is read again if the server could not answer, or had not stored all events."""
 
 PAGE: Final = 500
 """Events that are asked for at once."""
@@ -136,7 +136,14 @@ def _answer(event: Event) -> int:
     """Return a hash of what an event says about the sound."""
     covariance = (value for row in event.covariance_m2 or () for value in row)
     when = event.time_utc or event.start_s
-    what = (event.confidence, event.status, *event.arrays, *(event.position_m or ()), *covariance)
+    what = (
+        event.confidence,
+        event.status,
+        tuple(event.replaces),
+        *event.arrays,
+        *(event.position_m or ()),
+        *covariance,
+    )
     return hash((when, event.duration_s, *what))
 
 
@@ -145,14 +152,23 @@ def live_query(memory: Memory, wanted: Wanted) -> dict[str, str]:
     return wanted.query if memory.last_seq is None else {**wanted.query, "since_seq": str(memory.last_seq)}
 
 
-def conversation(memory: Memory, wanted: Wanted) -> Steps:
+def conversation(memory: Memory, wanted: Wanted, monotonic_s: Callable[[], float]) -> Steps:
     """The steps of a connection, until the user or the connection ends it.
+
+    Parameters
+    ----------
+    memory : Memory
+    wanted : Wanted
+    monotonic_s : callable
+        Returns seconds by a clock that nobody sets.
 
     Raises
     ------
-    NewerServerError
-        If a message cannot be read.
+    NewerServerError, ForeignAnswerError
+        If a message or an answer cannot be read.
     """
+    memory.is_behind = True
+    next_read_s = monotonic_s()
     hello = parse((yield Receive()))
     if not isinstance(hello, Hello):
         raise NewerServerError("expected a message of the kind 'hello' first, got another; update livessl")
@@ -160,11 +176,14 @@ def conversation(memory: Memory, wanted: Wanted) -> Steps:
         memory.last_seq = hello.last_seq
     if wanted.kinds is None:
         yield Deliver(hello)
-    memory.is_behind = True
     while True:
-        if wanted.has_events and (memory.is_behind or memory.unread >= COMPARED):
+        now_s = monotonic_s()
+        memory.is_behind |= memory.unread >= COMPARED
+        if wanted.has_events and memory.is_behind and now_s >= next_read_s:
             yield from _read_log(memory, wanted)
-        text = yield Receive(RETRY_S if wanted.has_events and memory.is_behind else None)
+            now_s = monotonic_s()
+            next_read_s = now_s + RETRY_S if memory.is_behind else now_s
+        text = yield Receive(max(next_read_s - now_s, 0.0) if wanted.has_events and memory.is_behind else None)
         message = None if text is None else parse(text)
         if isinstance(message, Gap):
             memory.is_behind = True

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import random
 from typing import Final
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
 
-from livessl.client.address import Address, RefusedError
+from livessl.client.address import Address, RefusedError, may_pass
 from livessl.clock import SystemClock
 from livessl.errors import RunError
 
@@ -31,6 +32,20 @@ LOST: Final = (OSError, WebSocketException)
 
 _POLICY_VIOLATION: Final = 1008
 
+_log = logging.getLogger(__name__)
+
+
+def monotonic_s() -> float:
+    """Return seconds by the monotonic clock."""
+    return SystemClock().monotonic_ns() / 1e9
+
+
+def socket_log() -> logging.Logger:
+    """Return the log of a connection, without debug messages: `websockets` would write the token into them."""
+    log = logging.getLogger("livessl.client.socket")
+    log.setLevel(logging.INFO)
+    return log
+
 
 class Patience:
     """Waits between attempts to connect.
@@ -47,10 +62,15 @@ class Patience:
         self._address = address
         self._give_up_s = give_up_s
         self._clock = SystemClock()
-        self.connected()
+        self._opened_ns: int | None = None
+        self.proven()
 
-    def connected(self) -> None:
-        """Begin anew, as a connection works."""
+    def opened(self) -> None:
+        """Note that a connection is open. It has proven nothing: the server may close it at once."""
+        self._opened_ns = self._clock.monotonic_ns()
+
+    def proven(self) -> None:
+        """Begin anew, as a connection works: the server has answered what the client needs."""
         self._wait_s = FIRST_WAIT_S
         self._lost_ns: int | None = None
 
@@ -68,8 +88,12 @@ class Patience:
         if reason is not None:
             raise reason from error
         now_ns = self._clock.monotonic_ns()
+        if self._opened_ns is not None and now_ns - self._opened_ns >= 1e9 * LONGEST_WAIT_S:
+            self.proven()
+        self._opened_ns = None
         if self._lost_ns is None:
             self._lost_ns = now_ns
+            _log.warning("%s: no connection (%s); trying again", self._address.url, str(error) or type(error).__name__)
         if self._give_up_s is not None and now_ns - self._lost_ns >= 1e9 * self._give_up_s:
             raise (error if isinstance(error, RunError) else self._address.lost(error)) from error
         wait_s, self._wait_s = self._wait_s, min(GROWTH * self._wait_s, LONGEST_WAIT_S)
@@ -78,12 +102,21 @@ class Patience:
     def refusal(self, error: Exception) -> RunError | None:
         """Return the error to raise if the server, or this client, does not want to try again."""
         url = self._address.url
-        if isinstance(error, InvalidStatus) and error.response.status_code < 500:
+        before = error.__cause__ or error.__context__
+        if isinstance(before, InvalidStatus):  # a redirect that `websockets` cannot follow
+            error = before
+        if isinstance(error, InvalidStatus) and not may_pass(error.response.status_code):
             status = error.response.status_code
+            target = error.response.headers.get("Location") if 300 <= status < 400 else None
+            if target is not None:
+                what = f"{url}: the server answered {status} to the WebSocket, a redirect to {target}"
+                return RefusedError(f"{what}; give that server's address if you trust it")
             cure = self._address.cure(status) or "; check its address"
             return RefusedError(f"{url}: the server answered {status} to the WebSocket{cure}")
         if isinstance(error, ConnectionClosed) and error.rcvd is not None and error.rcvd.code == _POLICY_VIOLATION:
             return RefusedError(f"{url}: {error.rcvd.reason}")
+        if isinstance(error, InvalidURI):
+            return RefusedError(f"{url}: {error}; correct the address")
         if isinstance(error, OSError):
             lost = self._address.lost(error)
             return lost if isinstance(lost, RefusedError) else None

@@ -13,12 +13,12 @@ from pydantic import BaseModel
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as open_socket
 
-from livessl.client.address import Address, UnavailableError, UnreachableError
+from livessl.client.address import Address, UnreachableError
 from livessl.client.options import Options, Wanted
 from livessl.client.questions import event_query, health_of
 from livessl.client.reading import read_answer
 from livessl.client.resumption import Deliver, Get, Memory, Receive, Received, Steps, conversation, live_query
-from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience
+from livessl.client.retry import LOST, MAX_MESSAGE_BYTES, SILENCE_S, Patience, monotonic_s, socket_log
 from livessl.schema.answers import Arrays, EventPage, Health, HealthStatus, OneEvent, Site, Tracks
 from livessl.schema.values import Event
 
@@ -163,17 +163,20 @@ class Client:
             ssl=self._address.context,
             max_size=MAX_MESSAGE_BYTES,
             ping_interval=None,  # `_receive` pings
+            logger=socket_log(),
         ) as socket:
             self._socket = socket
-            steps: Steps = conversation(self._memory, self._wanted)
+            patience.opened()
+            steps: Steps = conversation(self._memory, self._wanted, monotonic_s)
             answer: str | bytes | None = None
             while not self._closed.is_set():
                 step = steps.send(answer)
                 answer = None
                 match step:
                     case Receive():
+                        if not self._memory.is_behind:
+                            patience.proven()
                         answer = _receive(socket, step.patience_s)
-                        patience.connected()
                     case Get():
                         answer = self._get(step)
                     case Deliver():
@@ -182,7 +185,7 @@ class Client:
     def _get(self, step: Get) -> bytes | None:
         try:
             return self._address.get(step.path, step.query)
-        except UnavailableError:
+        except UnreachableError:  # the connection itself may work all the same
             return None
 
 
