@@ -3,6 +3,8 @@
 //   import { follow } from "http://127.0.0.1:8000/static/client.js";
 //   const stop = follow("http://127.0.0.1:8000", { kinds: ["event"], onMessage: (event) => console.log(event) });
 //
+// Node.js imports it from a file: curl -o client.mjs http://127.0.0.1:8000/static/client.js
+//
 // It connects again for ever and resumes: every event that the server stores arrives, and no answer twice. After each
 // connection it reads the server's log of stored events besides the WebSocket; what it knows is a copy. client.d.ts has
 // the types.
@@ -17,6 +19,10 @@ const COMPARED = 1000;
 const RETRY_MS = 2000;
 /** Longest wait for an answer of the log, in milliseconds. */
 const ANSWER_MS = 30000;
+/** A connection that lasted so many milliseconds has worked, whatever became of the log. */
+const PROVEN_MS = 5000;
+/** Statuses below 500 that may be gone at the next attempt. */
+const TEMPORARY = [408, 425, 429];
 /** Code of a connection that the server closes because of the request: another attempt would not help. */
 const POLICY_VIOLATION = 1008;
 
@@ -43,6 +49,9 @@ class Follower {
     this.unread = 0;
     this.failures = 0;
     this.socket = null;
+    this.queue = Promise.resolve(); // messages wait while the log is read
+    this.openedMs = null;
+    this.nextReadMs = 0;
     this.timer = null;
     this.stopped = false;
   }
@@ -61,22 +70,29 @@ class Follower {
     const protocols = token === undefined ? [] : ["livessl", `livessl.token.${token}`];
     const socket = new WebSocket(`${this.url.replace(/^http/, "ws")}/api/v1/live?${query}`, protocols);
     this.socket = socket;
-    let queue = Promise.resolve(); // messages wait while the log is read
-    socket.onmessage = ({ data }) => {
-      queue = queue.then(() => socket === this.socket && this.take(JSON.parse(data))).catch((error) => this.drop(error));
-    };
+    this.queue = Promise.resolve();
+    this.openedMs = null;
+    this.nextReadMs = 0;
+    socket.onmessage = ({ data }) => this.then(socket, () => this.take(JSON.parse(data)));
     socket.onclose = ({ code, reason }) => {
       if (socket !== this.socket) return;
       if (code === POLICY_VIOLATION) this.refuse(reason);
-      else this.drop(new Error("the connection was lost"));
+      else if (this.openedMs === null) this.explain(socket);
+      else this.drop(socket, new Error("the connection was lost"));
     };
+  }
+
+  /** Carry a step out after those before, unless the connection is another one by then. */
+  then(socket, step) {
+    const current = () => socket === this.socket && step();
+    this.queue = this.queue.then(current).catch((error) => this.drop(socket, error));
   }
 
   async take(message) {
     if (message.kind === "hello") {
-      this.failures = 0;
+      this.openedMs = performance.now();
       this.lastSeq ??= message.last_seq;
-      this.options.onState?.("live");
+      this.tell("live");
       if (this.options.kinds === undefined) this.deliver(message);
       await this.readLog();
       return;
@@ -111,13 +127,16 @@ class Follower {
     return !this.known.get(event.id).answers.has(answerOf(event));
   }
 
+  /** Deliver the stored events that did not come live; without an answer, try again later. */
   async readLog() {
-    if (!this.hasEvents) return;
+    if (!this.hasEvents || performance.now() < this.nextReadMs) return; // the timer reads it
+    const { socket } = this;
     clearTimeout(this.timer);
     let page = { more: true };
     while (page.more) {
       page = await this.ask();
-      if (page === null) break; // the server's database is away
+      if (socket !== this.socket) return;
+      if (page === null) break;
       if (!page.complete) {
         const reason = "the server does not have all events since the connection was lost";
         this.deliver({ v: 1, kind: "gap", missed: null, reason });
@@ -125,35 +144,82 @@ class Follower {
       for (const event of page.events) if (this.isNews(event, true)) this.deliver(event);
       this.position = page.position;
     }
-    this.unread = 0;
-    if (page === null || page.unsaved > 0) this.timer = setTimeout(() => this.readLog().catch((e) => this.drop(e)), RETRY_MS);
+    if (page !== null) {
+      this.unread = 0;
+      this.failures = 0;
+      if (page.unsaved === 0) return;
+    }
+    this.nextReadMs = performance.now() + RETRY_MS;
+    this.timer = setTimeout(() => {
+      this.nextReadMs = 0;
+      this.then(socket, () => this.readLog());
+    }, RETRY_MS);
   }
 
+  /** Return a page of the log, or null if the server cannot answer now; the connection may work all the same. */
   async ask() {
     const query = new URLSearchParams({ limit: 500 });
-    const { zone, minConfidence, token } = this.options;
+    const { zone, minConfidence } = this.options;
     if (this.position !== null) query.set("after", this.position);
     if (zone !== undefined) query.set("zone", zone);
     if (minConfidence !== undefined) query.set("min_confidence", minConfidence);
+    try {
+      const answer = await this.get(`event-log?${query}`);
+      if (answer.ok) return await answer.json();
+      if (isFinal(answer.status)) this.refuse(`event-log: the server answered ${answer.status}`);
+    } catch {
+      return null; // no connection, no answer in time, or one that is no JSON
+    }
+    return null;
+  }
+
+  get(path) {
+    const { token } = this.options;
     const headers = token === undefined ? {} : { Authorization: `Bearer ${token}` };
     const signal = AbortSignal.timeout(ANSWER_MS);
-    const answer = await fetch(`${this.url}/api/v1/event-log?${query}`, { headers, signal, cache: "no-store" });
-    if (answer.status === 503) return null;
-    if (!answer.ok) throw new Error(`event-log: the server answered ${answer.status}`);
-    return answer.json();
+    return fetch(`${this.url}/api/v1/${path}`, { headers, signal, cache: "no-store", redirect: "error" });
   }
 
+  /** Find out why a connection did not open, which a WebSocket does not say: a token that is refused stays refused. */
+  async explain(socket) {
+    let status = null;
+    try {
+      ({ status } = await this.get("tracks"));
+    } catch {
+      // nobody answers
+    }
+    if (socket !== this.socket) return;
+    if (status === 401 || status === 403) this.refuse(`the server answered ${status}; give a token that is valid`);
+    else this.drop(socket, new Error("no connection"));
+  }
+
+  /** Hand a message to the page, whose errors are its own: they are reported and change nothing here. */
   deliver(message) {
-    if (!this.stopped) this.options.onMessage(message);
+    if (!this.stopped) this.call(this.options.onMessage, message);
   }
 
-  /** Close the connection and try again after a wait. */
-  drop(error) {
-    const { socket } = this;
+  tell(state, error) {
+    if (this.options.onState !== undefined) this.call(this.options.onState, state, error);
+  }
+
+  call(callback, ...given) {
+    try {
+      callback(...given);
+    } catch (error) {
+      queueMicrotask(() => {
+        throw error;
+      });
+    }
+  }
+
+  /** Close a connection and try again after a wait. */
+  drop(socket, error) {
+    if (socket !== this.socket) return;
     this.socket = null;
     if (socket !== null) socket.close();
     if (this.stopped) return;
-    this.options.onState?.("down", error);
+    if (this.openedMs !== null && performance.now() - this.openedMs >= PROVEN_MS) this.failures = 0;
+    this.tell("down", error);
     clearTimeout(this.timer);
     const wait = BACK_OFF_MS[Math.min(this.failures, BACK_OFF_MS.length - 1)];
     this.failures += 1;
@@ -162,16 +228,22 @@ class Follower {
 
   refuse(reason) {
     this.stop();
-    this.options.onState?.("refused", new Error(reason));
+    this.tell("refused", new Error(reason));
   }
 
   stop() {
     this.stopped = true;
-    this.drop(null);
+    this.drop(this.socket, null);
     clearTimeout(this.timer);
   }
 }
 
+/** Whether a request that was answered with this status would fail again. */
+const isFinal = (status) => status >= 400 && status < 500 && !TEMPORARY.includes(status);
+
 /** What an event says about the sound, as a text that is equal for copies only. */
-const answerOf = ({ time_utc, start_s, duration_s, position_m, covariance_m2, confidence, arrays, status }) =>
-  JSON.stringify([time_utc ?? start_s, duration_s, position_m, covariance_m2, confidence, arrays, status]);
+const answerOf = (event) => {
+  const { time_utc, start_s, duration_s, position_m, covariance_m2, confidence, arrays, status, replaces } = event;
+  const when = time_utc ?? start_s;
+  return JSON.stringify([when, duration_s, position_m, covariance_m2, confidence, arrays, status, replaces]);
+};
