@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,7 +29,7 @@ from livessl.server.history.journal import (
     put_entry,
     remove_older_entries,
 )
-from livessl.server.history.log import DURABLE, LogPage, LogPosition, log_page
+from livessl.server.history.log import LogPage, LogPosition, log_page
 from livessl.server.history.query import Cursor, Page, Query, Row
 from livessl.server.history.search import page_statement
 from livessl.server.history.tables import disabled, events, progress
@@ -98,7 +97,6 @@ class Store:
 
     def __init__(self, place: Path | str | None = None, *, forwards: bool = False) -> None:
         self._bounded = place is None
-        self._life = secrets.randbits(63) if self._bounded else DURABLE
         self._count: int | None = None
         self._counting = threading.Lock()
         self._when_ready: deque[Callable[[], None]] = deque()
@@ -283,7 +281,7 @@ class Store:
         self.backlog.settle()
         kept = MAX_EVENTS_IN_MEMORY if self._bounded else None
         with self._database.reading() as connection:
-            return log_page(connection, query, after, self._life, kept)
+            return log_page(connection, query, after, kept)
 
     def find(self, query: Query) -> tuple[list[JsonObject], Cursor | None]:
         """Return events, newest first unless the query says otherwise, and the cursor of the next page or None."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -86,6 +87,24 @@ def test_position_outlives_a_database_and_no_memory(opened: Callable[[], Store])
     finally:
         memory.close()
         other.close()
+
+
+def test_database_that_was_replaced_is_another_history(tmp_path: Path) -> None:
+    """Also if it has as many events as the one before."""
+    found = []
+    for name in ("before.sqlite", "after.sqlite"):
+        store = Store(tmp_path / name)
+        store.add(event_message(id=name), START_NS)
+        found.append(store)
+    try:
+        end = found[0].log(Query(), None).position
+        assert found[0].log(Query(), end).is_complete
+        page = found[1].log(Query(), end)
+        assert not page.is_complete
+        assert [row.event["id"] for row in page.rows] == ["after.sqlite"]
+    finally:
+        for store in found:
+            store.close()
 
 
 def test_history_that_was_begun_anew_gives_all_that_it_has(store: Store) -> None:

@@ -20,10 +20,11 @@ from sqlalchemy.pool import QueuePool
 
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault, RunError
+from livessl.server.history import records
 from livessl.server.history.tables import metadata
 from livessl.server.history.turns import Turns
 
-HEAD: Final = "0003"
+HEAD: Final = "0004"
 """The newest revision in `migrations/`; a database that has it needs no Alembic."""
 
 BUSY_S: Final = 0.2
@@ -140,6 +141,7 @@ class Database:
                         metadata.create_all(connection)
                     else:
                         _migrate(connection)
+                    records.begin_life(connection)
                     for prepare in self._further:
                         prepare(connection)
             except StoreError as error:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from sqlalchemy import Connection, func, select
 
 from livessl.server.history.query import Query, Row
 from livessl.server.history.search import matching
 from livessl.server.history.tables import events
-
-DURABLE: Final = 0
-"""Life of a history that outlives the server; one in memory has a random number."""
+from livessl.server.history.tables import life as lives
 
 
 class LogPosition(NamedTuple):
@@ -25,7 +23,8 @@ class LogPosition(NamedTuple):
     Parameters
     ----------
     life : int
-        The history that it is of: in memory, each start of the server begins another one.
+        The number of the history that it is of. In memory, each start of the server begins another one; a database
+        keeps it until it is replaced.
     number : int
         Number of the last event before the place.
     """
@@ -72,7 +71,7 @@ class LogPage(NamedTuple):
     is_complete: bool
 
 
-def log_page(connection: Connection, query: Query, after: LogPosition | None, life: int, kept: int | None) -> LogPage:
+def log_page(connection: Connection, query: Query, after: LogPosition | None, kept: int | None) -> LogPage:
     """Return the events that were stored after a position.
 
     Parameters
@@ -82,11 +81,10 @@ def log_page(connection: Connection, query: Query, after: LogPosition | None, li
         Filters, and the most events of the page.
     after : LogPosition or None
         None gives the position of the end, and no event.
-    life : int
-        The history that the connection reads.
     kept : int or None
         Number of events that the history keeps at most; None if there is no limit.
     """
+    life = connection.execute(select(lives.c.number)).scalar_one()
     newest = connection.execute(select(func.max(events.c.number))).scalar() or 0
     if after is None:
         return LogPage([], LogPosition(life, newest), has_more=False, is_complete=True)

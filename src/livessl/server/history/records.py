@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -10,10 +11,16 @@ from sqlalchemy import Connection, delete, func, insert, select
 
 from livessl.core.types import FRAME_NS
 from livessl.server.history.query import JsonObject
-from livessl.server.history.tables import disabled, early, event_row, events, progress, tag_rows, tags
+from livessl.server.history.tables import disabled, early, event_row, events, life, progress, tag_rows, tags
 
 _INSERT_EVENT = insert(events)
 _INSERT_TAG = insert(tags)
+
+
+def begin_life(connection: Connection) -> None:
+    """Give a history that has none yet the number by which positions in its log are recognized."""
+    if connection.execute(select(life.c.number)).first() is None:
+        connection.execute(insert(life), {"number": secrets.randbits(63)})
 
 
 def put_events(connection: Connection, given: Sequence[tuple[JsonObject, int]]) -> int:

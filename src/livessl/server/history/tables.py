@@ -128,6 +128,16 @@ Index("journal_time", journal.c.time_ns, journal.c.number)
 Index("journal_kind", journal.c.kind, journal.c.time_ns, journal.c.number)
 
 
+life: Final = Table(
+    "life",
+    metadata,
+    Column("number", BigInteger, autoincrement=False, nullable=False),
+    PrimaryKeyConstraint("number"),
+)
+"""One row: a random number, drawn when the tables are made. Positions in the log name it, so that those of a history
+that was replaced are recognized."""
+
+
 def event_row(event: JsonObject, time_ns: int) -> dict[str, Any]:
     """Return an event's columns, without its number."""
     position_m = event.get("position_m")
