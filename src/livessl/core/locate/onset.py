@@ -156,8 +156,8 @@ class Onset(MapEstimator):
     def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
         """Answer by sharp evidence, unless another place is more certain when clocks inside the arrays may be apart.
 
-        Arrays that disagree do so for another reason, and wide peaks would hide it. Where the arrays do not determine the
-        distance, the places of both differ along the line of sight.
+        Arrays that disagree do so for another reason, and wide peaks would hide it. Where the arrays do not determine
+        the distance, the places of both differ along the line of sight.
         """
         sharp = self._answer_by(evidence, suspect, whole=whole)
         is_agreed = sharp.refused is None and not sharp.consensus.outliers
