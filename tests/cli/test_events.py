@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,6 +61,12 @@ def test_wrong_use_is_explained(run: Run, server: Server, tmp_path: Path) -> Non
         (["--since", "yesterday"], 2, "expected RFC 3339 with an offset"),
         (["--token-file", str(tmp_path / "none")], 2, "--token-file: cannot read"),
         (["--url", "site.example"], 2, "url: expected an address such as http://127.0.0.1:8000, got 'site.example'"),
+        (
+            ["--url", "http://site.example:80x"],
+            2,
+            "url: expected an address such as http://127.0.0.1:8000, got 'http://s",
+        ),
+        (["--url", server.url.replace("http", "https")], 1, "does not speak TLS"),
         (["--url", server.url, "--zone", "hall"], 1, "zone: no zone 'hall'; zones are door"),
     ):
         done = run("events", *arguments)
@@ -67,7 +74,9 @@ def test_wrong_use_is_explained(run: Run, server: Server, tmp_path: Path) -> Non
         assert done.out == ""
 
 
-def test_server_that_is_away_is_waited_for(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_that_is_away_is_waited_for(
+    run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     waits: list[float] = []
 
     def patient(_: object, seconds: float) -> None:
@@ -76,5 +85,7 @@ def test_server_that_is_away_is_waited_for(run: Run, monkeypatch: pytest.MonkeyP
             raise KeyboardInterrupt
 
     monkeypatch.setattr("livessl.client.sync.threading.Event.wait", patient)
-    assert run("events", "--url", f"http://127.0.0.1:{free_port()}").code == 0
+    with caplog.at_level(logging.WARNING):
+        assert run("events", "--url", f"http://127.0.0.1:{free_port()}").code == 0
     assert len(waits) == 3
+    assert caplog.text.count("trying again") == 1

@@ -37,7 +37,7 @@ export interface OtherMessage {
 export type Message = LiveEvent | Gap | OtherMessage;
 
 export interface Options {
-  /** Gets each message. */
+  /** Gets each message. An error that it throws is reported as an uncaught one, and the client goes on. */
   onMessage: (message: Message) => void;
   /** `live` after each connection, `down` when it is lost, `refused` when the server does not want to try again. */
   onState?: (state: "live" | "down" | "refused", error?: Error | null) => void;
