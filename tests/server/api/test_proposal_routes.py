@@ -124,6 +124,11 @@ def test_claps_that_leave_a_pose_open_are_refused_and_the_next_place_is_named(
     too_few = post(client, "measure", clapped(server, 3), 422)
     assert "expected 4 sounds or more" in str(too_few["detail"])
     request = clapped(server, 4)
+    far = [{**clap, "place_m": [1e4, 1e4, 1e4]} for clap in request["claps"]]
+    for path in ("measure", "verify"):
+        told = str(post(client, path, {"claps": far}, 422)["detail"])
+        assert "expected places in the room" in told
+        assert "got 10000, 10000, 10000" in told
     for clap in request["claps"]:  # all claps at almost one place
         clap["number"], clap["place_m"] = request["claps"][0]["number"], request["claps"][0]["place_m"]
     proposal = post(client, "measure", request)
