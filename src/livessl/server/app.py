@@ -161,8 +161,7 @@ def assemble(
         )
         set_up = SetUpInForce(site, clock, publish)
         proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
-        # the engine first: if its estimator cannot be made, nothing changes
-        for follower in (engine.take_over, set_up_watch.take_over, *(() if clips is None else (clips.take_over,))):
+        for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
         reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)

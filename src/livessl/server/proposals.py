@@ -60,7 +60,7 @@ _log = logging.getLogger(__name__)
 
 
 class ProposalRefusedError(RunError):
-    """A proposal cannot come into force: it is not determined, does not fit, or is out of date."""
+    """A proposal cannot come into force: it is not determined, or does not fit."""
 
 
 class BusyError(RunError):
@@ -284,7 +284,7 @@ class Proposals:
             If there is no such proposal any more.
         ProposalRefusedError
             If it cannot come into force.
-        ConfigError, CalibrationFileError, SetUpChangedError
+        OutOfDateError, ConfigError, CalibrationFileError, SetUpChangedError
             See `SetUpInForce.accept`.
         """
         with self._lock:
@@ -295,11 +295,9 @@ class Proposals:
             raise LookupError(f"no proposal {proposal_id!r}; measure again")
         if proposal.refusal is not None:
             raise ProposalRefusedError(proposal.refusal)
-        if proposal.site is not self._set_up.site:
-            raise ProposalRefusedError("other poses have come into force since this was proposed; measure again")
         measured = proposal.measured
         sounds, c_m_s = (0, 0.0) if measured is None else (measured.sounds, measured.c_m_s)
-        return self._set_up.accept(proposal.stored, proposal.method, sounds, c_m_s)
+        return self._set_up.accept(proposal.stored, proposal.method, sounds, c_m_s, proposal.site)
 
     # --- the thread that refines
 

@@ -132,6 +132,32 @@ def undo_calibration(path: Path) -> None:
     kept_path(path).replace(path)
 
 
+def contents(path: Path) -> dict[Path, bytes | None]:
+    """Return the content of a calibration file and of the one before; None where there is none.
+
+    Raises
+    ------
+    OSError
+        If one of them cannot be read.
+    """
+    return {one: one.read_bytes() if one.exists() else None for one in (path, kept_path(path))}
+
+
+def put_back(before: Mapping[Path, bytes | None]) -> None:
+    """Put back what `contents` has returned.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be replaced.
+    """
+    for path, content in before.items():
+        if content is None:
+            path.unlink(missing_ok=True)
+        else:
+            _written(path, content).replace(path)
+
+
 def can_undo(path: Path) -> bool:
     """Return whether there is a file to put back."""
     return kept_path(path).exists()
