@@ -212,7 +212,9 @@ def test_eight_sounds_are_too_few_to_refine(run: Run, claps: Recorded) -> None:
 def test_a_calibration_file_that_does_not_fit_is_told(
     run: Run, tmp_path: Path, content: str | None, words: str
 ) -> None:
-    if content is not None:
+    if content is None:
+        (tmp_path / "lab.yaml").mkdir()
+    else:
         (tmp_path / "lab.yaml").write_text(content, encoding="utf-8")
     done = run("check", write_site(tmp_path, {"calibration": "lab.yaml"}))
     assert done.code == 2

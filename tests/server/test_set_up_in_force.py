@@ -14,6 +14,7 @@ from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.server.set_up_in_force import CalibrationFileError, Commit, OutOfDateError, SetUpChangedError, SetUpInForce
 from livessl.site.build.calibrated import typed_arrays
+from livessl.site.effective import effective_settings
 from livessl.site.load import load_site
 from livessl.site.models import CalibratedArray, Site
 from small_site import Changes, site_of, write_site
@@ -79,6 +80,17 @@ def test_each_change_can_be_undone_once_and_the_first_one_too(desk: Desk, tmp_pa
         load_site(tmp_path / "first" / "site.yaml").array("south").microphones_m,
         first.site.array("south").microphones_m,
     )
+
+
+def test_a_named_file_that_is_still_to_be_written_is_made_by_the_first_change(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, {"calibration": str(tmp_path / "state" / "poses.yaml")})
+    (said,) = desk.site.warnings
+    assert "poses.yaml yet, so the poses of the site file are in force" in said
+    assert {setting.place[0] for setting in effective_settings(tmp_path / "site.yaml")} >= {"arrays", "calibration"}
+    assert desk.set_up.accept(desk.moved(), "typed") == ["south"]
+    again = load_site(tmp_path / "site.yaml")
+    assert again.warnings == ()
+    assert np.array_equal(again.array("south").microphones_m, desk.set_up.site.array("south").microphones_m)
 
 
 def test_a_file_that_another_program_wrote_is_taken_over(desk: Desk, tmp_path: Path) -> None:

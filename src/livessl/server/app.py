@@ -135,11 +135,13 @@ def assemble(
         array_states = ArrayStates(
             site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
+        set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         alerts = Alerts(
-            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces
-        )
+            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces,
+            lambda: set_up.site,
+        )  # fmt: skip
         undo.callback(alerts.stop)
         for _, alert in reversed(alerts.outbox.recent(RESTORED)):
             journal.alert(alert)
@@ -159,7 +161,6 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
-        set_up = SetUpInForce(site, clock, publish)
         proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
         for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)

@@ -56,6 +56,17 @@ def calibration_path(site: Site) -> Path:
     return site.file(site.calibration or default_name(site.site))
 
 
+def is_absent(path: Path) -> bool:
+    """Return whether there is certainly no such file; what cannot be looked for may be there."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
 def read_calibration(path: Path) -> CalibrationFile:
     """Return a calibration; one without arrays if there is no such file.
 
@@ -64,7 +75,7 @@ def read_calibration(path: Path) -> CalibrationFile:
     ConfigError
         With every fault of the file.
     """
-    return read_model(CalibrationFile, path, "calibration file") if path.exists() else CalibrationFile(arrays={})
+    return CalibrationFile(arrays={}) if is_absent(path) else read_model(CalibrationFile, path, "calibration file")
 
 
 def extended(
@@ -140,7 +151,7 @@ def contents(path: Path) -> dict[Path, bytes | None]:
     OSError
         If one of them cannot be read.
     """
-    return {one: one.read_bytes() if one.exists() else None for one in (path, kept_path(path))}
+    return {one: None if is_absent(one) else one.read_bytes() for one in (path, kept_path(path))}
 
 
 def put_back(before: Mapping[Path, bytes | None]) -> None:
