@@ -282,9 +282,6 @@ class Server:
             self._kernel_loader.stop()
             self.parts.reloader.stop()
             self.parts.engine.stop()
-            self.parts.maps.stop()
-            self.parts.set_up_watch.stop()
-            self.parts.proposals.stop()
             self.parts.alerts.stop()
             if self.parts.clips is not None:
                 self.parts.clips.stop()
@@ -294,6 +291,10 @@ class Server:
             self.parts.store.close()
             self.parts.sinks.close()
             self._listener.close()
+            # what computes at leisure comes last: what has to be on the disk does not wait for it
+            self.parts.maps.stop()
+            self.parts.set_up_watch.stop()
+            self.parts.proposals.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 

@@ -28,6 +28,9 @@ KEPT_SOUNDS: Final = 12
 WAIT_S: Final = 1.0
 """Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
 
+JOIN_S: Final = 1.0
+"""Longest wait, in seconds, for an examination that is under way when the server stops."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -157,10 +160,10 @@ class SetUpWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, and wait for the thread."""
+        """Stop, and wait a little for the thread."""
         self._stop.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(timeout=JOIN_S)
 
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""

@@ -146,7 +146,11 @@ def test_sounds_at_wrong_places_contradict_each_other(server: Server, client: ht
     assert proposal["refusal"] is not None
 
 
-def test_the_server_refines_poses_by_the_sounds_that_it_locates(server: Server, client: httpx.Client) -> None:
+def test_the_server_refines_poses_by_the_sounds_that_it_locates(
+    server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("livessl.server.proposals.KEPT", 1)
+    outside = post(client, "move", {"arrays": {"south": {"position_m": [2.0, 3.0, 7.0]}}})
     assert get(client, "set-up")["refinement"] == {"sounds": 0, "needed": 20, "agrees": None, "proposal": None}
     for event in events(count=22):
         finish(server, event)
@@ -156,6 +160,7 @@ def test_the_server_refines_poses_by_the_sounds_that_it_locates(server: Server, 
     (pose,) = proposal["arrays"]
     assert (refinement["agrees"], proposal["known"], pose["array"]) == (False, ["north"], "south")
     assert pose["turn_deg"] == pytest.approx([0.0, 0.0, -25.0], abs=3.0)
+    post(client, "accept", {"id": outside["id"]}, 409)  # the thread's proposals push out no other
     post(client, "accept", {"id": proposal["id"]})
     wait_until(lambda: get(client, "set-up")["refinement"]["agrees"] is True, "the refinement with the new poses")
 
