@@ -107,7 +107,7 @@ def fitted_together(set_up: SetUp) -> int:
     unknowns = unknowns_of(set_up)
     slopes = max(one.size * (8 + 3 * one.shape[1]) for one in set_up.delays.values())
     normal = unknowns * (unknowns + 3 * sounds)
-    return max(1, min(MOST_SLOPES // slopes, MOST_NORMAL // normal))
+    return int(max(1, min(MOST_SLOPES // slopes, MOST_NORMAL // normal)))
 
 
 def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
