@@ -73,6 +73,14 @@ def test_arrays_that_are_all_too_low_are_named(run: Run, claps: Recorded, tmp_pa
     assert "0.50 m higher than the site file" in finding["message"]
 
 
+def test_places_far_outside_the_room_are_refused(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    far = ["--at", "120,180,90", "--at", "1,2,1"]  # centimetres
+    done = run("calibrate", "poses", "--site", write_site(tmp_path), "--session", claps.directory, *far)
+    assert done.code == 2
+    assert "--at: expected places in the room, 0, 0, 0 to 4, 5, 3 m" in done.err
+    assert "got 120, 180, 90" in done.err
+
+
 def turned_site(directory: Path) -> Path:
     """The small site with an array that is filed with a wrong yaw and place."""
     return write_site(
