@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from known_sounds import events, finish, places_m
 from livessl.server.app import Server
 from livessl.site.build import set_up
 from livessl.site.load import load_site
+from livessl.site.models import Site
 from scene_server import capture_scene, get, live
 from small_site import HANG_S, running_server, scene, site_of, wait_until, write_site
 
@@ -144,6 +146,26 @@ def test_sounds_at_wrong_places_contradict_each_other(server: Server, client: ht
         clap["place_m"] = [clap["place_m"][1], clap["place_m"][0], 0.2]
     proposal = post(client, "measure", request)
     assert proposal["refusal"] is not None
+
+
+def test_claps_are_judged_with_the_speed_of_sound_that_stays_in_force(
+    server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure, place, speeds = set_up.measure_set_up, set_up.place_sounds, []
+
+    def at_another_speed(*arguments: Any) -> Any:
+        return replace(measure(*arguments), c_m_s=300.0)
+
+    def noted(site: Site, *arguments: Any) -> Any:
+        speeds.append(site.c_m_s)
+        return place(site, *arguments)
+
+    monkeypatch.setattr(set_up, "measure_set_up", at_another_speed)
+    monkeypatch.setattr(set_up, "place_sounds", noted)
+    proposal = post(client, "measure", clapped(server))
+    assert proposal["speed"]["speed_of_sound_m_s"] == 300.0
+    assert speeds == [server.parts.site.c_m_s] * 2, "before and after"
+    assert proposal["refusal"] is None
 
 
 def test_the_server_refines_poses_by_the_sounds_that_it_locates(
