@@ -73,6 +73,14 @@ def test_arrays_that_are_all_too_low_are_named(run: Run, claps: Recorded, tmp_pa
     assert "0.50 m higher than the site file" in finding["message"]
 
 
+def test_places_far_outside_the_room_are_refused(run: Run, claps: Recorded, tmp_path: Path) -> None:
+    far = ["--at", "120,180,90", "--at", "1,2,1"]  # centimetres
+    done = run("calibrate", "poses", "--site", write_site(tmp_path), "--session", claps.directory, *far)
+    assert done.code == 2
+    assert "--at: expected places in the room, 0, 0, 0 to 4, 5, 3 m" in done.err
+    assert "got 120, 180, 90" in done.err
+
+
 def turned_site(directory: Path) -> Path:
     """The small site with an array that is filed with a wrong yaw and place."""
     return write_site(
@@ -212,7 +220,9 @@ def test_eight_sounds_are_too_few_to_refine(run: Run, claps: Recorded) -> None:
 def test_a_calibration_file_that_does_not_fit_is_told(
     run: Run, tmp_path: Path, content: str | None, words: str
 ) -> None:
-    if content is not None:
+    if content is None:
+        (tmp_path / "lab.yaml").mkdir()
+    else:
         (tmp_path / "lab.yaml").write_text(content, encoding="utf-8")
     done = run("check", write_site(tmp_path, {"calibration": "lab.yaml"}))
     assert done.code == 2

@@ -7,7 +7,7 @@ import re
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from livessl.server.alerts.outbox import DeliveryState
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.reload import Reloader
+from livessl.site.build.calibrated import typed_arrays
 from livessl.site.load import load_site
 from livessl.site.models import Site
 from livessl.site.tokens import add_token
@@ -200,12 +201,37 @@ def test_calibration_file_and_moved_array_take_effect(tmp_path: Path) -> None:
         assert microphones("south") == moved_m.round(4).tolist()
 
 
+def test_poses_that_were_accepted_while_rules_were_taken_over_stay_in_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving(tmp_path) as server:
+        set_up, alerts = server.parts.set_up, server.parts.alerts
+        moved_m = set_up.site.array("south").microphones_m + 0.1
+        take_over = alerts.take_over
+
+        def slow(config: Any) -> None:
+            set_up.accept(typed_arrays(set_up.site, {"south": moved_m}), "typed")
+            take_over(config)
+
+        monkeypatch.setattr(alerts, "take_over", slow)
+        write_site(tmp_path, {"alerts": {"rules": {"door": DOOR}}, "arrays.north.position_m": [1.8, 1.3, 1.4]})
+        assert "arrays.north.position_m" in server.parts.reloader.reload().changed
+        assert set_up.site.array("south").microphones_m == pytest.approx(moved_m, abs=1e-4)
+        assert set_up.site.array("north").centre_m[0] == pytest.approx(1.8)
+
+
 class Still:
     """Poses that can or cannot be taken over."""
 
     def __init__(self, site: Site, fault: str | None = None) -> None:
         self.site = site
         self.fault = fault
+
+    def unchanged(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def calibrated(self, site: Site) -> Site:
+        return site
 
     def take_over(self, site: Site) -> list[str]:
         if self.fault is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import yaml
 
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
-from livessl.server.set_up_in_force import CalibrationFileError, SetUpChangedError, SetUpInForce
+from livessl.server.set_up_in_force import CalibrationFileError, Commit, OutOfDateError, SetUpChangedError, SetUpInForce
 from livessl.site.build.calibrated import typed_arrays
+from livessl.site.effective import effective_settings
 from livessl.site.load import load_site
 from livessl.site.models import CalibratedArray, Site
 from small_site import Changes, site_of, write_site
@@ -28,7 +30,7 @@ class Desk:
         self.followed: list[Site] = []
         self.published: list[dict[str, Any]] = []
         self.set_up = SetUpInForce(self.site, SystemClock(), self.published.append)
-        self.set_up.follow(self.followed.append)
+        self.set_up.follow(lambda site: partial(self.followed.append, site))
 
     def moved(self, name: str = "south") -> dict[str, CalibratedArray]:
         """What is stored of an array that somebody moved from where the site file has it."""
@@ -80,6 +82,17 @@ def test_each_change_can_be_undone_once_and_the_first_one_too(desk: Desk, tmp_pa
     )
 
 
+def test_a_named_file_that_is_still_to_be_written_is_made_by_the_first_change(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, {"calibration": str(tmp_path / "state" / "poses.yaml")})
+    (said,) = desk.site.warnings
+    assert "poses.yaml yet, so the poses of the site file are in force" in said
+    assert {setting.place[0] for setting in effective_settings(tmp_path / "site.yaml")} >= {"arrays", "calibration"}
+    assert desk.set_up.accept(desk.moved(), "typed") == ["south"]
+    again = load_site(tmp_path / "site.yaml")
+    assert again.warnings == ()
+    assert np.array_equal(again.array("south").microphones_m, desk.set_up.site.array("south").microphones_m)
+
+
 def test_a_file_that_another_program_wrote_is_taken_over(desk: Desk, tmp_path: Path) -> None:
     written = tmp_path / "calibration" / "small.yaml"
     written.parent.mkdir()
@@ -113,15 +126,62 @@ def test_a_file_that_cannot_be_written_changes_nothing(desk: Desk, tmp_path: Pat
     assert desk.set_up.site is desk.site
 
 
-def test_a_follower_that_fails_leaves_the_poses_as_they_were(desk: Desk) -> None:
-    def fails(_: Site) -> None:
-        raise MemoryError
+@pytest.mark.parametrize("when", ["prepares", "commits"])
+def test_a_follower_that_fails_leaves_poses_and_file_as_they_were(desk: Desk, tmp_path: Path, when: str) -> None:
+    desk.set_up.accept(desk.moved("north"), "typed")
+    before = desk.set_up.site
+    files = {path.name: path.read_bytes() for path in (tmp_path / "calibration").iterdir()}
+
+    def fails(_: Site) -> Commit:
+        def commit() -> None:
+            raise MemoryError
+
+        if when == "prepares":
+            raise MemoryError
+        return commit
 
     desk.set_up.follow(fails)
     with pytest.raises(MemoryError):
         desk.set_up.accept(desk.moved(), "typed")
-    assert desk.set_up.site is desk.site
+    assert desk.set_up.site is before
+    assert len(desk.published) == 1
+    assert {path.name: path.read_bytes() for path in (tmp_path / "calibration").iterdir()} == files
+    if when == "prepares":
+        assert desk.followed == [before], "no follower has taken over what another one cannot"
+
+
+def test_poses_that_were_proposed_for_others_are_refused(desk: Desk) -> None:
+    desk.set_up.accept(desk.moved(), "typed", proposed_for=desk.site)
+    with pytest.raises(OutOfDateError, match="other poses have come into force"):
+        desk.set_up.accept(desk.moved("north"), "typed", proposed_for=desk.site)
+    assert np.array_equal(desk.set_up.site.array("north").microphones_m, desk.site.array("north").microphones_m)
+
+
+def test_nothing_is_written_where_nothing_changes(desk: Desk, tmp_path: Path) -> None:
+    as_it_is = typed_arrays(desk.site, {"south": desk.site.array("south").microphones_m})
+    rounded = Desk(tmp_path, {"arrays.south": {"microphones_m": as_it_is["south"].microphones_m}})
+    assert rounded.set_up.accept(as_it_is, "typed") == []
+    assert not (tmp_path / "calibration").exists()
+    assert rounded.set_up.accept(rounded.moved(), "typed") == ["south"]
+    files = {path.name: path.read_bytes() for path in (tmp_path / "calibration").iterdir()}
+    assert rounded.set_up.accept(rounded.moved(), "typed") == []
+    assert {path.name: path.read_bytes() for path in (tmp_path / "calibration").iterdir()} == files
+    assert rounded.set_up.undo() == ["south"]
+
+
+def test_other_names_of_files_are_taken_over_although_no_pose_changes(desk: Desk) -> None:
+    named = desk.site.model_copy(update={"calibration": "measured.yaml"})
+    assert desk.set_up.take_over(named) == []
+    assert desk.set_up.site.calibration == "measured.yaml"
     assert desk.published == []
+
+
+def test_poses_that_fit_only_another_room_need_a_restart(desk: Desk) -> None:
+    size_m = desk.site.room.size_m
+    changes = {"room.size_m": [size_m[0] + 5.0, *size_m[1:]], "arrays.north.position_m": [size_m[0] + 2.0, 1.3, 1.4]}
+    with pytest.raises(SetUpChangedError, match=r"arrays\.north.*room"):
+        desk.set_up.take_over(site_of(changes))
+    assert desk.set_up.site is desk.site
 
 
 @pytest.mark.parametrize(

@@ -65,3 +65,36 @@ def test_what_is_no_secret_stays() -> None:
 def test_what_looks_like_a_secret_is_hidden_in_any_text(text: str, secret: str) -> None:
     assert secret not in scrubbed(text)
     assert HIDDEN in scrubbed(text)
+
+
+@pytest.mark.parametrize("word", ["livessl", "services", "small", "North"])
+def test_users_and_paths_that_are_ordinary_words_leave_no_holes_in_other_texts(word: str) -> None:
+    data = small(
+        {
+            "server.events_db": f"postgresql://{word}:zq17@db.example/{word}",
+            "alerts.actions.a.mqtt.username": word,
+            "alerts.actions.b.command": ["/usr/bin/ring", word],
+        }
+    )
+    shown, taken = redacted(data)
+    assert scrubbed(f"{word} has started", taken) == f"{word} has started"
+    assert taken == {"zq17"}
+    assert shown["server"]["events_db"] == "postgresql://db.example/…"
+    assert shown["alerts"]["actions"]["a"]["mqtt"]["username"] == HIDDEN
+
+
+@settings(max_examples=20)
+@given(SECRETS)
+def test_secrets_in_commands_and_below_secret_keys_are_hidden(secret: str) -> None:
+    shown, taken = redacted(
+        {
+            "action": {"command": f"/usr/bin/ring --pin {secret}"},
+            "password": {"value": secret, "others": [{"old": secret}], "pin": 7391},
+            "bell": {"command": "/usr/bin/ring"},
+        }
+    )
+    assert shown["action"]["command"] == f"/usr/bin/ring {HIDDEN}"
+    assert shown["password"] == {"value": HIDDEN, "others": [{"old": HIDDEN}], "pin": HIDDEN}
+    assert shown["bell"]["command"] == "/usr/bin/ring"
+    assert secret not in scrubbed(f"tried {secret} and 7391", taken)
+    assert "7391" in taken

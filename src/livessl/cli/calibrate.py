@@ -219,12 +219,24 @@ def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
 
     _require_places(arguments)
     site, sounds, _ = _recorded(arguments)
+    _require_inside(site, arguments)
     return site, claps_of(sounds, np.array(arguments.at))
 
 
 def _require_places(arguments: argparse.Namespace) -> None:
     if not arguments.at:
         raise UseError("calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres")
+
+
+def _require_inside(site: Site, arguments: argparse.Namespace) -> None:
+    import numpy as np
+
+    from livessl.site.build.set_up import PlaceOutsideError, require_near_room
+
+    try:
+        require_near_room(site, np.array(arguments.at, dtype=np.float64).reshape(-1, 3))
+    except PlaceOutsideError as error:
+        raise UseError(f"--at: {error}") from error
 
 
 def _verify(arguments: argparse.Namespace) -> int:
@@ -239,6 +251,7 @@ def _verify(arguments: argparse.Namespace) -> int:
         from livessl.cli.guided import claps_at
 
         site, sounds = _server(arguments)
+        _require_inside(site, arguments)
         claps = claps_at(sounds, arguments.at, show)
     else:
         site, claps = _recorded_claps(arguments)
@@ -263,6 +276,7 @@ def _poses(arguments: argparse.Namespace) -> int:
             print(json.dumps(clap_object(clap)) if arguments.json else clap_line(clap), flush=True)
 
         site, sounds = _server(arguments)
+        _require_inside(site, arguments)
         claps = claps_for_poses(sounds, site, arguments.at, arguments.place_std, show)
     else:
         site, claps = _recorded_claps(arguments)

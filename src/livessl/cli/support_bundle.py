@@ -126,7 +126,8 @@ def _checked(path: Path) -> str:
 
 def _versions() -> dict[str, Any]:
     """Return what runs where."""
-    packages = {distribution.metadata["Name"]: distribution.version for distribution in distributions()}
+    found = ((one.metadata["Name"], one.version) for one in distributions())
+    packages = {name: version for name, version in found if name}  # what is left of an uninstalled one has no name
     return {
         "livessl": __version__,
         "python": sys.version,

@@ -135,11 +135,13 @@ def assemble(
         array_states = ArrayStates(
             site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
+        set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         alerts = Alerts(
-            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces
-        )
+            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces,
+            lambda: set_up.site,
+        )  # fmt: skip
         undo.callback(alerts.stop)
         for _, alert in reversed(alerts.outbox.recent(RESTORED)):
             journal.alert(alert)
@@ -159,10 +161,8 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
-        set_up = SetUpInForce(site, clock, publish)
         proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
-        # the engine first: if its estimator cannot be made, nothing changes
-        for follower in (engine.take_over, set_up_watch.take_over, *(() if clips is None else (clips.take_over,))):
+        for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
         reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
@@ -282,9 +282,6 @@ class Server:
             self._kernel_loader.stop()
             self.parts.reloader.stop()
             self.parts.engine.stop()
-            self.parts.maps.stop()
-            self.parts.set_up_watch.stop()
-            self.parts.proposals.stop()
             self.parts.alerts.stop()
             if self.parts.clips is not None:
                 self.parts.clips.stop()
@@ -294,6 +291,10 @@ class Server:
             self.parts.store.close()
             self.parts.sinks.close()
             self._listener.close()
+            # what computes at leisure comes last: what has to be on the disk does not wait for it
+            self.parts.maps.stop()
+            self.parts.set_up_watch.stop()
+            self.parts.proposals.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Final, Protocol
 
 from livessl import wire
@@ -121,8 +122,8 @@ class Engine:
             self._thread.join(timeout=3.0)
         self._parallel.stop()
 
-    def take_over(self, site: Site) -> None:
-        """Locate with the poses of this site from the next turn on; any thread may call it.
+    def prepare(self, site: Site) -> Callable[[], None]:
+        """Prepare to locate with the poses of this site; return what does so from the next turn on; on any thread.
 
         Sounds that have begun are located as before. The tables of the estimator are computed here, so that the fusion
         thread does not wait for them.
@@ -130,7 +131,7 @@ class Engine:
         set_up = make_array_set_up(site, self._parallel.for_each)
         for array, rate_hz in tuple(self._rates_hz.items()):
             set_up.estimator.prepare(array, rate_hz)
-        self._coming.append((site, set_up))
+        return partial(self._coming.append, (site, set_up))
 
     def wait_idle(self) -> None:
         """Return when the replay that was sent has ended and its last event is published.

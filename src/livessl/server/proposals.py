@@ -29,10 +29,13 @@ if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredPose, MeasuredSetUp
 
 KEPT: Final = 16
-"""Number of proposals that can still be accepted; the oldest ones are dropped."""
+"""Number of proposals of people that can still be accepted, and of those of the thread; the oldest ones are dropped."""
 
 WAIT_S: Final = 2.0
 """Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
+
+JOIN_S: Final = 1.0
+"""Longest wait, in seconds, for a refinement that is under way when the server stops; it is of no use any more."""
 
 REFINED_SOUNDS: Final = 20
 """Fewest sounds from which the thread refines: fewer leave poses unsure."""
@@ -60,7 +63,7 @@ _log = logging.getLogger(__name__)
 
 
 class ProposalRefusedError(RunError):
-    """A proposal cannot come into force: it is not determined, does not fit, or is out of date."""
+    """A proposal cannot come into force: it is not determined, or does not fit."""
 
 
 class BusyError(RunError):
@@ -176,6 +179,9 @@ class Proposals:
         self._busy = threading.Lock()
         self._lock = threading.Lock()
         self._kept: OrderedDict[str, Proposal] = OrderedDict()
+        self._kept_of_thread: OrderedDict[str, Proposal] = (
+            OrderedDict()
+        )  # they come all the time, and push no other out
         self._made = 0
         self._refined: tuple[Site, int] | None = None  # the site and the last sound of the last refinement
         self.refinement = Refinement()
@@ -284,22 +290,18 @@ class Proposals:
             If there is no such proposal any more.
         ProposalRefusedError
             If it cannot come into force.
-        ConfigError, CalibrationFileError, SetUpChangedError
+        OutOfDateError, ConfigError, CalibrationFileError, SetUpChangedError
             See `SetUpInForce.accept`.
         """
         with self._lock:
-            found = self._kept.get(proposal_id)
-        latest = self.refinement.proposal
-        proposal = latest if found is None and latest is not None and latest.id == proposal_id else found
+            proposal = self._kept.get(proposal_id) or self._kept_of_thread.get(proposal_id)
         if proposal is None:
             raise LookupError(f"no proposal {proposal_id!r}; measure again")
         if proposal.refusal is not None:
             raise ProposalRefusedError(proposal.refusal)
-        if proposal.site is not self._set_up.site:
-            raise ProposalRefusedError("other poses have come into force since this was proposed; measure again")
         measured = proposal.measured
         sounds, c_m_s = (0, 0.0) if measured is None else (measured.sounds, measured.c_m_s)
-        return self._set_up.accept(proposal.stored, proposal.method, sounds, c_m_s)
+        return self._set_up.accept(proposal.stored, proposal.method, sounds, c_m_s, proposal.site)
 
     # --- the thread that refines
 
@@ -309,10 +311,10 @@ class Proposals:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, and wait for the thread."""
+        """Stop, and wait a little for the thread."""
         self._stop.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(timeout=JOIN_S)
 
     def refine_if_new(self) -> None:
         """Refine if there are enough new sounds or other poses; the thread calls it, and a test may."""
@@ -326,7 +328,7 @@ class Proposals:
         if before is not None and before[0] is site and new < NEW_SOUNDS:
             return
         try:
-            proposal = self._refine(site, sounds, [_best_known(site)], POSITION_STD_M)
+            proposal = self._refine(site, sounds, [_best_known(site)], POSITION_STD_M, is_of_thread=True)
         except (ValueError, np.linalg.LinAlgError) as error:
             _log.debug("the sounds so far do not refine the poses: %s", error)
             self._refined, self.refinement = (site, sounds[-1].number), Refinement(len(sounds))
@@ -350,14 +352,22 @@ class Proposals:
             raise
 
     def _refine(
-        self, site: Site, sounds: Sequence[HeardSound], known: Collection[str], position_std_m: float
+        self,
+        site: Site,
+        sounds: Sequence[HeardSound],
+        known: Collection[str],
+        position_std_m: float,
+        *,
+        is_of_thread: bool = False,
     ) -> Proposal:
         from livessl.site.build.set_up import refine_set_up
 
         measured = refine_set_up(site, [sound.observations for sound in sounds], known, position_std_m)
         stored = measured_arrays(site, measured)
         refusal = _undetermined(measured) or _misfit_with_site(site, stored)
-        return self._keep("refine", site, measured, stored, known=tuple(known), refusal=refusal)
+        return self._keep(
+            "refine", site, measured, stored, known=tuple(known), refusal=refusal, is_of_thread=is_of_thread
+        )
 
     def _keep(
         self,
@@ -372,6 +382,7 @@ class Proposals:
         next_place_m: FloatArray | None = None,
         is_enough: bool = False,
         refusal: str | None = None,
+        is_of_thread: bool = False,
     ) -> Proposal:
         if microphones is None:
             microphones = {} if measured is None else {n: pose.microphones_m for n, pose in measured.poses.items()}
@@ -382,9 +393,10 @@ class Proposals:
                 f"{method}-{now_ns // 1_000_000}-{self._made}",
                 method, now_ns, site, microphones, stored, measured, known, claps, next_place_m, is_enough, refusal,
             )  # fmt: skip
-            self._kept[proposal.id] = proposal
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
+            kept = self._kept_of_thread if is_of_thread else self._kept
+            kept[proposal.id] = proposal
+            while len(kept) > KEPT:
+                kept.popitem(last=False)
         return proposal
 
 
@@ -404,13 +416,16 @@ def _best_known(site: Site) -> str:
 
 
 def _moved(site: Site, measured: MeasuredSetUp) -> Site:
-    """Return a site with measured arrays, which need not fit the room, and the measured speed of sound."""
+    """Return a site with measured arrays, which need not fit the room.
+
+    Its speed of sound is that of the site, because the measured one does not come into force.
+    """
     at_m = {name: pose.microphones_m for name, pose in measured.poses.items()}
     processed = tuple(
         ArraySpec(spec.name, at_m.get(spec.name, spec.microphones_m), spec.band_hz, spec.uncertainty, spec.parts)
         for spec in site.processed
     )
-    return site.model_copy(update={"processed": processed, "c_m_s": measured.c_m_s})
+    return site.model_copy(update={"processed": processed})
 
 
 def _undetermined(measured: MeasuredSetUp) -> str | None:

@@ -12,7 +12,8 @@ KEPT_LINES: Final = 1000
 """Most lines that are kept: days of a server without trouble, and the beginning of most troubles."""
 
 MAX_LINE: Final = 2000
-"""Longest message that is kept, in characters, so that the lines take 10 MB at most."""
+"""Longest message that is kept, in characters, so that the lines take 10 MB at most. Of longer ones beginning and end
+are: a traceback says at its end what is wrong."""
 
 
 class Line(NamedTuple):
@@ -32,12 +33,15 @@ class RecentLog(logging.Handler):
         self._lines: deque[Line] = deque(maxlen=KEPT_LINES)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record."""
-        message = record.getMessage()
-        if record.exc_info and record.exc_info[0] is not None:
-            message += f"\n{logging.Formatter().formatException(record.exc_info)}"
-        time_ns = round(record.created * 1e6) * 1000
-        self._lines.append(Line(time_ns, record.levelname.lower(), record.name, message[:MAX_LINE]))
+        """Keep a record; one that cannot be formatted is handled as the handlers of the standard library do."""
+        try:
+            message = record.getMessage()
+            if record.exc_info and record.exc_info[0] is not None:
+                message += f"\n{logging.Formatter().formatException(record.exc_info)}"
+            time_ns = round(record.created * 1e6) * 1000
+            self._lines.append(Line(time_ns, record.levelname.lower(), record.name, _shortened(message)))
+        except Exception:  # noqa: BLE001 - a log line must not end what logs it
+            self.handleError(record)
 
     def lines(self, most: int = KEPT_LINES) -> list[Line]:
         """Return the newest lines, the oldest of them first."""
@@ -56,3 +60,12 @@ class RecentLog(logging.Handler):
             yield
         finally:
             root.removeHandler(self)
+
+
+def _shortened(message: str) -> str:
+    """Return beginning and end of a long message, with what is left out between them."""
+    if len(message) <= MAX_LINE:
+        return message
+    note = f"\n… {len(message) - MAX_LINE + 100} characters are left out …\n"
+    begin = (MAX_LINE - 100) // 2
+    return message[:begin] + note + message[begin - MAX_LINE + 100 :]

@@ -9,10 +9,11 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from livessl.errors import RunError, UseError
+from livessl.errors import ConfigError, RunError, UseError
 from livessl.server.alerts.service import Alerts
 from livessl.server.zones.book import ZoneBook
 from livessl.site.changes import changed_keys, is_of_poses, is_taken_over, moved_arrays, names_of
@@ -35,6 +36,20 @@ class Poses(Protocol):
     @property
     def site(self) -> Site:
         """The site with the poses that are in force."""
+        ...
+
+    def unchanged(self) -> AbstractContextManager[None]:
+        """Keep everybody else from changing the poses or the calibration file during a context."""
+        ...
+
+    def calibrated(self, site: Site) -> Site:
+        """Return a site that was read before with its calibration file as it is now.
+
+        Raises
+        ------
+        ConfigError
+            With every fault of the file.
+        """
         ...
 
     def take_over(self, site: Site) -> list[str]:
@@ -172,18 +187,21 @@ class Reloader:
 
     def _take_over_poses(self, site: Site, places: Sequence[Place]) -> Reloaded:
         """Take over where the microphones are; what a file of the site says of an array counts as the array's key."""
-        moved = moved_arrays(self._in_force if self._poses is None else self._poses.site, site)
-        named = {place[1] for place in places if place[0] == "arrays"}
-        keys = [*names_of(list(places)), *(f"arrays.{name}" for name in moved if name not in named)]
-        if not keys:
-            return Reloaded([], [], [])
         if self._poses is None:
-            return Reloaded([], keys, [])
-        try:
-            self._poses.take_over(site)
-        except RunError as error:
-            _log.warning("%s", error)
-            return Reloaded([], keys, [])
+            return Reloaded([], _keys_of_poses(self._in_force, site, places), [])
+        with self._poses.unchanged():
+            keys: list[str] = []
+            try:
+                # the site was read before its rules were taken over, which takes seconds: somebody may have accepted
+                # other poses since
+                site = self._poses.calibrated(site)
+                keys = _keys_of_poses(self._poses.site, site, places)
+                if not keys:
+                    return Reloaded([], [], [])
+                self._poses.take_over(site)
+            except (ConfigError, RunError) as error:
+                _log.warning("%s", error)
+                return Reloaded([], keys or _keys_of_poses(self._poses.site, site, places), [])
         self._in_force = self._in_force.model_copy(update=_poses_of(site, self._in_force))
         return Reloaded(keys, [], [])
 
@@ -201,6 +219,13 @@ class Reloader:
             self.failure = error
             _log.exception("the thread that reloads has failed; the server ends")
             raise
+
+
+def _keys_of_poses(before: Site, site: Site, places: Sequence[Place]) -> list[str]:
+    """Return the changed keys of poses, and the arrays that files of the site have elsewhere."""
+    named = {place[1] for place in places if place[0] == "arrays"}
+    moved = moved_arrays(before, site)
+    return [*names_of(list(places)), *(f"arrays.{name}" for name in moved if name not in named)]
 
 
 def _poses_of(site: Site, before: Site) -> dict[str, Any]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,36 +15,53 @@ import numpy as np
 from livessl.clock import Clock
 from livessl.core.types import ArraySpec
 from livessl.errors import ConfigError, RunError
-from livessl.site.build.calibrated import with_calibration
+from livessl.site.build.calibrated import array_faults, with_calibration
 from livessl.site.calibration_file import (
     calibration_path,
     can_undo,
+    contents,
     extended,
     kept_path,
+    put_back,
     read_calibration,
     undo_calibration,
     write_calibration,
 )
+from livessl.site.findings import dotted
 from livessl.site.models import CalibratedArray, CalibrationFile, Site
 
 _log = logging.getLogger(__name__)
 
-Follower = Callable[[Site], None]
-"""Takes over the poses of a site; called on any thread."""
+Commit = Callable[[], None]
+"""Brings into force what was prepared; it cannot fail."""
 
-_TAKEN: Final = (
-    *("arrays", "uncertainty", "calibration", "temperature_c", "speed_of_sound_m_s"),
-    *("c_m_s", "specs", "processed"),
-)
-"""What is taken over of a site that was loaded anew."""
+Follower = Callable[[Site], Commit]
+"""Prepares to take over the poses of a site, which may fail and changes nothing; called on any thread."""
+
+_KEYS: Final = ("arrays", "uncertainty", "calibration", "temperature_c", "speed_of_sound_m_s", "c_m_s")
+_TAKEN: Final = (*_KEYS, "specs", "processed")
+"""What is taken over of a site that was loaded anew: keys of its file and the speed of sound, and what they make."""
 
 
 class SetUpChangedError(RunError):
     """A set-up that differs in more than poses: the server has to start again for it."""
 
 
+class OutOfDateError(RunError):
+    """Poses that were proposed for others than those in force."""
+
+
 class CalibrationFileError(RunError):
     """The calibration file cannot be written."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """A site that can come into force, the arrays that it changes, and what brings it into force."""
+
+    site: Site
+    changed: list[str]
+    commits: tuple[Commit, ...]
 
 
 class SetUpInForce:
@@ -65,8 +84,14 @@ class SetUpInForce:
         self._lock = threading.RLock()
 
     def follow(self, follower: Follower) -> None:
-        """Have this called with every site whose poses come into force; the first follower that fails prevents that."""
+        """Have this prepare for every site whose poses come into force; one that fails prevents that for all."""
         self._followers.append(follower)
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Keep everybody else from changing the poses or the calibration file during a context."""
+        with self._lock:
+            yield
 
     def take_over(self, site: Site) -> list[str]:
         """Take over the poses, their uncertainty and the speed of sound of a site that was loaded anew.
@@ -82,23 +107,41 @@ class SetUpInForce:
         Raises
         ------
         SetUpChangedError
-            If arrays have other names, numbers of microphones, bands or members: then the server has to start again.
+            If arrays have other names, numbers of microphones, bands or members, or do not fit the room that the server
+            runs with: then it has to start again.
         """
         with self._lock:
-            fault = _difference(self.site, site)
-            if fault is not None:
-                raise SetUpChangedError(f"{fault}; start the server again to change that")
-            before = {spec.name: spec for spec in self.site.processed}
-            changed = [spec.name for spec in site.processed if _differs(before[spec.name], spec)]
-            if not changed and site.c_m_s == self.site.c_m_s:
-                return []
-            now = self.site.model_copy(update={key: getattr(site, key) for key in _TAKEN})
-            for follower in self._followers:
-                follower(now)
-            self.site = now
-            _log.info("new poses are in force: %s", ", ".join(changed) or "a new speed of sound")
-            self._publish({"kind": "poses", "arrays": self.describe_arrays(), "changed": changed})
-            return changed
+            return self._bring_into_force(self._prepared(site))
+
+    def _prepared(self, site: Site) -> _Prepared:
+        fault = _difference(self.site, site)
+        if fault is not None:
+            raise SetUpChangedError(f"{fault}; start the server again to change that")
+        changed = self._changed(site)
+        if all(getattr(site, key) == getattr(self.site, key) for key in _KEYS) and not changed:
+            return _Prepared(self.site, [], ())
+        now = self.site.model_copy(update={key: getattr(site, key) for key in _TAKEN})
+        if not changed and site.c_m_s == self.site.c_m_s:
+            return _Prepared(now, [], ())
+        faults = array_faults(now)
+        if faults:
+            told = "; ".join(f"{dotted(where)}: {what}" for where, what in faults)
+            raise SetUpChangedError(f"{told}; if the room has changed as well, start the server again")
+        return _Prepared(now, changed, tuple(follower(now) for follower in self._followers))
+
+    def _bring_into_force(self, prepared: _Prepared) -> list[str]:
+        for commit in prepared.commits:
+            commit()
+        self.site = prepared.site
+        if prepared.commits:
+            _log.info("new poses are in force: %s", ", ".join(prepared.changed) or "a new speed of sound")
+            self._publish({"kind": "poses", "arrays": self.describe_arrays(), "changed": prepared.changed})
+        return prepared.changed
+
+    def _changed(self, site: Site) -> list[str]:
+        """Return the names of the arrays that a site with the same arrays has elsewhere, or knows differently well."""
+        before = {spec.name: spec for spec in self.site.processed}
+        return [spec.name for spec in site.processed if _differs(before[spec.name], spec)]
 
     # --- the calibration file
 
@@ -115,10 +158,27 @@ class SetUpInForce:
         with self._lock:
             return self.take_over(with_calibration(self.site, read_calibration(calibration_path(self.site))))
 
+    def calibrated(self, site: Site) -> Site:
+        """Return a site that was read before with its calibration file as it is now.
+
+        Raises
+        ------
+        ConfigError
+            With every fault of the file.
+        """
+        return with_calibration(site, read_calibration(calibration_path(site)))
+
     def accept(
-        self, arrays: Mapping[str, CalibratedArray], method: str, sounds: int = 0, c_m_s: float = 0.0
+        self,
+        arrays: Mapping[str, CalibratedArray],
+        method: str,
+        sounds: int = 0,
+        c_m_s: float = 0.0,
+        proposed_for: Site | None = None,
     ) -> list[str]:
         """Write arrays into the calibration file and take it over; return the names of the arrays that changed.
+
+        Nothing is written where neither the poses in force nor those of the file would change.
 
         Parameters
         ----------
@@ -129,23 +189,28 @@ class SetUpInForce:
             Number of sounds that they rest on.
         c_m_s : float
             Measured speed of sound, m/s; 0 if it was not.
+        proposed_for : Site or None
+            The site that was in force when the arrays were measured; None for any.
 
         Raises
         ------
+        OutOfDateError
+            If other poses have come into force since; then nothing has changed.
         ConfigError
             If the arrays do not fit the site, or the file before cannot be read; then nothing has changed.
         CalibrationFileError
             If the file cannot be written; then nothing has changed.
         """
         with self._lock:
+            if proposed_for is not None and proposed_for is not self.site:
+                raise OutOfDateError("other poses have come into force since this was proposed; measure again")
             path = calibration_path(self.site)
-            calibration = extended(read_calibration(path), arrays, method, self._clock.now_ns(), sounds, c_m_s)
-            site = with_calibration(self.site, calibration)
-            try:
-                write_calibration(path, calibration)
-            except OSError as error:
-                raise _unwritable(path, error) from error
-            return self.take_over(site)
+            before = read_calibration(path)
+            calibration = extended(before, arrays, method, self._clock.now_ns(), sounds, c_m_s)
+            prepared = self._prepared(with_calibration(self.site, calibration))
+            if not prepared.changed and self._is_in_force(before):
+                return []
+            return self._replaced(path, lambda: write_calibration(path, calibration), prepared)
 
     def undo(self) -> list[str]:
         """Put back the calibration file before the last change and take it over; return the arrays that changed.
@@ -163,12 +228,29 @@ class SetUpInForce:
             path = calibration_path(self.site)
             if not can_undo(path):
                 raise LookupError("there is no calibration before this one to go back to")
-            site = with_calibration(self.site, read_calibration(kept_path(path)))
-            try:
-                undo_calibration(path)
-            except OSError as error:
-                raise _unwritable(path, error) from error
-            return self.take_over(site)
+            prepared = self._prepared(with_calibration(self.site, read_calibration(kept_path(path))))
+            return self._replaced(path, lambda: undo_calibration(path), prepared)
+
+    def _replaced(self, path: Path, replace: Callable[[], None], prepared: _Prepared) -> list[str]:
+        """Replace the file, then bring into force what was prepared; if that fails, the file is as it was."""
+        try:
+            before = contents(path)
+            replace()
+        except OSError as error:
+            raise _unwritable(path, error) from error
+        try:
+            return self._bring_into_force(prepared)
+        except BaseException:
+            if self.site is not prepared.site:
+                put_back(before)
+            raise
+
+    def _is_in_force(self, calibration: CalibrationFile) -> bool:
+        """Return whether a calibration of this site has the arrays where they are."""
+        try:
+            return not self._changed(with_calibration(self.site, calibration))
+        except ConfigError:
+            return False
 
     # --- for the API
 

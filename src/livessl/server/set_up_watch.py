@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
@@ -26,6 +27,9 @@ KEPT_SOUNDS: Final = 12
 
 WAIT_S: Final = 1.0
 """Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
+
+JOIN_S: Final = 1.0
+"""Longest wait, in seconds, for an examination that is under way when the server stops."""
 
 _log = logging.getLogger(__name__)
 
@@ -135,11 +139,16 @@ class SetUpWatch:
             self._steady = SteadyFindings()
             self._note(())
 
-    def take_over(self, site: Site) -> None:
-        """Examine the last sounds anew with the poses of this site: what was wrong may be mended; any thread."""
-        of_layout = layout_findings(site)
+    def prepare(self, site: Site) -> Callable[[], None]:
+        """Return what examines the last sounds anew with the poses of this site; any thread.
+
+        What was wrong may be mended.
+        """
+        return partial(self._take_over, site, layout_findings(site))
+
+    def _take_over(self, site: Site, of_layout: Sequence[Finding]) -> None:
         with self._lock:
-            self._site, self._of_layout = site, of_layout
+            self._site, self._of_layout = site, tuple(of_layout)
             self._run += 1
             self._steady = SteadyFindings()
             self._unjudged = len(self._sounds)
@@ -151,10 +160,10 @@ class SetUpWatch:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, and wait for the thread."""
+        """Stop, and wait a little for the thread."""
         self._stop.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(timeout=JOIN_S)
 
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""

@@ -56,6 +56,17 @@ def calibration_path(site: Site) -> Path:
     return site.file(site.calibration or default_name(site.site))
 
 
+def is_absent(path: Path) -> bool:
+    """Return whether there is certainly no such file; what cannot be looked for may be there."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
 def read_calibration(path: Path) -> CalibrationFile:
     """Return a calibration; one without arrays if there is no such file.
 
@@ -64,7 +75,7 @@ def read_calibration(path: Path) -> CalibrationFile:
     ConfigError
         With every fault of the file.
     """
-    return read_model(CalibrationFile, path, "calibration file") if path.exists() else CalibrationFile(arrays={})
+    return CalibrationFile(arrays={}) if is_absent(path) else read_model(CalibrationFile, path, "calibration file")
 
 
 def extended(
@@ -130,6 +141,32 @@ def undo_calibration(path: Path) -> None:
         If the file cannot be replaced.
     """
     kept_path(path).replace(path)
+
+
+def contents(path: Path) -> dict[Path, bytes | None]:
+    """Return the content of a calibration file and of the one before; None where there is none.
+
+    Raises
+    ------
+    OSError
+        If one of them cannot be read.
+    """
+    return {one: None if is_absent(one) else one.read_bytes() for one in (path, kept_path(path))}
+
+
+def put_back(before: Mapping[Path, bytes | None]) -> None:
+    """Put back what `contents` has returned.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be replaced.
+    """
+    for path, content in before.items():
+        if content is None:
+            path.unlink(missing_ok=True)
+        else:
+            _written(path, content).replace(path)
 
 
 def can_undo(path: Path) -> bool:

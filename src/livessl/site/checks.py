@@ -19,6 +19,7 @@ from livessl.errors import Fault
 from livessl.site.addresses import is_loopback
 from livessl.site.alert_checks import alert_faults, alert_warnings
 from livessl.site.build.grid import search_grid
+from livessl.site.calibration_file import is_absent
 from livessl.site.fields import Bounds
 from livessl.site.findings import unknown_array
 from livessl.site.guesses import box_cure, position_cure, rate_cure, unlikely
@@ -83,12 +84,21 @@ def warnings_of(site: Site) -> tuple[str, ...]:
     """Return warnings about settings that are valid but unlikely to work as expected."""
     return (
         *unlikely(site),
+        *_not_calibrated(site),
         *_near_arrays(site),
         *_wide_arrays(site),
         *_look_alikes(site),
         *_privacy_gaps(site),
         *alert_warnings(site),
     )
+
+
+def _not_calibrated(site: Site) -> Iterator[str]:
+    if site.calibration is not None and is_absent(site.file(site.calibration)):
+        yield (
+            f"calibration: there is no file {site.calibration} yet, so the poses of the site file are in force; "
+            "`livessl calibrate poses --write` or the Set-up view makes it"
+        )
 
 
 def _server_faults(site: Site) -> Iterator[Finding]:

@@ -9,7 +9,8 @@ from typing import Any, Final
 
 import yaml
 
-from livessl.site.findings import Locator, dotted, nodes_of, read_yaml, value_of
+from livessl.site.calibration_file import read_calibration
+from livessl.site.findings import Locator, dotted, nodes_of, value_of
 from livessl.site.load import load_site
 from livessl.site.models import Site
 from livessl.site.place import Place
@@ -81,9 +82,7 @@ def effective_settings(path: Path) -> list[Setting]:
 
 def _measured(site: Site) -> set[str]:
     """Return the names of the arrays whose microphones the calibration file gives."""
-    if site.calibration is None:
-        return set()
-    return set(read_yaml(site.file(site.calibration).read_text(encoding="utf-8"))["arrays"])
+    return set() if site.calibration is None else set(read_calibration(site.file(site.calibration)).arrays)
 
 
 def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | None:

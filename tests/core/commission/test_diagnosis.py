@@ -8,7 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
-from livessl.core.commission.diagnosis import Diagnosis, diagnose
+from livessl.core.commission.diagnosis import MOST_ARRAYS, Diagnosis, diagnose, most_doubtful
+from livessl.core.commission.judge import fitted_together
+from livessl.core.commission.places import PlaceSearch
+from livessl.core.commission.set_up import SetUp, careful
+from livessl.core.commission.tolerance import unknowns_of
+from livessl.core.geometry import posed, tetrahedron
 
 seeds = st.integers(0, 10_000)
 few = settings(deadline=None, max_examples=3)
@@ -119,3 +124,36 @@ def test_channels_without_sound_and_arrays_that_missed_sounds_are_left_out() -> 
     found = diagnosed(filed, swapped).best
     assert found is not None
     assert (found.fault, found.array, found.order) == ("swapped", "south", (4, 2, 3, 1))
+
+
+def many(rng: np.random.Generator, count: int) -> Arrays:
+    """Tetrahedra all over the room, turned at random."""
+    return {
+        f"array{index}": posed(tetrahedron(0.5), tuple(at_m), yaw_deg=float(rng.uniform(-180.0, 180.0)))
+        for index, at_m in enumerate(rng.uniform([1.0, 1.0, 1.5], [7.0, 9.0, 3.0], (count, 3)))
+    }
+
+
+@pytest.mark.parametrize("count", [2, 8, 24, 48])
+def test_set_ups_that_are_fitted_together_take_bounded_memory(count: int) -> None:
+    rng = np.random.default_rng(count)
+    filed = many(rng, count)
+    one = SetUp(filed, delays_of(filed, sources(rng), rng), C_M_S, careful(filed))
+    unknowns = unknowns_of(one)
+    assert unknowns == 18 * count + 2
+    rows = fitted_together(one)
+    assert rows >= 1
+    assert rows * unknowns**2 * 8 <= 64e6
+
+
+@few
+@given(seed=seeds, wrong=st.integers(0, 11), angle_deg=st.floats(20.0, 100.0))
+def test_of_many_arrays_the_wrong_one_is_among_those_that_are_judged(seed: int, wrong: int, angle_deg: float) -> None:
+    rng = np.random.default_rng(seed)
+    true = many(rng, 12)
+    name = f"array{wrong}"
+    filed = true | {name: turned(true[name], angle_deg)}
+    used = most_doubtful(filed, delays_of(true, sources(rng), rng), PlaceSearch(BOUNDS_M, C_M_S))
+    assert name in used
+    assert len(used) == len(set(used)) == MOST_ARRAYS
+    assert used == [one for one in filed if one in used]

@@ -102,7 +102,7 @@ def test_clip_that_is_too_large_or_never_comes_is_not_attached(tmp_path: Path, m
 
     def found(clips: Any) -> Path | None:
         site = site_of()
-        return asyncio.run(Evidence(site, lambda: ZoneMap(site), clips).clip(alert_at(1.0, 1.0)))
+        return asyncio.run(Evidence(lambda: site, lambda: ZoneMap(site), clips).clip(alert_at(1.0, 1.0)))
 
     for name, value in (("LOOK_S", 0.001), ("QUEUED_S", 0.003), ("CLIP_WAIT_S", 0.02), ("MAX_CLIP_BYTES", 100)):
         monkeypatch.setattr(evidence, name, value)
@@ -130,3 +130,12 @@ def test_alert_links_to_its_picture_which_the_server_draws(tmp_path: Path) -> No
         assert httpx.get(alert["clips"]).json()["event_id"] == event.id
         assert httpx.get(alert["picture"], params={"size": 5000}).status_code == 422
         assert httpx.get(alert["picture"].replace("alert_", "alert_f")).status_code == 404
+
+
+def test_pictures_show_where_the_arrays_are_now() -> None:
+    sites = [site_of(), site_of({"arrays.south.position_m": [3.2, 0.8, 1.5]})]
+    now = iter(sites)
+    evidence = Evidence(lambda: next(now), lambda: ZoneMap(sites[0]), None)
+    alert = alert_at(1.0, 1.0)
+    assert [evidence.picture(alert), evidence.picture(alert)] == [picture_of(alert, one, ZoneMap(one)) for one in sites]
+    assert picture_of(alert, sites[0], ZoneMap(sites[0])) != picture_of(alert, sites[1], ZoneMap(sites[1]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from known_sounds import events, finish, places_m
 from livessl.server.app import Server
 from livessl.site.build import set_up
 from livessl.site.load import load_site
+from livessl.site.models import Site
 from scene_server import capture_scene, get, live
 from small_site import HANG_S, running_server, scene, site_of, wait_until, write_site
 
@@ -124,6 +126,11 @@ def test_claps_that_leave_a_pose_open_are_refused_and_the_next_place_is_named(
     too_few = post(client, "measure", clapped(server, 3), 422)
     assert "expected 4 sounds or more" in str(too_few["detail"])
     request = clapped(server, 4)
+    far = [{**clap, "place_m": [1e4, 1e4, 1e4]} for clap in request["claps"]]
+    for path in ("measure", "verify"):
+        told = str(post(client, path, {"claps": far}, 422)["detail"])
+        assert "expected places in the room" in told
+        assert "got 10000, 10000, 10000" in told
     for clap in request["claps"]:  # all claps at almost one place
         clap["number"], clap["place_m"] = request["claps"][0]["number"], request["claps"][0]["place_m"]
     proposal = post(client, "measure", request)
@@ -141,7 +148,31 @@ def test_sounds_at_wrong_places_contradict_each_other(server: Server, client: ht
     assert proposal["refusal"] is not None
 
 
-def test_the_server_refines_poses_by_the_sounds_that_it_locates(server: Server, client: httpx.Client) -> None:
+def test_claps_are_judged_with_the_speed_of_sound_that_stays_in_force(
+    server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure, place, speeds = set_up.measure_set_up, set_up.place_sounds, []
+
+    def at_another_speed(*arguments: Any) -> Any:
+        return replace(measure(*arguments), c_m_s=300.0)
+
+    def noted(site: Site, *arguments: Any) -> Any:
+        speeds.append(site.c_m_s)
+        return place(site, *arguments)
+
+    monkeypatch.setattr(set_up, "measure_set_up", at_another_speed)
+    monkeypatch.setattr(set_up, "place_sounds", noted)
+    proposal = post(client, "measure", clapped(server))
+    assert proposal["speed"]["speed_of_sound_m_s"] == 300.0
+    assert speeds == [server.parts.site.c_m_s] * 2, "before and after"
+    assert proposal["refusal"] is None
+
+
+def test_the_server_refines_poses_by_the_sounds_that_it_locates(
+    server: Server, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("livessl.server.proposals.KEPT", 1)
+    outside = post(client, "move", {"arrays": {"south": {"position_m": [2.0, 3.0, 7.0]}}})
     assert get(client, "set-up")["refinement"] == {"sounds": 0, "needed": 20, "agrees": None, "proposal": None}
     for event in events(count=22):
         finish(server, event)
@@ -151,6 +182,7 @@ def test_the_server_refines_poses_by_the_sounds_that_it_locates(server: Server, 
     (pose,) = proposal["arrays"]
     assert (refinement["agrees"], proposal["known"], pose["array"]) == (False, ["north"], "south")
     assert pose["turn_deg"] == pytest.approx([0.0, 0.0, -25.0], abs=3.0)
+    post(client, "accept", {"id": outside["id"]}, 409)  # the thread's proposals push out no other
     post(client, "accept", {"id": proposal["id"]})
     wait_until(lambda: get(client, "set-up")["refinement"]["agrees"] is True, "the refinement with the new poses")
 

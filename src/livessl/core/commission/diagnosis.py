@@ -18,7 +18,7 @@ import numpy as np
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.judge import COSTS, Judge
-from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch
+from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch, contradictions_s
 from livessl.core.commission.trial import FLOOR_S as KNOWN_FLOOR_S
 from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray
@@ -47,6 +47,10 @@ to 2 cm and 1.5 degrees."""
 
 MOST_SOUNDS: Final = 24
 """Most sounds that are compared: more of them tell little more, because the errors of the set-up do not average out."""
+
+MOST_ARRAYS: Final = 8
+"""Most arrays that are judged together. The time of each fit grows with the cube of their number, its memory with the
+square, and there are more alternatives to fit."""
 
 MIN_RATIO: Final = 1.3
 """Least ratio between the misfit as filed and that of the alternative."""
@@ -103,10 +107,14 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
     c_m_s : float
         Speed of sound as filed, m/s.
     """
-    judge = Judge(microphones, most_telling(delays), PlaceSearch(bounds_m, c_m_s))
+    search, arrays = PlaceSearch(bounds_m, c_m_s), len(microphones)
+    if arrays > MOST_ARRAYS:
+        names = most_doubtful(microphones, most_telling(delays), search)
+        microphones, delays = ({name: of[name] for name in names} for of in (microphones, delays))
+    judge = Judge(microphones, most_telling(delays), search)
     if judge.sounds < LEAST_SOUNDS or judge.arrays < 2:
         return Diagnosis(judge.sounds, judge.misfit_s, None, (), contradicts=False)
-    return _by_judge(judge)
+    return _by_judge(judge, arrays)
 
 
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
@@ -134,6 +142,28 @@ def most_telling(delays: Delays) -> dict[str, FloatArray]:
     return {name: one[used] for name, one in delays.items()}
 
 
+def most_doubtful(microphones: Microphones, delays: Delays, search: PlaceSearch) -> list[str]:
+    """Return the names of the `MOST_ARRAYS` arrays that are judged together, in the order of the site.
+
+    Half of them are those that disagree most with the places that all arrays say. The others received the sounds of
+    these best: what is wrong with an array shows only against others.
+    """
+    places_m = search.fit(microphones, delays).positions_m
+    off_s = {}
+    for name, one in delays.items():
+        squares = contradictions_s(microphones, {name: one}, places_m, search.c_m_s) ** 2
+        counts = np.maximum(np.isfinite(one).sum(axis=1) - 1, 0)
+        each = squares.sum(axis=1)[counts > 0] / counts[counts > 0]
+        # a median, because one echo is no fault of an array
+        off_s[name] = float(np.sqrt(np.median(each))) if len(each) >= LEAST_SOUNDS else 0.0
+    worst = sorted(delays, key=lambda name: off_s[name], reverse=True)[: MOST_ARRAYS // 2]
+    heard = np.any([np.isfinite(delays[name]).sum(axis=1) > 1 for name in worst], axis=0)
+    others = [name for name in delays if name not in worst]
+    others.sort(key=lambda name: int(np.isfinite(delays[name][heard]).sum()), reverse=True)
+    used = {*worst, *others[: MOST_ARRAYS - len(worst)]}
+    return [name for name in delays if name in used]
+
+
 def _by_criterion(trial: Trial) -> Diagnosis:
     """Compare alternatives by their misfits alone, as sounds at known places allow."""
     filed_s = trial.filed.misfit_s
@@ -153,9 +183,9 @@ def _by_criterion(trial: Trial) -> Diagnosis:
     return _decided(trial.sounds, filed_s, rivals, gained, contradicts, KNOWN_MIN_LEAD, KNOWN_MIN_LEAD)
 
 
-def _by_judge(judge: Judge) -> Diagnosis:
-    """Compare alternatives with the freedom of a careful set-up."""
-    least = MIN_GAIN + GAIN_PER_ARRAY * (judge.arrays - 1)
+def _by_judge(judge: Judge, arrays: int) -> Diagnosis:
+    """Compare alternatives with the freedom of a careful set-up; the judged arrays were chosen from so many."""
+    least = MIN_GAIN + GAIN_PER_ARRAY * (arrays - 1)
     misfit_s = judge.misfit_s
     if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
         return Diagnosis(judge.sounds, misfit_s, None, (), contradicts=False)

@@ -18,7 +18,7 @@ from livessl.core.commission.hypotheses import Hypotheses, Hypothesis
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.poses import moved
 from livessl.core.commission.set_up import SetUp, Stacked
-from livessl.core.commission.tolerance import Explained, explained
+from livessl.core.commission.tolerance import Explained, explained, unknowns_of
 from livessl.core.types import FloatArray
 
 COSTS: Final = {
@@ -36,6 +36,10 @@ microphone does, because there are many."""
 
 MOST_SLOPES: Final = 500_000
 """Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
+
+MOST_NORMAL: Final = 8_000_000
+"""Most numbers in the normal equations of the set-ups that are fitted at one time: 64 MB. Their unknowns are those of
+all arrays, so one set-up of 30 arrays has 300 000."""
 
 
 class Judge:
@@ -87,9 +91,7 @@ class Judge:
 
     def _fitted(self, tried: Sequence[Hypothesis]) -> list[Explained]:
         """Fit hypotheses, as many together as fit into a little memory."""
-        first = tried[0].set_up
-        most = max(1, MOST_SLOPES // max(one.size * (8 + 3 * one.shape[1]) for one in first.delays.values()))
-        bounds_m, found = self._search.bounds_m, []
+        most, bounds_m, found = fitted_together(tried[0].set_up), self._search.bounds_m, []
         for begin in range(0, len(tried), most):
             some = tried[begin : begin + most]
             set_ups = [one.set_up for one in some]
@@ -97,6 +99,15 @@ class Judge:
             places_m = Stacked(set_ups, bounds_m).placed(starts_m, [one.but for one in some])
             found += explained(set_ups, places_m, bounds_m)
         return found
+
+
+def fitted_together(set_up: SetUp) -> int:
+    """Return the number of set-ups like this one that are fitted together: as many as fit into a little memory."""
+    sounds = len(next(iter(set_up.delays.values())))
+    unknowns = unknowns_of(set_up)
+    slopes = max(one.size * (8 + 3 * one.shape[1]) for one in set_up.delays.values())
+    normal = unknowns * (unknowns + 3 * sounds)
+    return int(max(1, min(MOST_SLOPES // slopes, MOST_NORMAL // normal)))
 
 
 def _applied(filed: SetUp, alternative: Alternative) -> SetUp:

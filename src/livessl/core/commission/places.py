@@ -84,12 +84,14 @@ class PlaceSearch:
         Search volume, metres.
     c_m_s : float
         Speed of sound, m/s.
+    points_m : (G, 3) float64 or None
+        Points at which places begin, metres; None for a grid in the volume.
     """
 
-    def __init__(self, bounds_m: FloatArray, c_m_s: float) -> None:
+    def __init__(self, bounds_m: FloatArray, c_m_s: float, points_m: FloatArray | None = None) -> None:
         self.bounds_m = np.asarray(bounds_m, dtype=np.float64)
         self.c_m_s = c_m_s
-        self._points_m = _points(self.bounds_m)
+        self._points_m = _points(self.bounds_m) if points_m is None else np.asarray(points_m, dtype=np.float64)
 
     @property
     def points_m(self) -> FloatArray:
@@ -179,8 +181,7 @@ class KnownPlaces(PlaceSearch):
     """
 
     def __init__(self, places_m: FloatArray, c_m_s: float) -> None:
-        super().__init__(np.column_stack([places_m.min(axis=0), places_m.max(axis=0)]), c_m_s)
-        self._points_m = np.asarray(places_m, dtype=np.float64)
+        super().__init__(np.column_stack([places_m.min(axis=0), places_m.max(axis=0)]), c_m_s, places_m)
 
     def costs(self, table_s: FloatArray, delays_s: FloatArray) -> FloatArray:
         """Squared contradiction of delays (S, K) at one array with the place of each sound, (S, 1)."""

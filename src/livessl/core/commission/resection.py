@@ -33,6 +33,9 @@ REACH_M: Final = 6.0
 STEPS_M: Final = (1.0, 0.25)
 """Steps of that search, metres."""
 
+POINTS_TOGETHER: Final = 4096
+"""Points that are tried at one time, so that a search in a hall takes little memory."""
+
 NEAREST_M: Final = 0.1
 """Least distance of an array from a sound, metres."""
 
@@ -294,7 +297,9 @@ def from_known_places(
     for step_m in STEPS_M:
         axes = [np.arange(a, b + step_m / 2.0, step_m) for a, b in zip(low, high, strict=True)]
         points_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        best_m = points_m[np.argmin(_contradictions(points_m, places_m[there], directions))]
+        chunks = (points_m[at : at + POINTS_TOGETHER] for at in range(0, len(points_m), POINTS_TOGETHER))
+        found = [_contradictions(chunk, places_m[there], directions) for chunk in chunks]
+        best_m = points_m[np.argmin(np.concatenate(found))]
         low, high = best_m - step_m, best_m + step_m
     towards = places_m[there] - best_m
     turn, _ = Rotation.align_vectors(towards / np.linalg.norm(towards, axis=1, keepdims=True), directions)

@@ -95,6 +95,11 @@ def explained(set_ups: Sequence[SetUp], starts_m: FloatArray, bounds_m: FloatArr
     return fit.results()
 
 
+def unknowns_of(set_up: SetUp) -> int:
+    """Return the number of unknowns of a fit: those of each array, the speed of sound and the delay of a channel."""
+    return sum(_POSE + 3 * len(set_up.microphones[name]) for name in set_up.delays) + 2
+
+
 class Fit:
     """Fits of several set-ups, all of them together; see `explained`.
 

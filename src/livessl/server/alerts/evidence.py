@@ -42,14 +42,15 @@ class Evidence:
 
     Parameters
     ----------
-    site : Site
+    site : callable
+        Returns the site with the poses that are in force.
     zones : callable
         Returns the zones that are in force.
     clips : ClipSource or None
         None if the site keeps no clips.
     """
 
-    def __init__(self, site: Site, zones: Callable[[], ZoneMap], clips: ClipSource | None) -> None:
+    def __init__(self, site: Callable[[], Site], zones: Callable[[], ZoneMap], clips: ClipSource | None) -> None:
         self._site = site
         self._zones = zones
         self._clips = clips
@@ -57,7 +58,7 @@ class Evidence:
     def picture(self, alert: JsonObject, size_px: int | None = None) -> bytes | None:
         """Return the picture of an alert as PNG; None for one that is about no place."""
         size = {} if size_px is None else {"size_px": size_px}
-        return picture_of(alert, self._site, self._zones(), **size)
+        return picture_of(alert, self._site(), self._zones(), **size)
 
     async def clip(self, alert: JsonObject) -> Path | None:
         """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.

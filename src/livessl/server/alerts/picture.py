@@ -1,6 +1,6 @@
 """The picture of an alert: the floor plan with its arrays and zones, and where the sound was, as PNG.
 
-It is drawn from the alert alone, with the zones of now, so it can be drawn at any time.
+It is drawn from the alert alone, with the zones and poses of now, so it can be drawn at any time.
 """
 
 from __future__ import annotations

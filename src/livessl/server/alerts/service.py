@@ -75,6 +75,8 @@ class Alerts:
         Finds the clips of events; None if the site keeps none.
     traces : EventTraces or None
         Adds spans of alerts; None if nothing is traced.
+    poses : callable or None
+        Returns the site with the poses that are in force; None if they stay as they are.
 
     Raises
     ------
@@ -97,6 +99,7 @@ class Alerts:
         zones: Callable[[], ZoneMap] | None = None,
         clips: ClipSource | None = None,
         traces: EventTraces | None = None,
+        poses: Callable[[], Site] | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
@@ -108,7 +111,7 @@ class Alerts:
         zones = fixed_zones(site) if zones is None else zones
         self.outbox = Outbox(outbox_path(site))
         """Alerts, deliveries and the rules' states."""
-        self.evidence = Evidence(site, zones, clips)
+        self.evidence = Evidence((lambda: site) if poses is None else poses, zones, clips)
         """Pictures and clips of alerts."""
         self._around = Surroundings(clock, store, zones, url, self.evidence, traces)
         try:

@@ -21,7 +21,7 @@ from livessl.server.api.routes import as_json
 from livessl.server.api.set_up_routes import PLACE_STD_M
 from livessl.server.parts import Parts
 from livessl.server.proposals import REFINED_SOUNDS, BusyError, Proposal, ProposalRefusedError, Refinement
-from livessl.server.set_up_in_force import CalibrationFileError, SetUpChangedError
+from livessl.server.set_up_in_force import CalibrationFileError, OutOfDateError, SetUpChangedError
 from livessl.site.models import Site
 
 _TEXTS: Final = {
@@ -136,7 +136,7 @@ def _refusals() -> Iterator[None]:
         number = error.args[0]
         text = f"sound {number} is not kept any more; make it again" if isinstance(number, int) else str(number)
         raise HTTPException(404, text) from error
-    except (BusyError, ProposalRefusedError, SetUpChangedError) as error:
+    except (BusyError, OutOfDateError, ProposalRefusedError, SetUpChangedError) as error:
         raise HTTPException(409, str(error)) from error
     except ConfigError as error:
         raise HTTPException(409, "; ".join(map(str, error.faults))) from error

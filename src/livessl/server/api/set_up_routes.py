@@ -15,6 +15,7 @@ from livessl.core.types import FloatArray, Observation
 from livessl.schema.answers import errors
 from livessl.server.api import set_up_schema
 from livessl.server.api.encode import API_VERSION, JsonObject, where
+from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
 from livessl.server.heard_sounds import HeardSound
 from livessl.server.parts import Parts
@@ -53,6 +54,7 @@ def set_up_routes(parts: Parts) -> APIRouter:
         One sound shows that something is wrong; four usually show what.
         """
         from livessl.site.build.set_up import (
+            PlaceOutsideError,
             next_clap_place,
             verify_set_up,
         )  # scipy's optimizer takes memory, and no event needs it
@@ -68,6 +70,8 @@ def set_up_routes(parts: Parts) -> APIRouter:
             site = parts.set_up.site
             findings = verify_set_up(site, [sound.observations for sound in sounds], places_m)
             next_m = next_clap_place(site, places_m, PLACE_STD_M)
+        except PlaceOutsideError as error:
+            raise unprocessable("claps", str(error)) from error
         finally:
             one_at_a_time.release()
         claps = [_clap(sound, place_m) for sound, place_m in zip(sounds, places_m, strict=True)]

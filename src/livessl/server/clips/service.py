@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -123,9 +123,14 @@ class Clips:
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
-    def take_over(self, site: Site) -> None:
-        """Take the arrays to be where this site has them, from the next clip on; any thread may call it."""
-        self._site, self._specs = site, {spec.name: spec for spec in site.processed}
+    def prepare(self, site: Site) -> Callable[[], None]:
+        """Return what takes the arrays to be where this site has them, from the next clip on; on any thread."""
+        specs = {spec.name: spec for spec in site.processed}
+
+        def take_over() -> None:
+            self._site, self._specs = site, specs
+
+        return take_over
 
     # --- for the fusion thread
 

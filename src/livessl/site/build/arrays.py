@@ -10,6 +10,7 @@ from livessl.core.geometry import as_positions_m, circle, line, posed, speed_of_
 from livessl.core.joint_array import joined
 from livessl.core.types import ArraySpec, FloatArray, Uncertainty
 from livessl.errors import ConfigError, Fault
+from livessl.site.calibration_file import read_calibration
 from livessl.site.findings import read_model, unknown_array
 from livessl.site.models import (
     ArrayConfig,
@@ -160,11 +161,11 @@ def _microphones_m(array: ArrayConfig, directory: Path) -> FloatArray:
 
 
 def _measured(file: SiteFile, directory: Path) -> tuple[dict[str, CalibratedArray], list[Finding]]:
-    """Return the arrays that the calibration file holds."""
+    """Return the arrays that the calibration file holds: none if it is still to be written."""
     if file.calibration is None:
         return {}, []
     try:
-        calibrated = read_model(CalibrationFile, directory / file.calibration, "calibration file")
+        calibrated = read_calibration(directory / file.calibration)
     except ConfigError as error:
         return {}, [(("calibration",), str(fault)) for fault in error.faults]
     return dict(calibrated.arrays), _strangers(calibrated, file)

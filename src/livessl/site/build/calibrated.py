@@ -12,6 +12,7 @@ from livessl.site.calibration_file import calibration_path
 from livessl.site.checks import cross_faults
 from livessl.site.findings import dotted
 from livessl.site.models import CalibratedArray, CalibrationFile, Site
+from livessl.site.place import Finding
 
 if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredSetUp
@@ -56,12 +57,17 @@ def with_calibration(site: Site, calibration: CalibrationFile) -> Site:
         If the arrays do not fit: there is no array of that name, or a microphone is outside the room.
     """
     changed, faults = recalibrated(site, calibration)
-    place = [("arrays", name) for name in site.arrays]
-    faults += [finding for finding in cross_faults(changed) if finding[0][:2] in place or finding[0][0] == "joint"]
+    faults += array_faults(changed)
     if faults:
         path = calibration_path(site)
         raise ConfigError([Fault(f"{path}: {dotted(where)}", what) for where, what in faults])
     return changed
+
+
+def array_faults(site: Site) -> list[Finding]:
+    """Return the faults of a site's arrays beside its room and each other."""
+    place = [("arrays", name) for name in site.arrays]
+    return [finding for finding in cross_faults(site) if finding[0][:2] in place or finding[0][0] == "joint"]
 
 
 def _members(site: Site, name: str, microphones_m: FloatArray) -> Iterator[tuple[str, FloatArray]]:

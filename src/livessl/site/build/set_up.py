@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import Final
 
 import numpy as np
 
@@ -17,6 +18,31 @@ from livessl.core.types import FloatArray, Observation
 from livessl.site.build.grid import search_grid
 from livessl.site.build.inputs import with_inputs
 from livessl.site.models import Site
+
+OUTSIDE_M: Final = 5.0
+"""Distance from the room, in metres, beyond which a place is a mistake: an origin or a unit that is not the site's."""
+
+
+class PlaceOutsideError(ValueError):
+    """A place that is said to be measured is far outside the room."""
+
+
+def require_near_room(site: Site, places_m: FloatArray) -> None:
+    """Refuse places (S, 3), metres, that are far outside the room.
+
+    Raises
+    ------
+    PlaceOutsideError
+        With the first of them.
+    """
+    size_m = np.array(site.room.size_m)
+    off = ((places_m < -OUTSIDE_M) | (places_m > size_m + OUTSIDE_M)).any(axis=1)
+    if off.any():
+        place, room = (", ".join(f"{x:g}" for x in one) for one in (places_m[off][0], size_m))
+        raise PlaceOutsideError(
+            f"expected places in the room, 0, 0, 0 to {room} m, or within {OUTSIDE_M:g} m of it, got {place}; measure "
+            "from the corner that is the site's origin, in metres"
+        )
 
 
 def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
@@ -36,7 +62,13 @@ def verify_set_up(site: Site, sounds: Sequence[Sequence[Observation]], places_m:
         What the arrays observed of each sound.
     places_m : (S, 3) float64
         Where the sounds were made, metres.
+
+    Raises
+    ------
+    PlaceOutsideError
+        If one of them is far outside the room.
     """
+    require_near_room(site, places_m)
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
     of_channels = channel_findings(microphones, sounds)
     delays = sharp_delays(microphones, sounds, of_channels)
@@ -68,9 +100,12 @@ def measure_set_up(
 
     Raises
     ------
+    PlaceOutsideError
+        If a place is far outside the room.
     ValueError
         If no array received enough of the sounds.
     """
+    require_near_room(site, places_m)
     microphones, delays = observed_delays(site, sounds)
     return measure_poses(microphones, delays, places_m, site.c_m_s, place_std_m)
 
