@@ -141,8 +141,7 @@ def assemble(
             site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces
         )
         undo.callback(alerts.stop)
-        for _, alert in reversed(alerts.outbox.recent(RESTORED)):
-            journal.alert(alert)
+        _restore(alerts, journal, hub_link)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -197,6 +196,14 @@ def assemble(
         reloader=reloader,
         recent_log=RecentLog(),
     )
+
+
+def _restore(alerts: Alerts, journal: Journal, hub_link: HubLink | None) -> None:
+    """Report the last alerts again: the last run may have ended before they were in the journal or the hub's outbox."""
+    for _, alert in reversed(alerts.outbox.recent(RESTORED)):
+        journal.alert(alert)
+        if hub_link is not None:
+            hub_link.take(alert)
 
 
 class Server:
