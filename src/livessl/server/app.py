@@ -200,10 +200,11 @@ def assemble(
 
 def _restore(alerts: Alerts, journal: Journal, hub_link: HubLink | None) -> None:
     """Report the last alerts again: the last run may have ended before they were in the journal or the hub's outbox."""
-    for _, alert in reversed(alerts.outbox.recent(RESTORED)):
+    last = [alert for _, alert in reversed(alerts.outbox.recent(RESTORED))]
+    for alert in last:
         journal.alert(alert)
-        if hub_link is not None:
-            hub_link.take(alert)
+    if hub_link is not None:
+        hub_link.take_alerts(last)
 
 
 class Server:

@@ -135,11 +135,16 @@ class HubLink:
         """
         match message["kind"]:
             case "alert":
-                self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message)])
+                self.take_alerts([message])
             case "track" if message["state"] != "update" and message["time_utc"] is not None:
                 self._put([Outgoing("track", utc_ns(message["time_utc"]), message)])
             case "arrays":
                 self._take_arrays(message)
+
+    def take_alerts(self, messages: Sequence[JsonObject]) -> None:
+        """Put alerts into the outbox; those that the hub has do no harm."""
+        if messages:
+            self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message) for message in messages])
 
     def start(self) -> None:
         """Begin to send."""
