@@ -111,7 +111,7 @@ class HubServer:
             self.archive = Archive(hub.database, clock)
             """The database, which other hubs may share."""
             undo.callback(self.archive.close)
-            self.intake = Intake(hub, self.archive)
+            self.intake = Intake(hub, self.archive, clock)
             """What takes messages in."""
             undo.pop_all()
         app = create_hub_app(hub, self.archive, self.intake, access, Refusals(clock))

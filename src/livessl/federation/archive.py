@@ -10,20 +10,19 @@ import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import orjson
 from sqlalchemy import Connection, bindparam, case, delete, insert, select, text, tuple_, update
 
 from livessl.clock import Clock, utc_ns, utc_text
-from livessl.federation.received import RECEIVED
+from livessl.federation.gaps import Gaps
+from livessl.federation.storing import Delivery, Taken, put, read
 from livessl.server.api.encode import JsonObject
-from livessl.server.forwarding.stream import Place
+from livessl.server.forwarding.stream import first_number
 from livessl.server.forwarding.tables import alerts, arrays, received, sites, tracks
-from livessl.server.history import tables as history
-from livessl.server.history.database import RejectedError
+from livessl.server.history.database import RejectedError, StoreError
 from livessl.server.store import Store
 
 LOCK: Final = 0x11_7E_55_2
@@ -51,37 +50,6 @@ _HEARD: Final = (
 _log = logging.getLogger(__name__)
 
 
-class Delivery(NamedTuple):
-    """A message from the stream.
-
-    Parameters
-    ----------
-    site : str
-        Site, by the subject that its credentials permit, whatever the message says.
-    kind : str
-    place : Place
-        Name of the outbox, and number there.
-    body : bytes
-        JSON.
-    tries : int
-        How often it was delivered, this time included.
-    """
-
-    site: str
-    kind: str
-    place: Place
-    body: bytes
-    tries: int
-
-
-class Taken(NamedTuple):
-    """What became of some deliveries: which are done with, which wait for earlier ones, and which are of no use."""
-
-    done: list[Delivery]
-    early: list[Delivery]
-    rejected: list[Delivery]
-
-
 class Archive:
     """The hub's database; every thread may call it.
 
@@ -99,6 +67,7 @@ class Archive:
         """The history of events; the id of an event is `SITE/ID` there."""
         self._database = self.store.database
         self._clock = clock
+        self._gaps = Gaps()
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
         """Delete events and alerts of before a time; return the number of events."""
@@ -113,14 +82,15 @@ class Archive:
 
     # --- what comes in
 
-    def take(self, deliveries: Sequence[Delivery], patience: int) -> Taken:
+    def take(self, deliveries: Sequence[Delivery], patience_s: float) -> Taken:
         """Store messages that are next in their outbox.
 
         Parameters
         ----------
         deliveries : sequence of Delivery
-        patience : int
-            Tries after which a message no longer waits for earlier ones: these are counted as missing.
+        patience_s : float
+            Time, in seconds, for which messages of an outbox wait for earlier ones; then these are counted as missing.
+            Only the time in which messages could be stored counts (`Gaps`).
 
         Returns
         -------
@@ -128,19 +98,25 @@ class Archive:
             `early` are messages whose predecessors have not come yet.
         """
         try:
-            return self._take(deliveries, patience)
+            return self._take(deliveries, patience_s)
         except RejectedError as error:
             if len(deliveries) == 1:
-                _log.error("site %r: %s", deliveries[0].site, error)
-                return self._skip(deliveries[0])
+                return self._skip(deliveries[0], str(error))
+        except StoreError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever a message does to the code, it holds up no other
+            if len(deliveries) == 1:
+                _log.debug("a message that cannot be taken in", exc_info=True)
+                return self._skip(deliveries[0], f"{type(error).__name__}: {error}")
         together = Taken([], [], [])
         for delivery in _in_order(deliveries):
-            for all_of_them, some in zip(together, self.take([delivery], patience), strict=True):
+            for all_of_them, some in zip(together, self.take([delivery], patience_s), strict=True):
                 all_of_them += some
         return together
 
-    def _take(self, deliveries: Sequence[Delivery], patience: int) -> Taken:
+    def _take(self, deliveries: Sequence[Delivery], patience_s: float) -> Taken:
         taken = Taken([], [], [])
+        now_ns = self._clock.monotonic_ns()
         with self._database.writing(f"store {len(deliveries)} messages of sites") as connection:
             places = {(each.site, each.place.outbox) for each in deliveries}
             last = _locked(connection, places)
@@ -152,10 +128,10 @@ class Archive:
                 if gap < 0:
                     taken.done.append(delivery)
                     continue
-                if gap > 0 and delivery.tries < patience:
+                if gap > 0 and self._gaps.seen_s(key, last[key], now_ns) < patience_s:
                     taken.early.append(delivery)
                     continue
-                message = _read(delivery)
+                message = read(delivery)
                 if message is None:
                     taken.rejected.append(delivery)
                 else:
@@ -163,7 +139,7 @@ class Archive:
                     taken.done.append(delivery)
                 missing[delivery.site] = missing.get(delivery.site, 0) + gap
                 last[key] = delivery.place.number
-            _put(connection, batch)
+            put(connection, batch)
             raised = [{"of_site": site, "of_outbox": box, "number": number} for (site, box), number in last.items()]
             connection.execute(_RAISE, raised)
             newest: dict[str, int] = {}
@@ -171,16 +147,21 @@ class Archive:
                 if kind == "event":
                     newest[site] = max(newest.get(site, 0), utc_ns(message["time_utc"]))
             self._touch(connection, {site for site, _ in places}, missing, newest)
+        self._gaps.note(last, {(each.site, each.place.outbox) for each in taken.early}, now_ns)
         return taken
 
-    def _skip(self, delivery: Delivery) -> Taken:
+    def _skip(self, delivery: Delivery, reason: str) -> Taken:
         """Note that a message cannot be stored, so that its successors do not wait for it."""
-        with self._database.writing("skip a message") as connection:
-            key = delivery.site, delivery.place.outbox
-            _locked(connection, {key})
-            mine = (received.c.site == key[0]) & (received.c.outbox == key[1])
-            number = delivery.place.number
-            connection.execute(update(received).where(mine, received.c.last < number).values(last=number))
+        number, key = delivery.place.number, (delivery.site, delivery.place.outbox)
+        _log.error("site %r: message %d is left out: %s", delivery.site, number, " ".join(reason.split()))
+        try:
+            with self._database.writing("skip a message") as connection:
+                gap = number - _locked(connection, {key})[key] - 1
+                raised = {"of_site": delivery.site, "of_outbox": delivery.place.outbox, "number": number}
+                connection.execute(_RAISE, [raised])
+                self._touch(connection, {delivery.site}, {delivery.site: max(0, gap)}, {})
+        except RejectedError:  # not even the name of its site or outbox can be stored
+            _log.debug("a message whose place cannot be stored", exc_info=True)
         return Taken([], [], [delivery])
 
     def note_report(self, site: str, report: JsonObject) -> None:
@@ -317,83 +298,11 @@ def _locked(connection: Connection, places: set[tuple[str, str]]) -> dict[tuple[
     last = {(row.site, row.outbox): int(row.last) for row in connection.execute(query.with_for_update())}
     new = sorted(places - last.keys())
     if new:  # another hub that does the same at this moment makes this one fail, and try again
-        connection.execute(insert(received), [{"site": site, "outbox": box, "last": 0} for site, box in new])
-    return last | dict.fromkeys(new, 0)
-
-
-def _read(delivery: Delivery) -> JsonObject | None:
-    """Return a message with its site; None if it is not what its kind has to be."""
-    try:
-        message = orjson.loads(delivery.body)
-        RECEIVED[delivery.kind].model_validate(message)
-    except (ValueError, KeyError) as error:  # pydantic's and orjson's errors are ValueErrors
-        what = " ".join(str(error).split())
-        _log.error("site %r: message %d is left out: %s", delivery.site, delivery.place.number, what)
-        return None
-    return {**message, "site": delivery.site}
-
-
-def _put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -> None:
-    """Store messages in their order: events at once, as their order is that of their time, and the rest one by one."""
-    for is_event, group in groupby(batch, key=lambda each: each[1] == "event"):
-        if is_event:
-            _put_events(connection, [message for _, _, message in group])
-        else:
-            for site, kind, message in group:
-                _PUT[kind](connection, site, message)
-
-
-def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
-    rows: dict[str, dict[str, Any]] = {}
-    known_as = {f"{message['site']}/{message['id']}": message for message in messages}
-    for key, message in known_as.items():
-        rows[key] = {**history.event_row(message, utc_ns(message["time_utc"])), "id": key}
-    query = select(history.events.c.id).where(history.events.c.id.in_(list(rows)))
-    for known in connection.execute(query).scalars().all():
-        del rows[known]
-    if not rows:
-        return
-    connection.execute(insert(history.events), list(rows.values()))
-    columns = history.events.c.number, history.events.c.id
-    numbers = connection.execute(select(*columns).where(history.events.c.id.in_(list(rows)))).all()
-    tags: list[dict[str, Any]] = []
-    for number, key in numbers:
-        message, row = known_as[key], rows[key]
-        tags += history.tag_rows(message, row, number)
-        compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
-        tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
-    connection.execute(insert(history.tags), tags)
-
-
-def _put_start(connection: Connection, site: str, _message: JsonObject) -> None:
-    """A server that starts follows no track of before."""
-    connection.execute(delete(tracks).where(tracks.c.site == site))
-
-
-def _put_array(connection: Connection, site: str, message: JsonObject) -> None:
-    connection.execute(delete(arrays).where(arrays.c.site == site, arrays.c.name == message["name"]))
-    connection.execute(insert(arrays), {"site": site, "name": message["name"], "body": orjson.dumps(message).decode()})
-
-
-def _put_track(connection: Connection, site: str, message: JsonObject) -> None:
-    connection.execute(delete(tracks).where(tracks.c.site == site, tracks.c.id == message["id"]))
-    if message["state"] != "end":
-        connection.execute(insert(tracks), {"site": site, "id": message["id"], "body": orjson.dumps(message).decode()})
-
-
-def _put_alert(connection: Connection, site: str, message: JsonObject) -> None:
-    mine = (alerts.c.site == site) & (alerts.c.key == message["key"])
-    if connection.execute(select(alerts.c.number).where(mine)).first() is None:
-        row = {
-            "site": site,
-            "key": message["key"],
-            "time_ns": utc_ns(message["raised_utc"]),
-            "body": orjson.dumps(message).decode(),
-        }
-        connection.execute(insert(alerts), row)
-
-
-_PUT: Final = {"start": _put_start, "array": _put_array, "track": _put_track, "alert": _put_alert}
+        begins = {(site, box): first_number(box) - 1 for site, box in new}
+        rows = [{"site": site, "outbox": box, "last": before} for (site, box), before in begins.items()]
+        connection.execute(insert(received), rows)
+        last |= begins
+    return last
 
 
 def _status(age_s: float, states: Mapping[str, str]) -> str:

@@ -14,9 +14,13 @@ import orjson
 from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
-from livessl.federation.archive import Archive, Delivery, Turn
+from livessl.clock import Clock
+from livessl.errors import RunError
+from livessl.federation.archive import Archive, Turn
 from livessl.federation.config import Hub
 from livessl.federation.received import Report
+from livessl.federation.standstill import Standstill
+from livessl.federation.storing import Delivery
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.stream import (
     CONSUMER,
@@ -38,6 +42,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.aio.subscription import Subscription
+    from nats.js import JetStreamContext
 
 BATCH: Final = 500
 """Most messages that are stored in one transaction."""
@@ -51,11 +56,14 @@ ACK_WAIT_S: Final = 2.0
 EARLY_S: Final = 0.1
 """Wait, in seconds, before a message comes again whose predecessors had not come."""
 
-PATIENCE: Final = 100
-"""Tries, 10 s in all, after which a message no longer waits for its predecessors."""
+PATIENCE_S: Final = 10.0
+"""Time, in seconds, for which a message waits for its predecessors."""
 
 DUPLICATES_S: Final = 600.0
 """Time, in seconds, for which the stream recognizes a message that it has already; the archive does so for ever."""
+
+LOOK_S: Final = 1.0
+"""Interval, in seconds, at which a hub that waits for its turn looks whether another one takes messages in."""
 
 TURN_S: Final = 0.25
 """Interval, in seconds, at which a hub that waits for its turn tries to get it."""
@@ -64,7 +72,19 @@ DAY_S: Final = 86_400.0
 
 PLACE: Final = "nats"
 
+_END: Final = ("404", "408")
+"""Statuses by which a request for messages ends in good order: there are no more, or its time is over."""
+
+_STANDSTILL: Final = (
+    "no hub takes messages in, though one holds the lock in PostgreSQL, which is freed a few seconds after that hub's "
+    "machine has vanished; if it is not, stop that hub"
+)
+
 _log = logging.getLogger(__name__)
+
+
+class RefusedError(RunError):
+    """NATS does not give messages: its stream or consumer is gone, or about to move."""
 
 
 class Intake:
@@ -74,6 +94,7 @@ class Intake:
     ----------
     hub : Hub
     archive : Archive
+    clock : Clock
 
     Raises
     ------
@@ -81,12 +102,14 @@ class Intake:
         If nats-py is not installed, or a file of `nats` cannot be used.
     """
 
-    def __init__(self, hub: Hub, archive: Archive) -> None:
+    def __init__(self, hub: Hub, archive: Archive, clock: Clock) -> None:
         self._nats = nats_library(PLACE)
         name = f"livessl hub {hub.settings.hub}"
         self._options = connect_options(hub.settings.nats, hub.file, PLACE) | {"name": name}
         self._stream = hub.settings.stream
         self._archive = archive
+        self._clock = clock
+        self._standstill, self._looked_ns = Standstill(), 0
         self._problem: str | None = "not connected yet"
         self.has_turn = False
         """True while this hub is the one that takes messages in."""
@@ -107,6 +130,8 @@ class Intake:
                 await self._receive()
             except (self._nats.errors.Error, StoreError, SQLAlchemyError, OSError, TimeoutError) as error:
                 self._note(_told(error))
+            except RefusedError as error:
+                self._note(str(error))
             await asyncio.sleep(RECONNECT_S)
 
     async def _receive(self) -> None:
@@ -121,15 +146,27 @@ class Intake:
             lost.set()
 
         async with connected(self._nats, self._options, failed, end) as client:
-            await self._make_stream(client)
+            stream = client.jetstream()
+            await self._make_stream(stream)
             self._note(None)
+            self._standstill = Standstill()
             await client.subscribe(health_of_all(), queue=CONSUMER, cb=self._take_report)
-            while not lost.is_set():
+            while not (lost.is_set() or client.is_closed):  # closed alone is one that has died silently
                 await self._take_turn(client)
+                await self._look(stream)
                 await asyncio.sleep(TURN_S)
         self._note("the connection was lost")
 
-    async def _make_stream(self, client: Client) -> None:
+    async def _look(self, stream: JetStreamContext) -> None:
+        """Note it if this hub waits for its turn, and no other one takes messages in."""
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - self._looked_ns < 1e9 * LOOK_S:
+            return
+        self._looked_ns = now_ns
+        is_standing = self._standstill.holds(await stream.consumer_info(STREAM, CONSUMER), now_ns)
+        self._note(_STANDSTILL if is_standing else None)
+
+    async def _make_stream(self, stream: JetStreamContext) -> None:
         """Make the stream and the consumer, or change them to what the hub's file says."""
         from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy, StreamConfig
         from nats.js.errors import BadRequestError
@@ -143,7 +180,6 @@ class Intake:
             max_bytes=self._stream.max_bytes,
             duplicate_window=DUPLICATES_S,
         )
-        stream = client.jetstream()
         try:
             await stream.add_stream(wanted)
         except BadRequestError:  # it is there, with other limits
@@ -165,6 +201,7 @@ class Intake:
             if turn is not None:
                 _log.info("this hub takes the messages of the sites in")
                 self.has_turn = True
+                self._note(None)
                 await self._take_all(client, turn)
         finally:
             self.has_turn = False
@@ -177,47 +214,62 @@ class Intake:
             while True:
                 await asyncio.to_thread(turn.check)
                 await self._request(client, inbox)
-                while batch := await self._next_batch(messages):
+                left, is_ended = BATCH, False
+                while left > 0 and not is_ended:
+                    batch, is_ended = await self._next_batch(messages, left)
+                    left -= len(batch)
                     await self._store(batch)
         finally:
             with suppress(self._nats.errors.Error):
                 await messages.unsubscribe()
 
     async def _request(self, client: Client, inbox: str) -> None:
-        """Ask the consumer for a batch; it answers with messages as they come, and with a status at the end."""
+        """Ask the consumer for a batch; it answers with messages as they come, and with a status if they are fewer."""
         request = {"batch": BATCH, "expires": round(REQUEST_S * 1e9)}
         await client.publish(f"$JS.API.CONSUMER.MSG.NEXT.{STREAM}.{CONSUMER}", orjson.dumps(request), reply=inbox)
 
-    async def _next_batch(self, messages: Subscription) -> list[Msg]:
-        """Return the messages that are there, of which there is one at least; none at the end of the request."""
+    async def _next_batch(self, messages: Subscription, most: int) -> tuple[list[Msg], bool]:
+        """Return the messages that are there, after waiting for the first one, and whether the request has ended."""
         batch: list[Msg] = []
-        with suppress(self._nats.errors.TimeoutError):
-            while len(batch) < BATCH and (not batch or messages.pending_msgs):
+        try:
+            while len(batch) < most and (not batch or messages.pending_msgs):
                 message = await messages.next_msg(timeout=2 * REQUEST_S)
-                if message.headers is not None and "Status" in message.headers:
-                    break
-                batch.append(message)
-        return batch
+                status = (message.headers or {}).get("Status")
+                if status is None:
+                    batch.append(message)
+                elif status in _END:
+                    return batch, True
+                elif not batch:
+                    said = f"{status} {(message.headers or {}).get('Description', '')}".strip()
+                    raise RefusedError(f"the stream gives no messages ({said}); it is made again if it is gone")
+                else:  # what came before it is stored; the next request is refused as well
+                    return batch, True
+        except self._nats.errors.TimeoutError:
+            return batch, True
+        return batch, False
 
     async def _store(self, batch: list[Msg]) -> None:
         """Store messages, and acknowledge them after that."""
-        by_delivery: dict[Delivery, Msg] = {}
+        by_delivery: dict[Delivery, list[Msg]] = {}
         for message in batch:
             delivery = _delivery(message)
             if delivery is None:
                 self.rejected += 1
                 await message.term()
             else:
-                by_delivery[delivery] = message
+                by_delivery.setdefault(delivery, []).append(message)
         if not by_delivery:
             return
-        taken = await asyncio.to_thread(self._archive.take, list(by_delivery), PATIENCE)
+        taken = await asyncio.to_thread(self._archive.take, list(by_delivery), PATIENCE_S)
         for delivery in taken.done:
-            await by_delivery[delivery].ack()
+            for message in by_delivery[delivery]:
+                await message.ack()
         for delivery in taken.rejected:
-            await by_delivery[delivery].term()
+            for message in by_delivery[delivery]:
+                await message.term()
         for delivery in taken.early:
-            await by_delivery[delivery].nak(delay=EARLY_S)
+            for message in by_delivery[delivery]:
+                await message.nak(delay=EARLY_S)
         self.taken += len(taken.done)
         self.rejected += len(taken.rejected)
 
@@ -251,7 +303,7 @@ def _delivery(message: Msg) -> Delivery | None:
     if place is None or source is None or source[1] not in KINDS:
         _log.error("%s: a message without a place in an outbox is left out", message.subject)
         return None
-    return Delivery(*source, place, message.data, message.metadata.num_delivered)
+    return Delivery(*source, place, message.data)
 
 
 def _told(error: Any) -> str:

@@ -4,62 +4,73 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from livessl.clock import utc_ns
 
+MAX_NS: Final = 2**63 - 1
+"""Latest time that a database can hold, in 2262."""
+
 
 def _instant(text: str) -> str:
-    utc_ns(text)
+    if not 0 <= utc_ns(text) <= MAX_NS:
+        raise ValueError(f"time: expected one from 1970 to 2262, got {text!r}")
     return text
 
 
 Instant = Annotated[str, AfterValidator(_instant)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class _Start(BaseModel):
+class _Message(BaseModel):
+    """Fields are of their own types only: no text is taken for a number; further fields are kept."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _Start(_Message):
     """The beginning of a site's server."""
 
 
-class _Event(BaseModel):
+class _Event(_Message):
     """A final event."""
 
-    id: Annotated[str, Field(min_length=1, max_length=200)]
+    id: Name
     time_utc: Instant
-    confidence: float
+    confidence: Annotated[float, Field(ge=0, le=1)]
     position_m: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
-    status: str | None = None
+    status: Name
     method: str | None = None
     reason: str | None = None
     level_dbfs: float | None = None
-    zones: list[str] = []
-    arrays: list[str] = []
-    heard_by: list[str] = []
+    zones: list[Name] = []
+    arrays: list[Name] = []
+    heard_by: list[Name] = []
 
 
-class _Track(BaseModel):
+class _Track(_Message):
     """The beginning or the end of a track."""
 
     id: Annotated[int, Field(ge=0, lt=2**63)]
     state: str
 
 
-class _Array(BaseModel):
+class _Array(_Message):
     """A new state of an array."""
 
-    name: str
+    name: Name
     state: str
 
 
-class _Alert(BaseModel):
+class _Alert(_Message):
     """An alert."""
 
-    key: Annotated[str, Field(min_length=1, max_length=200)]
+    key: Name
     raised_utc: Instant
 
 
-class Report(BaseModel):
+class Report(_Message):
     """A site's report on itself."""
 
     version: str | None = None

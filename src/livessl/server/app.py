@@ -143,8 +143,7 @@ def assemble(
             lambda: set_up.site,
         )  # fmt: skip
         undo.callback(alerts.stop)
-        for _, alert in reversed(alerts.outbox.recent(RESTORED)):
-            journal.alert(alert)
+        _restore(alerts, journal, hub_link)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -197,6 +196,15 @@ def assemble(
         reloader=reloader,
         recent_log=RecentLog(),
     )
+
+
+def _restore(alerts: Alerts, journal: Journal, hub_link: HubLink | None) -> None:
+    """Report the last alerts again: the last run may have ended before they were in the journal or the hub's outbox."""
+    last = [alert for _, alert in reversed(alerts.outbox.recent(RESTORED))]
+    for alert in last:
+        journal.alert(alert)
+    if hub_link is not None:
+        hub_link.take_alerts(last)
 
 
 class Server:

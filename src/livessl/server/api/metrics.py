@@ -113,6 +113,8 @@ def event_metrics(parts: Parts) -> Iterator[Metric]:
         yield GaugeMetricFamily("livessl_events_stored", "Events in the database.", stored)
     if parts.hub_link is not None:
         yield CounterMetricFamily("livessl_hub_sent", "Messages that the hub's stream has taken.", parts.hub_link.sent)
+        dropped = parts.hub_link.dropped
+        yield CounterMetricFamily("livessl_hub_dropped", "Messages larger than NATS takes, given up.", dropped)
         yield GaugeMetricFamily("livessl_hub_waiting", "Messages that wait for the hub.", parts.hub_link.waiting)
     yield CounterMetricFamily("livessl_sink_failures", "Events that a sink did not accept.", parts.sinks.failures)
 

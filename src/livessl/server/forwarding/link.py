@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 import orjson
@@ -38,10 +39,14 @@ from livessl.site.models import Site
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
+    from nats.js import JetStreamContext
     from nats.js.api import PubAck
 
 WINDOW: Final = 500
 """Most messages that are sent before the first of them is acknowledged: about 750 kB, 40 ms at 150 Mbit/s."""
+
+HEADERS_BYTES: Final = 256
+"""Size of a message's headers at most, which NATS counts as part of it."""
 
 ACKNOWLEDGED_S: Final = 5.0
 """Longest wait, in seconds, for the acknowledgement of a window."""
@@ -103,10 +108,13 @@ class HubLink:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._news, self._end = asyncio.Event(), asyncio.Event()
+        self._is_named = False  # whether the outbox has its name of this run
         self._problem: str | None = "not connected yet"
         self._complaint: str | None = None  # what NATS has said since the last window was sent
         self.sent = 0
         """Messages that the stream has acknowledged since the start."""
+        self.dropped = 0
+        """Messages that were larger than NATS takes, and were given up, since the start."""
         self.waiting = 0
         """Messages that wait in the outbox, as of the last look at it."""
         self.failure: BaseException | None = None
@@ -127,11 +135,16 @@ class HubLink:
         """
         match message["kind"]:
             case "alert":
-                self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message)])
+                self.take_alerts([message])
             case "track" if message["state"] != "update" and message["time_utc"] is not None:
                 self._put([Outgoing("track", utc_ns(message["time_utc"]), message)])
             case "arrays":
                 self._take_arrays(message)
+
+    def take_alerts(self, messages: Sequence[JsonObject]) -> None:
+        """Put alerts into the outbox; those that the hub has do no harm."""
+        if messages:
+            self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message) for message in messages])
 
     def start(self) -> None:
         """Begin to send."""
@@ -235,20 +248,31 @@ class HubLink:
             await asyncio.gather(reporting, return_exceptions=True)
 
     async def _send_all(self, client: Client, lost: asyncio.Event) -> None:
-        """Send what waits and what comes, until the connection is lost."""
-        while not lost.is_set():
+        """Send what waits and what comes, until the connection is lost.
+
+        A connection that dies silently is closed without `lost`: its TLS cannot be ended in good order.
+        """
+        stream = client.jetstream()  # one for the connection: each has a subscription of its own, for ever
+        while not (lost.is_set() or client.is_closed):
             self._news.clear()
             wait_s = REPORT_S
             try:
+                if not self._is_named:
+                    await asyncio.to_thread(self._outbox.rename)
+                    self._is_named = True
                 head = await asyncio.to_thread(self._outbox.head)
                 window = await asyncio.to_thread(self._outbox.unsent, WINDOW)
                 self.waiting = head.last - head.acknowledged if window else 0
                 if window:
-                    count = await self._send(client, head.outbox, window, lost)
+                    small = _small_enough(window, client.max_payload)
+                    if not small:
+                        await self._drop(window[0], client.max_payload)
+                        continue
+                    count = await self._send(stream, head.outbox, small, lost)
                     if count:
-                        await asyncio.to_thread(self._outbox.acknowledge, window[count - 1].number)
+                        await asyncio.to_thread(self._outbox.acknowledge, small[count - 1].number)
                         self.sent += count
-                    if count == len(window):
+                    if count == len(small):
                         self._note(None)
                         continue
                     wait_s = RETRY_S
@@ -261,9 +285,17 @@ class HubLink:
                 async with asyncio.timeout(wait_s):
                     await self._news.wait()
 
-    async def _send(self, client: Client, outbox: str, window: Sequence[Unsent], lost: asyncio.Event) -> int:
+    async def _drop(self, message: Unsent, limit: int) -> None:
+        """Give a message up that NATS would never take, so that its successors do not wait for it."""
+        await asyncio.to_thread(self._outbox.acknowledge, message.number)
+        self.dropped += 1
+        _log.error(
+            "%s: message %d (%s) is given up: its %d bytes are more than max_payload of NATS, %d bytes; raise that",
+            *(PLACE, message.number, message.kind, len(message.body.encode()), limit),
+        )
+
+    async def _send(self, stream: JetStreamContext, outbox: str, window: Sequence[Unsent], lost: asyncio.Event) -> int:
         """Send messages; return how many of the first ones the stream has acknowledged without a gap."""
-        stream = client.jetstream()
         waiting: list[asyncio.Future[PubAck]] = []
         losing = asyncio.create_task(lost.wait())
         self._complaint = None
@@ -315,6 +347,11 @@ class HubLink:
         else:
             _log.warning("%s: %s; messages wait in the database, and are sent later", PLACE, problem)
         self._problem = problem
+
+
+def _small_enough(window: Sequence[Unsent], limit: int) -> list[Unsent]:
+    """Return the messages before the first one that is larger than NATS takes."""
+    return list(takewhile(lambda message: len(message.body.encode()) + HEADERS_BYTES <= limit, window))
 
 
 def _is_acknowledged(sent: asyncio.Future[PubAck]) -> bool:

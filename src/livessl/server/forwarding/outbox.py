@@ -5,13 +5,13 @@ What a final pass stores and what it sends are written in one transaction, so ne
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import orjson
 from sqlalchemy import Connection, delete, insert, select, update
 
+from livessl.server.forwarding.stream import outbox_name
 from livessl.server.forwarding.tables import outbox, outbox_head
 from livessl.server.history.database import Database
 from livessl.server.history.query import JsonObject
@@ -89,6 +89,16 @@ class Outbox:
         connection.execute(update(outbox_head).values(last=last))
         connection.execute(delete(outbox).where(outbox.c.number <= last - MAX_UNSENT))
 
+    def rename(self) -> None:
+        """Give the outbox a new name, under which all messages are sent that wait now.
+
+        A database that was restored from a copy gives numbers again that the hub knows already under the old name. What
+        the hub has of the messages that wait does no harm: it knows events and alerts by their ids.
+        """
+        with self._database.writing("name the outbox of the hub") as connection:
+            name = outbox_name(_head(connection).acknowledged + 1)
+            connection.execute(update(outbox_head).values(outbox=name))
+
     def head(self) -> Head:
         """Return the name of the outbox, and how far it has come."""
         with self._database.writing("name the outbox of the hub") as connection:
@@ -118,6 +128,6 @@ def _head(connection: Connection) -> Head:
     row = connection.execute(select(*columns)).one_or_none()
     if row is not None:
         return Head(*row)
-    head = Head(secrets.token_hex(8), 0, 0)
+    head = Head(outbox_name(1), 0, 0)
     connection.execute(insert(outbox_head), {"only": 1, **head._asdict()})
     return head

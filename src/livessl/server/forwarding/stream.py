@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
@@ -88,6 +89,17 @@ def parse_message_id(text: str | None) -> Place | None:
     return Place(name, int(number)) if name and number.isascii() and number.isdigit() and len(number) < 19 else None
 
 
+def outbox_name(first: int) -> str:
+    """Return a new name of an outbox, whose first message has this number."""
+    return f"{secrets.token_hex(8)}.{first}"
+
+
+def first_number(outbox: str) -> int:
+    """Return the number of the first message of an outbox, by its name."""
+    number = outbox.partition(".")[2]
+    return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else 1
+
+
 def nats_library(where: str) -> Any:
     """Return the module `nats`.
 
@@ -124,6 +136,8 @@ async def connected(
         Called when the connection is lost.
     """
     client: Client = nats.NATS()
+    if "tls" in options:
+        _insist_on_tls(client, nats)
     try:
         await client.connect(**options, error_cb=failed, disconnected_cb=lost)
         yield client
@@ -131,6 +145,23 @@ async def connected(
         with suppress(Exception):
             async with asyncio.timeout(CLOSE_S):
                 await client.close()
+
+
+def _insist_on_tls(client: Any, nats: Any) -> None:
+    """Have a client end a connection whose server offers no TLS, before it sends its user and password.
+
+    The library starts TLS only if the first line of the server, which anyone on the way can change, asks for it.
+    """
+    greeting = client._connect_command
+
+    def encrypted_greeting() -> bytes:
+        url = client._current_server.uri
+        if url.scheme == "tls" and client._transport._io_writer.get_extra_info("ssl_object") is None:
+            raise nats.errors.Error(f"{url.netloc} offers no TLS; set tls in its nats.conf, or see who answers there")
+        text: bytes = greeting()
+        return text
+
+    client._connect_command = encrypted_greeting
 
 
 def _token(site: str) -> str:

@@ -39,6 +39,12 @@ STATEMENT_S: Final = 30
 READER_S: Final = 3
 """Longest wait, in seconds, of a reader while all connections for reading are taken."""
 
+DEAD_CLIENT: Final = (
+    "-c tcp_keepalives_idle=5 -c tcp_keepalives_interval=2 -c tcp_keepalives_count=3 -c tcp_user_timeout=10000"
+)
+"""Settings by which PostgreSQL ends a session, and frees its locks, about 11 s after its client's machine vanished; by
+default it does so after two hours."""
+
 STEPS: Final = 100_000
 """SQLite looks at the time of a search whenever it has done so many steps: every few milliseconds."""
 
@@ -101,7 +107,9 @@ class Database:
             self.name = make_url(place).render_as_string(hide_password=True)
             self._writing: Engine = _postgresql(place, readers=0)
             self._reading = _postgresql(place, readers=READERS)
-            self._sessions: Engine = _postgresql(place, readers=0).execution_options(isolation_level="AUTOCOMMIT")
+            self._sessions: Engine = _postgresql(place, readers=0, further=DEAD_CLIENT).execution_options(
+                isolation_level="AUTOCOMMIT"
+            )
         elif place is None:
             self.name = "memory"
             self._writing = self._reading = self._sessions = _sqlite(":memory:", 1, writes=True)
@@ -359,7 +367,7 @@ def _set_up_for_reading(driver: Any) -> None:
     driver.execute("PRAGMA query_only=ON")
 
 
-def _postgresql(url: str, *, readers: int) -> Engine:
+def _postgresql(url: str, *, readers: int, further: str = "") -> Engine:
     if find_spec("psycopg") is None:
         what = "PostgreSQL needs the package psycopg; pip install 'livessl[postgres]'"
         raise ConfigError([Fault("server.events_db", what)])
@@ -383,5 +391,5 @@ def _postgresql(url: str, *, readers: int) -> Engine:
         max_overflow=0,
         pool_pre_ping=True,
         **of_readers,
-        connect_args={**given, "options": f"{options} {made.query.get('options', '')}".strip()},
+        connect_args={**given, "options": f"{options} {further} {made.query.get('options', '')}".strip()},
     )
