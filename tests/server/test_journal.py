@@ -263,8 +263,17 @@ def test_start_waits_for_no_database_and_restores_what_its_journal_lacks(
         desk.alerts.note_in_journal(desk.published[0])
     calls: list[str] = []
     prepare, start = Store.prepare, Backlog.start
-    monkeypatch.setattr(Store, "prepare", lambda store: (calls.append("prepare"), prepare(store))[1])
-    monkeypatch.setattr(Backlog, "start", lambda backlog: (calls.append("start"), start(backlog))[1])
+
+    def noted_prepare(store: Store) -> None:
+        calls.append("prepare")
+        prepare(store)
+
+    def noted_start(backlog: Backlog) -> None:
+        calls.append("start")
+        start(backlog)
+
+    monkeypatch.setattr(Store, "prepare", noted_prepare)
+    monkeypatch.setattr(Backlog, "start", noted_start)
     with running_server(site) as server:
         store, outbox = server.parts.store, server.parts.alerts.outbox
         wait_until(lambda: not outbox.not_in_journal(10), "the entries")

@@ -97,7 +97,12 @@ def test_change_that_is_reported_as_refused_is_not_made_later(tmp_path: Path, mo
     with running_desk(site) as desk:
         loop, busy, free, later = desk.alerts._loop, Flag(), Flag(), Flag()
         assert loop is not None
-        loop.call_soon_threadsafe(lambda: (busy.set(), free.wait(HANG_S)))
+
+        def work() -> None:
+            busy.set()
+            free.wait(HANG_S)
+
+        loop.call_soon_threadsafe(work)
         assert busy.wait(HANG_S)
         monkeypatch.setattr(service, "TAKE_OVER_S", 0.01)
         with pytest.raises(RunError, match="the former rules stay in force; reload again later"):
