@@ -118,6 +118,8 @@ def _serve(control: Connection, updates_per_s: float) -> None:
             ended.wait(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
 
     def control_server() -> None:
+        while not server.parts.engine.has_turned:  # what computes is loaded after the server listens
+            time.sleep(0.05)
         control.send(server.url)
         while control.recv() != "end":
             publishing.set()

@@ -13,7 +13,7 @@ _USUAL: Final = gc.get_threshold()
 
 
 def collect_seldom() -> None:
-    """Begin to load."""
+    """Begin to load, in a command that ends it by `collect_as_usual`: until then hardly any unused memory is found."""
     gc.set_threshold(LOADING, *_USUAL[1:])
 
 

@@ -66,17 +66,26 @@ def offline(site: Path, recordings: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in said.splitlines()]
 
 
+def reasons(site: Playing) -> list[str]:
+    """Return for what clocks the site is degraded now."""
+    health = site.get("health")
+    if health is None or health["status"] != "degraded":
+        return []
+    return [reason for reason in health["reasons"] if "set both by NTP" in reason]
+
+
 def test_a_clock_that_is_off_and_sounds_that_one_array_hears(tmp_path: Path) -> None:
     made = scene()
     record(tmp_path, made)
     changes = {"arrays.south.wav_offset_s": AHEAD_S}
     with Playing(tmp_path, tmp_path / "live", changes=changes) as site:
         site.start()
+        # while the machine is busy, that frames come late is the nearer reason
+        wait_for(lambda: any("ahead of that of 'a'" in reason for reason in reasons(site)), "the reason", 90)
         site.sleep_until(made.duration_s - TAIL_S)
         wait_for(lambda: len(site.events()) >= len(made.sources), "the last event", 60)
         events = site.events()
         north, south = site.get("arrays")["arrays"]
-        health = site.get("health")
         told = metrics(f"http://127.0.0.1:{site.http}/metrics")
     expected = offline(site.site, tmp_path)
     assert len(events) == len(expected) == len(made.sources)
@@ -91,12 +100,9 @@ def test_a_clock_that_is_off_and_sounds_that_one_array_hears(tmp_path: Path) -> 
         assert event["confidence"] == pytest.approx(other["confidence"], abs=0.001)
         assert event["at_s"] == pytest.approx(other["start_s"], abs=1e-6)
     assert south["state"] == "degraded"
-    assert "ahead of that of 'a'" in south["reason"]
     assert south["clock_offset"]["offset_s"] == pytest.approx(AHEAD_S, abs=0.005)
     assert south["clock_offset"]["corrected_s"] == 0.15
     assert (south["counters"]["asked"], south["counters"]["helped"]) == (FAINT, FAINT)
     assert north["state"] == "healthy"
-    assert health["status"] == "degraded"
-    assert any("set both by NTP" in reason for reason in health["reasons"])
     assert 'livessl_array_clock_offset_seconds{array="south",reference="a"} 0.1' in told
     assert 'livessl_array_total{array="south",what="helped"} 2.0' in told

@@ -9,7 +9,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
 from livessl.clock import SystemClock
-from livessl.garbage import collect_as_usual
+from livessl.garbage import collect_as_usual, collect_seldom
 from livessl.traces import traced
 
 
@@ -31,6 +31,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    collect_seldom()
     from livessl.capture.node import capture_device, capture_recordings
     from livessl.cli.node_input import audio_device, check_files, node_config, recordings, run_id
     from livessl.recordings.assign import span_ns

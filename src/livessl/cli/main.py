@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
-from livessl import __version__, garbage
+from livessl import __version__
 from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctrl_c
 from livessl.cli.output import complain
 from livessl.cli.standard_streams import open_standard_streams
@@ -107,7 +107,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2 means wrong use or an invalid configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by
     itself.
     """
-    garbage.collect_seldom()
     # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
     open_standard_streams()

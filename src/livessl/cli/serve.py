@@ -11,6 +11,7 @@ from livessl.cli.exits import OK, on_hang_up
 from livessl.cli.options import add_joint, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import print_warnings
 from livessl.clock import SystemClock
+from livessl.garbage import collect_seldom
 from livessl.traces import traced
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    collect_seldom()
     from livessl.server.app import Server
 
     import_from_here()

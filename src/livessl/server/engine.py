@@ -97,7 +97,8 @@ class Engine:
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._prepare: Callable[[], None] | None = None
-        self._has_turned = threading.Event()
+        self.has_turned = False
+        """Whether the thread has taken its first turn: what computes is loaded by then."""
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
@@ -137,7 +138,7 @@ class Engine:
         The first turn comes after what computes is loaded; until then it is not known whether a replay was sent.
         """
         while self.failure is None and self._thread.is_alive():
-            if self._has_turned.is_set() and not self._site_time.replay_is_running:
+            if self.has_turned and not self._site_time.replay_is_running:
                 return
             self._stop.wait(WAIT_S)
 
@@ -182,7 +183,7 @@ class Engine:
                 self._prepare()
             while not self._stop.is_set():
                 self.turn()
-                self._has_turned.set()
+                self.has_turned = True
         except BaseException as error:
             self.failure = error
             _log.exception("the fusion thread has failed; the server ends")

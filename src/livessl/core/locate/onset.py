@@ -156,10 +156,12 @@ class Onset(MapEstimator):
     def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
         """Answer by sharp evidence, unless another place is more certain when clocks inside the arrays may be apart.
 
-        Where the arrays do not determine the distance, the places of both differ along the line of sight.
+        Arrays that disagree do so for another reason, and wide peaks would hide it. Where the arrays do not determine
+        the distance, the places of both differ along the line of sight.
         """
         sharp = self._answer_by(evidence, suspect, whole=whole)
-        if not sharp.contributing or sharp.judgement.features.crossing_deg < CROSSING_DEG:
+        is_agreed = sharp.refused is None and not sharp.consensus.outliers
+        if not is_agreed or sharp.judgement.features.crossing_deg < CROSSING_DEG:
             return sharp
         place = sharp.consensus.place
         (peak,) = self._search.among([tolerant(part) for part in sharp.evidence])(1)
