@@ -87,13 +87,65 @@ in_use() { readlink "$prefix/bin" 2>/dev/null | cut -d / -f 2; }
 # Prints the number of the release that was in use before this one.
 before() { cat "$prefix/releases/$1/before" 2>/dev/null || true; }
 
+# Prints the units that an update restarts: those of the options, or all that run.
+running() {
+    set -- "$(services)"
+    if [ -n "$1" ]; then printf '%s\n' "$1"; else
+        systemctl list-units --plain --no-legend 'livessl-*.service' | cut -d ' ' -f 1
+    fi
+}
+
+# Does one of three things with the history: `copy` copies its SQLite file beside itself before the new release may
+# migrate it; `restore` puts the copy back if the new release has done so, as the one before would refuse the file; and
+# `forget` deletes the copy, which holds events that the site's retention does not reach.
+history() {
+    if [ -z "$last" ] || [ -n "$dry_run" ]; then return 0; fi
+    "$release/bin/python" - "$1" "$site" "$number" <<'END'
+import os
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+
+from livessl.site.history_place import history_place
+from livessl.site.load import load_site
+
+
+def revision(database):
+    try:
+        return database.execute("SELECT version_num FROM alembic_version").fetchone()
+    except sqlite3.OperationalError:  # of a release that had no such table
+        return None
+
+
+what, site, number = sys.argv[1:]
+place = history_place(load_site(Path(site)))
+if isinstance(place, str) and what == "copy":
+    said = "server.events_db is a PostgreSQL database, which is not copied: going back needs a dump made by pg_dump"
+    print(f"install: {said} if the new release migrates it", file=sys.stderr)
+if not isinstance(place, Path) or not place.is_file():
+    raise SystemExit
+copy = place.with_name(f"{place.name}.before-{number}")
+if what == "copy":
+    os.umask(0o077)
+    copy.unlink(missing_ok=True)
+if what == "forget":
+    copy.unlink(missing_ok=True)
+elif what == "copy" or copy.is_file():
+    with closing(sqlite3.connect(place, timeout=30)) as now, closing(sqlite3.connect(copy, timeout=30)) as before:
+        if what == "copy":
+            now.backup(before)
+        elif revision(now) != revision(before):
+            before.backup(now)
+            print(f"install: {place} is again as it was before the update", file=sys.stderr)
+END
+}
+
 # Restarts what runs, and returns 1 if something does not stay up for five seconds.
 restart() {
     [ -n "$systemd" ] || return 0
-    # shellcheck disable=SC2046  # lists of names
-    set -- $(services)
-    # shellcheck disable=SC2046
-    [ $# -gt 0 ] || set -- $(systemctl list-units --plain --no-legend 'livessl-*.service' | cut -d ' ' -f 1)
+    # shellcheck disable=SC2046  # a list of names
+    set -- $(running)
     [ $# -gt 0 ] || return 0
     run systemctl restart "$@"
     [ -z "$dry_run" ] || return 0
@@ -146,15 +198,23 @@ for unit in livessl-server.service livessl-node@.service; do
     [ -n "$dry_run" ] || sed "s|/opt/livessl/|$prefix/|; s|/etc/livessl/site.yaml|$site|" "$source/deploy/$unit" >"$release/$unit"
     run install -D -m 644 "$release/$unit" "$units/$unit"
 done
+history copy || fail "the history could not be copied, so that nothing was changed; free space beside server.events_db"
 use "$number"
 systemctl_if_wanted daemon-reload
 for service in $(services); do systemctl_if_wanted enable --quiet "$service"; done
 if ! restart; then
     [ -n "$last" ] || fail "the units do not stay up; see journalctl -u 'livessl-*'"
     use "$last"
-    restart || true
-    fail "the units of release $number did not stay up: release $last is in use again; see journalctl -u 'livessl-*'"
+    # shellcheck disable=SC2046  # a list of names
+    run systemctl stop $(running) || true
+    what="the units of release $number did not stay up: release $last is in use again"
+    see="see journalctl -u 'livessl-*'"
+    history restore || fail "$what, but the history could not be put back from its copy beside server.events_db; $see"
+    restart || fail "$what, but its units do not stay up either; if they refuse the database, restore a copy or dump; $see"
+    history forget || say "a copy of the history is left beside server.events_db; delete it"
+    fail "$what; $see"
 fi
+history forget || say "a copy of the history is left beside server.events_db; delete it"
 
 # What is neither in use, nor the release to roll back to, nor among the last ones, goes.
 for old in "$prefix"/releases/*; do

@@ -216,6 +216,9 @@ def test_linter_accepts_the_containerfile() -> None:
 
 @pytest.mark.parametrize("path", [DEPLOY / "compose.yaml", STACK], ids=["node and server", "stack"])
 def test_compose_specification_accepts_the_file(path: Path) -> None:
+    [health] = [rest for name, rest in instructions() if name == "HEALTHCHECK"]
+    [test] = re.findall(r"CMD (\[.*\])", health)
+    assert compose(path)["services"]["server"]["healthcheck"]["test"] == ["CMD", *json.loads(test)]
     compose_spec.PyCompose.from_yaml(yaml.safe_dump(compose(path))).validate()
 
 

@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
 import sysconfig
 import tomllib
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 INSTALLER = ROOT / "deploy" / "install.sh"
 SYSTEMCTL = """#!/bin/sh
 echo "$*" >>"$CALLS"
+case $1 in restart) [ ! -e "$CALLS.migrates" ] || { . "$CALLS.migrates"; rm "$CALLS.migrates"; } ;; esac
 case $1 in is-active) [ ! -e "$CALLS.down" ] || { rm "$CALLS.down"; exit 3; } ;; esac
 """
 """Stands in for systemd, which does not run in a test: it notes its calls, and the units are down if a file says so."""
@@ -79,6 +84,22 @@ def machine(tmp_path: Path) -> Machine:
     return Machine(tmp_path)
 
 
+def migrating_history(machine: Machine) -> Path:
+    """A history of an old revision, as a server writes it, that the next restart migrates."""
+    site, path = yaml.safe_load(machine.site.read_text()), machine.site.parent / "history" / "events.sqlite"
+    site["server"] = {**site.get("server", {}), "events_db": str(path)}
+    machine.site.write_text(yaml.safe_dump(site))
+    path.parent.mkdir()
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("CREATE TABLE alembic_version (version_num)")
+        database.execute("INSERT INTO alembic_version VALUES ('0001')")
+    change = "import sqlite3, sys; sqlite3.connect(sys.argv[1], isolation_level=None).execute(sys.argv[2])"
+    words = [sys.executable, "-c", change, str(path), "UPDATE alembic_version SET version_num = '9000'"]
+    Path(f"{machine.calls}.migrates").write_text(shlex.join(words))
+    return path
+
+
 def test_update_that_does_not_come_up_is_taken_back(machine: Machine, wheel: Path) -> None:
     """Install, update, and an update that fails: with a real wheel in real environments."""
     options = ("--wheel", str(wheel), "--server", "--node", "lab-pc")
@@ -98,10 +119,16 @@ def test_update_that_does_not_come_up_is_taken_back(machine: Machine, wheel: Pat
     assert "--roll-back returns to release 1" in second.stderr
     assert machine.in_use == "releases/2/bin"
 
+    history = migrating_history(machine)
     Path(f"{machine.calls}.down").touch()
     third = machine.install(*options)
     assert third.returncode == 1
-    assert "the units of release 3 did not stay up: release 2 is in use again" in third.stderr
+    assert "the units of release 3 did not stay up: release 2 is in use again; see" in third.stderr
+    assert "stop livessl-server.service livessl-node@lab-pc.service" in machine.calls.read_text()
+    with closing(sqlite3.connect(history)) as database:
+        assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("0001",)]
+        assert not Path(f"{machine.calls}.migrates").exists()
+    assert [path.name for path in history.parent.iterdir()] == [history.name]
     assert machine.in_use == "releases/2/bin"
     assert sorted(path.name for path in (machine.prefix / "releases").iterdir()) == ["1", "2"]
 

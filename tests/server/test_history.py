@@ -22,12 +22,12 @@ from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject
 from livessl.server.history import backlog as backlog_module
 from livessl.server.history import database, migrations
-from livessl.server.history.backlog import MAX_UNSAVED, Backlog, Write
+from livessl.server.history.backlog import MAX_UNSAVED, RETRY_NS, Backlog, Write
 from livessl.server.history.tables import metadata
 from livessl.server.store import Query, Store, StoreError
 from messages import event_message
 from postgresql import PostgreSQL, running_postgresql
-from small_site import site_of, wait_until
+from small_site import HANG_S, site_of, wait_until
 
 DAY_NS = 86_400_000_000_000
 OLD_TABLES = (
@@ -218,6 +218,49 @@ def test_nobody_waits_for_a_database_that_stands_still(monkeypatch: pytest.Monke
     wait_until(lambda: waiting.unsaved == 0, "all to be written")
     waiting.stop()
     assert jam.done == [0, *range(7, MAX_UNSAVED + 6)]
+
+
+def test_what_waits_is_bounded_in_bytes_and_given_up_entries_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backlog_module, "MAX_BYTES", 1000)
+    jam, waiting = Jammed(), Backlog(lambda: None)
+    waiting.start()
+    waiting.put(Write(lambda: jam.write(0), 0, False, others=1, nbytes=900), 0)
+    assert jam.begun.wait(60)
+    for k in range(1, 5):
+        waiting.put(Write(lambda k=k: jam.write(k), k % 2, False, others=2 * (1 - k % 2), nbytes=60 - k), 0)  # type: ignore[misc]
+    assert (waiting.unkept, waiting.unkept_others, waiting.unsaved) == (2, 2, 0)  # 900 + 56 bytes are left
+    jam.go.set()
+    waiting.settle(60)
+    waiting.stop()
+    assert jam.done == [0, 4]
+
+
+@pytest.mark.parametrize("runs", [False, True])
+def test_what_waits_for_the_database_may_put_more(tmp_path: Path, *, runs: bool) -> None:
+    """As the journal does once the database can be read: on one thread, with no thread waiting for itself."""
+    store, tries = Store(tmp_path / "events.db"), count()
+
+    def work() -> None:
+        if next(tries) == 0:
+            raise StoreError("the database is not there yet")
+        store.backlog.put(Write(lambda: store.add(event(1), 1), 1, False), 0)
+        assert store.get("small-1") is None  # no wait for what this thread is to write
+
+    def put() -> None:
+        store.when_ready(work)
+        if runs:
+            store.backlog.start()
+        store.backlog.put(Write(lambda: store.add(event(2), 2), 1, False), 0)
+        store.backlog.retry(RETRY_NS)
+
+    putting = Thread(target=put, daemon=True)
+    putting.start()
+    putting.join(HANG_S)
+    assert not putting.is_alive()
+    wait_until(lambda: store.backlog.unsaved == 0, "both to be stored")
+    assert store.backlog.is_failing is False
+    assert {each["id"] for each in store.find(Query())[0]} == {"small-1", "small-2"}
+    store.close()
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from livessl.clock import SystemClock, utc_text
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Track, TrackState
 from livessl.server.api.encode import JsonObject, Messages
+from livessl.server.history.backlog import Backlog
 from livessl.server.history.journal import Entry, EntryKind, JournalQuery
 from livessl.server.journal import Journal
 from livessl.server.store import Store
@@ -242,5 +243,40 @@ def test_alert_that_a_killed_server_left_in_the_outbox_is_in_the_journal_after_t
         wait_until(lambda: desk.published, "the alert")
     (tmp_path / "events.sqlite").unlink()  # the outbox is another file
     with running_server(site) as server:
+        wait_until(lambda: texts(server.parts.store, EntryKind.ALERT), "the entry")
         [entry] = all_of(server.parts.store, JournalQuery(EntryKind.ALERT))
     assert entry.key == desk.published[0]["key"]
+
+
+def test_start_waits_for_no_database_and_restores_what_its_journal_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Alerts of an outage are in the outbox only; a start puts them into the journal, once it runs."""
+    rules = {"door": {"events": {"zones": ["door"]}, "hold_off_s": 0}}
+    desks, site = (
+        alert_site(tmp_path, {"server.events_db": name}, rules=rules, outbox="outbox.db") for name in ("a.db", "b.db")
+    )
+    sounds = [sound(k) for k in range(5)]
+    with running_desk(desks) as desk:  # it has no journal
+        desk.finish(*sounds)
+        wait_until(lambda: len(desk.published) == len(sounds), "the alerts")
+        desk.alerts.note_in_journal(desk.published[0])
+    calls: list[str] = []
+    prepare, start = Store.prepare, Backlog.start
+
+    def noted_prepare(store: Store) -> None:
+        calls.append("prepare")
+        prepare(store)
+
+    def noted_start(backlog: Backlog) -> None:
+        calls.append("start")
+        start(backlog)
+
+    monkeypatch.setattr(Store, "prepare", noted_prepare)
+    monkeypatch.setattr(Backlog, "start", noted_start)
+    with running_server(site) as server:
+        store, outbox = server.parts.store, server.parts.alerts.outbox
+        wait_until(lambda: not outbox.not_in_journal(10), "the entries")
+        found = [entry.key for entry in all_of(store, JournalQuery(EntryKind.ALERT))]
+    assert found == [alert["key"] for alert in reversed(desk.published[1:])]
+    assert calls.index("start") <= 2  # only the opening and the entry about the site file come before it

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from threading import Event as Flag
 from typing import Any
 
 import httpx
@@ -16,10 +17,11 @@ import numpy as np
 import pytest
 import yaml
 
-from alert_desk import ELSEWHERE, PATIENT, after, key_of, sound
+from alert_desk import ELSEWHERE, PATIENT, after, alert_site, key_of, running_desk, sound
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import Event, FloatArray
 from livessl.errors import ConfigError, RunError
+from livessl.server.alerts import service
 from livessl.server.alerts.outbox import DeliveryState
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
@@ -87,6 +89,32 @@ def test_zones_and_rules_take_effect_and_the_rest_says_that_it_needs_a_restart(t
             "zones.centre",
         ]
         assert server.parts.alerts.states == {}
+
+
+def test_change_that_is_reported_as_refused_is_not_made_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that judges is busy for longer than the reload waits."""
+    site = alert_site(tmp_path, rules={"door": DOOR})
+    other = site.alerts.model_copy(update={"rules": {}})
+    with running_desk(site) as desk:
+        loop, busy, free, later = desk.alerts._loop, Flag(), Flag(), Flag()
+        assert loop is not None
+
+        def work() -> None:
+            busy.set()
+            free.wait(HANG_S)
+
+        loop.call_soon_threadsafe(work)
+        assert busy.wait(HANG_S)
+        monkeypatch.setattr(service, "TAKE_OVER_S", 0.01)
+        with pytest.raises(RunError, match="the former rules stay in force; reload again later"):
+            desk.alerts.take_over(other)
+        free.set()
+        loop.call_soon_threadsafe(loop.call_soon, loop.call_soon, later.set)
+        assert later.wait(HANG_S)
+        assert desk.alerts.config == site.alerts
+        monkeypatch.setattr(service, "TAKE_OVER_S", HANG_S)
+        desk.alerts.take_over(other)
+        assert desk.alerts.config == other
 
 
 BROKEN: list[Changes] = [

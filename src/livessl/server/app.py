@@ -7,11 +7,13 @@ import logging
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
+from livessl.server.alerts.outbox import OutboxError
 from livessl.server.alerts.service import Alerts
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
@@ -59,9 +61,12 @@ releases it thousands of times a second; by Python's default it would wait 5 ms 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
 
-RESTORED: Final = 100
-"""Newest alerts of the outbox that are put into the journal at the start: a server that was killed may have kept them
-in the outbox only."""
+RESTORED: Final = 10_000
+"""Most alerts of the outbox, about 20 MB, that a start puts into the journal because it lacks them; the next start goes
+on with the others."""
+
+RESTORED_AGAIN: Final = 100
+"""Newest alerts of the outbox that are put at each start into a journal that is kept in memory."""
 
 _log = logging.getLogger(__name__)
 
@@ -131,7 +136,11 @@ def assemble(
         set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
         found = traces_in_use()
         traces = None if found is None else EventTraces(found)
-        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(journal.alert, publish_to_all)
+
+        def keep_alert(alert: JsonObject) -> None:
+            journal.alert(alert, partial(alerts.note_in_journal, alert) if store.is_durable else None)
+
+        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(keep_alert, publish_to_all)
         array_states = ArrayStates(
             site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
         )
@@ -143,7 +152,6 @@ def assemble(
             lambda: set_up.site,
         )  # fmt: skip
         undo.callback(alerts.stop)
-        _restore(alerts, journal, hub_link)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
             if not site_time.is_replay:
@@ -196,15 +204,6 @@ def assemble(
         reloader=reloader,
         recent_log=RecentLog(),
     )
-
-
-def _restore(alerts: Alerts, journal: Journal, hub_link: HubLink | None) -> None:
-    """Report the last alerts again: the last run may have ended before they were in the journal or the hub's outbox."""
-    last = [alert for _, alert in reversed(alerts.outbox.recent(RESTORED))]
-    for alert in last:
-        journal.alert(alert)
-    if hub_link is not None:
-        hub_link.take_alerts(last)
 
 
 class Server:
@@ -316,6 +315,9 @@ class Server:
 
     async def _serve(self) -> None:
         self.loop = asyncio.get_running_loop()
+        if not self._stepped:
+            self.parts.store.backlog.start()  # before everything that stores: from now on nothing waits for a database
+        self._restore_alerts()
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
@@ -327,7 +329,6 @@ class Server:
             self.parts.hub_link.start()
         self.parts.reloader.start()
         if not self._stepped:
-            self.parts.store.backlog.start()
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
         tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
@@ -338,6 +339,23 @@ class Server:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             self.loop = None
+
+    def _restore_alerts(self) -> None:
+        """Put into the journal the alerts that are in the outbox only, as after an outage of the database.
+
+        The hub gets the newest ones again, and knows which it has: they may not have been among its messages yet.
+        """
+        alerts, is_durable = self.parts.alerts, self.parts.store.is_durable
+        try:
+            newest = [alert for _, alert in reversed(alerts.outbox.recent(RESTORED_AGAIN))]
+            missing = alerts.outbox.not_in_journal(RESTORED) if is_durable else newest
+        except OutboxError as error:
+            _log.error("%s", error)
+            return
+        for alert in missing:
+            self.parts.journal.alert(alert, partial(alerts.note_in_journal, alert) if is_durable else None)
+        if self.parts.hub_link is not None:
+            self.parts.hub_link.take_alerts(newest)
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple, Protocol, Self
 
 import orjson
@@ -158,6 +157,11 @@ class EventLog:
         """Events given up because the store did not take them."""
         return self._store.backlog.unkept
 
+    @property
+    def unkept_others(self) -> int:
+        """Entries of the journal, and messages for the hub, given up because the store did not take them."""
+        return self._store.backlog.unkept_others
+
     def begin_live(self) -> Finalized:
         """Begin a live run where the last one stopped: restore its early events, and return how far it came."""
         self._is_replay = False
@@ -178,7 +182,7 @@ class EventLog:
         """Publish an event that cannot wait for an array that is late or away."""
         stages = self._stages(event)
         message = messages.event(event, stages)
-        self._write(partial(self._store.add, message, event.start_ns, early=True), 1)  # holds no sound of the event
+        self._add(message, event.start_ns, early=True)
         if not self._is_replay:
             self._remember(EarlyEvent.of(event, message))
         if self._watcher is not None and not self._is_replay:
@@ -217,11 +221,14 @@ class EventLog:
         done = {event.id for event in results.events} | {early.id for early in before}
         self._early = [early for early in self._early if early.id not in done]
         until, kept = results.until, orjson.dumps(clocks)  # as bytes: thousands may wait for a database
+        bodies = [(orjson.dumps(message), time_ns) for message, time_ns in rows]
 
         def store() -> None:
-            self._store.finalize(self._site, rows, replaced, until, orjson.loads(kept))
+            final = [(orjson.loads(body), time_ns) for body, time_ns in bodies]
+            self._store.finalize(self._site, final, replaced, until, orjson.loads(kept))
 
-        self._write(store, len(rows), is_final=True)
+        nbytes = len(kept) + sum(len(body) for body, _ in bodies)
+        self._write(Write(store, len(rows), is_final=True, nbytes=nbytes))
         if self._watcher is not None:
             self._watcher.take_final(rows, results.until)
         for message, event, stages in news:
@@ -238,12 +245,21 @@ class EventLog:
     def _add_replayed(self, events: Sequence[Event], messages: Messages) -> None:
         for event in events:
             message = messages.event(event)
-            self._write(partial(self._store.add, message, event.start_ns), 1)
+            self._add(message, event.start_ns)
             self._publish_event(message, event, None)
 
-    def _write(self, work: Callable[[], None], events: int, *, is_final: bool = False) -> None:
+    def _add(self, message: JsonObject, time_ns: int, *, early: bool = False) -> None:
+        """Have an event stored that is early, or of a replay."""
+        body = orjson.dumps(message)
+
+        def store() -> None:
+            self._store.add(orjson.loads(body), time_ns, early=early)
+
+        self._write(Write(store, 1, is_final=False, nbytes=len(body)))
+
+    def _write(self, write: Write) -> None:
         """Have something stored, without waiting for it while the server runs."""
-        self._store.backlog.put(Write(work, events, is_final), self._clock.monotonic_ns())
+        self._store.backlog.put(write, self._clock.monotonic_ns())
 
     def _publish_event(self, message: JsonObject, event: Event, stages: Stages | None, *, first: bool = True) -> None:
         self.published += 1

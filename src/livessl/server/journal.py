@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -41,10 +42,13 @@ class Journal:
         self._clock = clock
         self._states: dict[str, str] = {}
 
-    def alert(self, alert: JsonObject) -> None:
-        """Keep an alert that a rule has raised; one that is kept already stays as it is."""
+    def alert(self, alert: JsonObject, done: Callable[[], None] | None = None) -> None:
+        """Keep an alert that a rule has raised; one that is kept already stays as it is.
+
+        `done` is called when it is stored, on any thread.
+        """
         time_ns = utc_ns(alert["time_utc"] or alert["raised_utc"])
-        self._put(Entry(EntryKind.ALERT, alert["rule"], alert["key"], time_ns, alert["text"], alert))
+        self._put(Entry(EntryKind.ALERT, alert["rule"], alert["key"], time_ns, alert["text"], alert), done)
 
     def arrays(self, message: JsonObject) -> None:
         """Keep which arrays have changed their state since the last message `arrays`; those of a replay do not count.
@@ -112,8 +116,17 @@ class Journal:
             return
         self.configuration(SITE_FILE, "livessl", text, _of_site(sections, changed))
 
-    def _put(self, entry: Entry) -> None:
-        self._store.backlog.put(Write(partial(self._store.note, entry), 0, is_final=False), self._clock.monotonic_ns())
+    def _put(self, entry: Entry, done: Callable[[], None] | None = None) -> None:
+        detail = orjson.dumps(entry.detail)  # as bytes: thousands may wait for a database
+        bare = replace(entry, detail={})
+
+        def store() -> None:
+            self._store.note(replace(bare, detail=orjson.loads(detail)))
+            if done is not None:
+                done()
+
+        write = Write(store, 0, is_final=False, others=1, nbytes=len(detail))
+        self._store.backlog.put(write, self._clock.monotonic_ns())
 
 
 def also(first: Callable[[JsonObject], None], second: Callable[[JsonObject], None]) -> Callable[[JsonObject], None]:

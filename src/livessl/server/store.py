@@ -125,6 +125,11 @@ class Store:
         return self._database
 
     @property
+    def is_durable(self) -> bool:
+        """True if what it has outlives the server."""
+        return not self._bounded
+
+    @property
     def problem(self) -> str | None:
         """Why a database cannot be used that has not been usable since the start, as PostgreSQL can be; else None."""
         return self._database.problem

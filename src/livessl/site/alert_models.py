@@ -201,10 +201,13 @@ class MqttConfig(Model):
 
 
 class AppriseConfig(Model):
-    """One service of those that Apprise knows; its URL holds secrets and stands in a file of its own."""
+    """One service of those that Apprise knows; its URL holds secrets and stands in a file of its own.
+
+    Recordings leave the building only where the site file says so.
+    """
 
     url: FileName
-    attach: tuple[Literal["picture", "clip"], ...] = ("picture", "clip")
+    attach: tuple[Literal["picture", "clip"], ...] = ("picture",)
 
 
 class AlertAction(Model):

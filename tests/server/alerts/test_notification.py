@@ -82,7 +82,8 @@ def test_mail_says_what_when_and_where_with_a_link(tmp_path: Path) -> None:
     part = mail.get_body(("plain",))
     assert part is not None
     alert = desk.published[0]
-    assert part.get_content().split() == f"{alert['text']}\n{alert['time_utc']}\n{alert['link']}".split()
+    wanted = "\n".join(alert[name] for name in ("text", "time_utc", "link", "key"))
+    assert part.get_content().split() == wanted.split()
 
 
 class OneClip:
@@ -123,6 +124,18 @@ def test_mail_has_the_picture_and_the_clip_that_are_wanted(tmp_path: Path, attac
     for wanted in attach:
         [content] = [content for kind, content in found.items() if kind.startswith(kinds[wanted])]
         assert content == (picture if wanted == "picture" else clip.read_bytes())
+
+
+def test_attempt_after_a_failed_one_is_without_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with running_receiver() as receiver:
+        site = notify_site(tmp_path, receiver.url.replace("http://", "json://"), timeout_s=60)
+        with running_desk(site) as desk:
+            answers = iter([500, 200])
+            receiver.answer = lambda: (next(answers), {})
+            desk.finish(sound(1))
+            wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
+    assert [b"map.png" in request.body for request in receiver.requests] == [True, False]
+    assert json.loads(receiver.accepted[0].body)["message"].endswith(desk.published[0]["key"])
 
 
 def test_service_that_refuses_is_tried_again(tmp_path: Path) -> None:

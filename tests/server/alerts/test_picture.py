@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.server.alerts import evidence
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.message import AlertMessages
-from livessl.server.alerts.picture import MARGIN_M, picture_of
+from livessl.server.alerts.picture import MARGIN_M, MAX_PX, picture_of
 from livessl.server.alerts.rules import Match
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.zones.shapes import ZoneMap
@@ -112,6 +113,23 @@ def test_clip_that_is_too_large_or_never_comes_is_not_attached(tmp_path: Path, m
     never, lasting = Clips(None, 0), Clips(None, 10**6)
     assert (found(never), found(lasting)) == (None, None)
     assert never.looks < lasting.looks == 20
+    direction, early, site = Clips(None, 10**6), Clips(None, 10**6), site_of()
+    about = alert_at(1.0, 1.0)
+    about["event"]["status"] = "direction-only"
+    assert asyncio.run(Evidence(site, lambda: ZoneMap(site), direction).clip(about)) is None
+    assert asyncio.run(Evidence(site, lambda: ZoneMap(site), early).clip(alert_at(1.0, 1.0), waits=False)) is None
+    assert (direction.looks, early.looks) == (0, 1)
+
+
+def test_large_picture_takes_little_memory() -> None:
+    alert, site = alert_at(1.0, 1.0), site_of()
+    tracemalloc.start()
+    try:
+        assert picture_of(alert, site, ZoneMap(site), MAX_PX) is not None
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 6 * 3 * MAX_PX**2
 
 
 def test_alert_links_to_its_picture_which_the_server_draws(tmp_path: Path) -> None:

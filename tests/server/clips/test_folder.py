@@ -234,6 +234,18 @@ def test_expiry_deletes_old_ones_then_the_oldest_and_never_kept_ones(
     assert (gone, folder.count) == (len(clips) - len(left), len(left))
 
 
+def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    for k in range(4):
+        folder.put(f"lab-{k}", write(k))
+    folder.keep("lab-1", True)
+    for name in ("lab-0", "lab-1"):
+        shutil.rmtree(tmp_path / name)
+    assert folder.expire(None, 2 * len(SOUND)) == 0
+    assert (folder.count, folder.nbytes, folder.kept_bytes) == (2, 2 * len(SOUND), 0)
+    assert folder.about("lab-2") is not None
+
+
 def test_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(ClipsError, match=r"server\.clips\.folder: cannot write .*; name a folder in which"):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
 
+from livessl.core.types import Status
 from livessl.server.alerts.picture import picture_of
 from livessl.server.api.encode import JsonObject
 from livessl.server.zones.shapes import ZoneMap
@@ -60,20 +61,20 @@ class Evidence:
         size = {} if size_px is None else {"size_px": size_px}
         return picture_of(alert, self._site(), self._zones(), **size)
 
-    async def clip(self, alert: JsonObject) -> Path | None:
+    async def clip(self, alert: JsonObject, *, waits: bool = True) -> Path | None:
         """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.
 
-        None if the site keeps no clips, the alert is about no event, there is none by then, or it is larger than
-        `MAX_CLIP_BYTES`.
+        None if the site keeps no clips, the alert is about no event with a position, there is none by then, or it is
+        larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
         """
-        if self._clips is None or alert["event"] is None:
+        if self._clips is None or alert["event"] is None or alert["event"]["status"] != Status.LOCATED:
             return None
         event_id = alert["event"]["id"]
         for look in range(round(CLIP_WAIT_S / LOOK_S)):
             path = self._clips.best_file(event_id)
             if path is not None:
                 return path if path.stat().st_size <= MAX_CLIP_BYTES else None
-            if look * LOOK_S >= QUEUED_S and not self._clips.is_waiting(event_id):
+            if not waits or (look * LOOK_S >= QUEUED_S and not self._clips.is_waiting(event_id)):
                 break
             await asyncio.sleep(LOOK_S)
         return None

@@ -130,8 +130,8 @@ def title(alert: JsonObject) -> str:
 
 
 def body(alert: JsonObject) -> str:
-    """Return the text of a mail or chat message: what, when, and the link."""
-    return f"{alert['text']}\n{alert['time_utc'] or 'at an unknown time'}\n{alert['link']}"
+    """Return the text of a mail or chat message: what, when, the link, and the key that repeated messages share."""
+    return f"{alert['text']}\n{alert['time_utc'] or 'at an unknown time'}\n{alert['link']}\n{alert['key']}"
 
 
 def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> str:

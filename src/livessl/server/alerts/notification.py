@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
 
 from livessl.server.alerts.actions import ActionSetting, DeliveryError, in_daemon_thread, optional_library
 from livessl.server.alerts.message import body, title
+from livessl.server.alerts.outbox import MAX_WAITING
 from livessl.server.api.encode import JsonObject
 from livessl.site.secret_files import fault, read_secret
+
+LEAST_BYTES_PER_S: Final = 250_000.0
+"""Slowest transfer of files, in bytes per second, that does not count as a failure: an uplink of 2 Mbit/s."""
 
 
 class Notification:
@@ -41,7 +47,9 @@ class Notification:
         self._service = service
         self._attached = config.attach if service.attachment_support else ()
         self._evidence = setting.evidence
+        self._rules = setting.site.alerts.rules
         self._timeout_s = setting.config.timeout_s
+        self._failed: deque[str] = deque(maxlen=MAX_WAITING)  # keys of alerts that are sent without files
 
     @asynccontextmanager
     async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:  # noqa: ARG002
@@ -49,20 +57,41 @@ class Notification:
         yield
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Send an alert.
+        """Send an alert; after an attempt that failed, without files: these may be why it failed.
 
         Raises
         ------
         DeliveryError
             If the service does not accept it in time.
         """
-        picture = self._evidence.picture(alert) if "picture" in self._attached else None
-        clip = await self._evidence.clip(alert) if "clip" in self._attached else None
+        picture, clip = (None, None) if alert["key"] in self._failed else await self._files(alert)
         try:
-            async with asyncio.timeout(self._timeout_s):
+            await self._send_in_time(alert, picture, clip)
+        except DeliveryError:
+            if picture is not None or clip is not None:
+                self._failed.append(alert["key"])
+            raise
+
+    async def _files(self, alert: JsonObject) -> tuple[bytes | None, Path | None]:
+        """Return the picture and the clip that are to be attached; an alert that may be early waits for no clip."""
+        picture = self._evidence.picture(alert) if "picture" in self._attached else None
+        if "clip" not in self._attached:
+            return picture, None
+        rule = self._rules.get(alert["rule"])
+        may_be_early = rule is not None and rule.events is not None and rule.events.early
+        return picture, await self._evidence.clip(alert, waits=not may_be_early)
+
+    async def _send_in_time(self, alert: JsonObject, picture: bytes | None, clip: Path | None) -> None:
+        nbytes = len(picture or b"")
+        if clip is not None:
+            with suppress(OSError):  # it may have been deleted meanwhile
+                nbytes += clip.stat().st_size
+        within_s = self._timeout_s + nbytes / LEAST_BYTES_PER_S
+        try:
+            async with asyncio.timeout(within_s):
                 accepted = await in_daemon_thread(partial(self._send, alert, picture, clip))
         except TimeoutError as error:
-            raise DeliveryError(f"no answer within {self._timeout_s:g} s") from error
+            raise DeliveryError(f"no answer within {within_s:.3g} s") from error
         except Exception as error:
             raise DeliveryError(f"{type(error).__name__}: {error}") from error
         if not accepted:

@@ -30,6 +30,9 @@ MAX_WAITING: Final = 1000
 BUSY_S: Final = 1.0
 """Longest wait, in seconds, for a file that another program has locked."""
 
+UNKNOWN_IN_JOURNAL: Final = 100
+"""Newest alerts that the journal may lack, in a file of a release that did not note what the journal has."""
+
 NO_ACTION: Final = "the site file no longer has this action"
 """Why an alert was given up whose action was removed."""
 
@@ -105,6 +108,7 @@ class Outbox:
                     "UNIQUE (key, action))"
                 )
                 db.execute("CREATE INDEX IF NOT EXISTS deliveries_due ON deliveries (action, state, next_ns)")
+                _add_in_journal(db)
         except sqlite3.Error as error:
             raise OutboxError(f"alerts.outbox: cannot use {path}: {error}; name a file in a writable folder") from error
 
@@ -259,6 +263,16 @@ class Outbox:
                 (DeliveryState.DISMISSED, DeliveryState.DEAD, number, number, action, action),
             ).rowcount
 
+    def not_in_journal(self, most: int) -> list[JsonObject]:
+        """Return the alerts that the journal of the history is not known to have, oldest first, so many at most."""
+        rows = self._rows("SELECT json FROM alerts WHERE NOT in_journal ORDER BY number LIMIT ?", (most,))
+        return [json.loads(text) for (text,) in rows]
+
+    def note_in_journal(self, key: str) -> None:
+        """Note that the journal of the history has an alert."""
+        with self._kept() as db:
+            db.execute("UPDATE alerts SET in_journal = 1 WHERE key = ?", (key,))
+
     def recent(self, limit: int, before: int | None = None, rule: str | None = None) -> list[tuple[int, JsonObject]]:
         """Return alerts, newest first, each with its number; those before a number, and of one rule, if given."""
         sql = (
@@ -318,6 +332,15 @@ class Outbox:
                 return self._db.execute(sql, values).fetchall()
         except sqlite3.Error as error:
             raise OutboxError(f"alerts.outbox: cannot be read: {error}; {CURE}") from error
+
+
+def _add_in_journal(db: sqlite3.Connection) -> None:
+    """Add the column that says whether the journal has an alert, to a file of a release that did not note it."""
+    if any(row[1] == "in_journal" for row in db.execute("PRAGMA table_info(alerts)")):
+        return
+    db.execute("ALTER TABLE alerts ADD COLUMN in_journal INTEGER NOT NULL DEFAULT 0")
+    newest = "SELECT number FROM alerts ORDER BY number DESC LIMIT ?"
+    db.execute(f"UPDATE alerts SET in_journal = 1 WHERE number NOT IN ({newest})", (UNKNOWN_IN_JOURNAL,))  # noqa: S608 - a constant
 
 
 _OF_ALERT: Final = (

@@ -21,6 +21,9 @@ DEFAULT_PX: Final = 640
 MAX_PX: Final = 2000
 """Length of the longer side of a picture by default, and at most, in pixels."""
 
+ROWS_AT_ONCE: Final = 64
+"""Rows whose pixels are computed together, for the memory: 1 MB for each intermediate array of the largest picture."""
+
 MARGIN_M: Final = 0.3
 """Margin around the room, in metres."""
 
@@ -120,8 +123,10 @@ def _draw_density(canvas: _Canvas, mean_m: FloatArray, covariance_m2: FloatArray
     x_m, y_m = canvas.centres_m()
     (xx, xy), (_, yy) = np.linalg.inv(covariance_m2)
     dx, dy = (x_m - mean_m[0])[None, :], (y_m - mean_m[1])[:, None]
-    level = np.exp(-(xx * dx**2 + 2.0 * xy * dx * dy + yy * dy**2) / 2.0)
-    canvas.pixels[:] = map_colours(level)
+    for first in range(0, len(dy), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        level = np.exp(-(xx * dx**2 + 2.0 * xy * dx * dy[rows] + yy * dy[rows] ** 2) / 2.0)
+        canvas.pixels[rows] = map_colours(level)
 
 
 def _draw_room(canvas: _Canvas, site: Site) -> None:

@@ -50,6 +50,26 @@ TAKE_OVER_S: Final = 10.0
 _log = logging.getLogger(__name__)
 
 
+class _Change:
+    """A change of the rules that is either begun or given up, whatever two threads do at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_begun = self._is_given_up = False
+
+    def begin(self) -> bool:
+        """Begin it; return False if it was given up."""
+        with self._lock:
+            self._is_begun = not self._is_given_up
+            return self._is_begun
+
+    def give_up(self) -> bool:
+        """Give it up; return False if it has begun."""
+        with self._lock:
+            self._is_given_up = not self._is_begun
+            return self._is_given_up
+
+
 class Alerts:
     """Rules, actions and outbox of a site.
 
@@ -205,6 +225,13 @@ class Alerts:
         with self._changing:
             self._in_force.judge.arm(rule, armed)
 
+    def note_in_journal(self, alert: JsonObject) -> None:
+        """Note that the journal has an alert; if that fails, the next start puts it there again, under the same key."""
+        try:
+            self.outbox.note_in_journal(alert["key"])
+        except OutboxError as error:
+            _log.debug("%s", error)  # the thread reports it
+
     def resend(self, number: int) -> None:
         """Let a dead letter be delivered again.
 
@@ -241,21 +268,25 @@ class Alerts:
             self._replace(site)
             self.start()
             return
-        replacing = asyncio.run_coroutine_threadsafe(self._replace_on_thread(site), loop)
+        change = _Change()
+        replacing = asyncio.run_coroutine_threadsafe(self._replace_on_thread(site, change), loop)
         try:
             replacing.result(TAKE_OVER_S)
         except TimeoutError:
-            replacing.cancel()
+            if not change.give_up():  # it has just been made
+                replacing.result()
+                return
             raise RunError(
                 f"alerts: the thread that judges was busy for {TAKE_OVER_S:g} s, and the former rules stay in force; "
                 "reload again later"
             ) from None
 
-    async def _replace_on_thread(self, site: Site) -> None:
-        """Replace the rules on the thread that judges, between two of its turns."""
-        self._replace(site)
-        self._replaced.set()
-        self._news.set()
+    async def _replace_on_thread(self, site: Site, change: _Change) -> None:
+        """Replace the rules on the thread that judges, between two of its turns, unless that was given up."""
+        if change.begin():
+            self._replace(site)
+            self._replaced.set()
+            self._news.set()
 
     def _replace(self, site: Site) -> None:
         former, before, path = self.outbox, self._in_force, outbox_path(site)

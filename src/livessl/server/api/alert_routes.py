@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Final
@@ -39,6 +40,7 @@ _log = logging.getLogger(__name__)
 def alert_routes(parts: Parts) -> APIRouter:
     """Rules and alerts."""
     alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
+    drawing = threading.Lock()  # one picture at a time, for the memory and the processor
 
     @router.get(
         "", response_model=alert_schema.AlertPage, responses=errors(404, 503, texts={404: _NO_RULE, 503: _OUTBOX})
@@ -77,7 +79,8 @@ def alert_routes(parts: Parts) -> APIRouter:
         """The floor plan with arrays, zones, and the place of an alert with its ellipse of 95 %."""
         with _outbox_errors():
             alert = alerts.outbox.get(key)
-        picture = None if alert is None else alerts.evidence.picture(alert, size)
+        with drawing:
+            picture = None if alert is None else alerts.evidence.picture(alert, size)
         if picture is None:
             raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
         return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})

@@ -16,6 +16,11 @@ _ANCHORS: Final = np.array(
 )
 """Colours (RGB) of the scale from low to high power, evenly spaced: dark, purple, red, orange, light."""
 
+_COLOURS: Final = np.stack(
+    [np.interp(np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(_ANCHORS)), each) for each in _ANCHORS.T], axis=-1
+).astype(np.uint8)
+"""Colours (RGB) of 256 levels, (256, 3)."""
+
 
 def map_png(image: Float32Array) -> bytes:
     """Draw a map (rows, columns) as a PNG with the first row at the bottom, dark up to the median, light at the top."""
@@ -25,11 +30,7 @@ def map_png(image: Float32Array) -> bytes:
 
 def map_colours(level: RealArray) -> NDArray[np.uint8]:
     """Return the colours (RGB) of levels from 0 to 1, (..., 3)."""
-    place = level * (len(_ANCHORS) - 1)
-    left = np.minimum(place.astype(np.int64), len(_ANCHORS) - 2)
-    fraction = (place - left)[..., None]
-    colours: NDArray[np.uint8] = (_ANCHORS[left] * (1.0 - fraction) + _ANCHORS[left + 1] * fraction).astype(np.uint8)
-    return colours
+    return _COLOURS[np.rint(level * (len(_COLOURS) - 1)).astype(np.uint8)]
 
 
 def encode_png(pixels: NDArray[np.uint8]) -> bytes:

@@ -159,11 +159,14 @@ def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[st
     unsaved = parts.event_log.unsaved if parts.store.backlog.is_failing else 0  # others are being written
     if unkept:
         reasons.append(f"server.events_db: {unkept} events were not stored; {parts.store.cure}")
+    if others := parts.event_log.unkept_others:
+        what = "entries of the journal or messages for the hub"
+        reasons.append(f"server.events_db: {others} {what} were not stored; {parts.store.cure}")
     if unsaved:
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {parts.store.cure}")
     if parts.store.problem is not None:
         reasons.append(parts.store.problem)
-    if (unkept or unsaved or parts.store.problem) and status == "ok":
+    if (unkept or others or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if parts.hub_link is not None and parts.hub_link.problem is not None:

@@ -246,7 +246,8 @@ class ClipFolder:
     def expire(self, before_ns: int | None, most_bytes: int) -> int:
         """Delete clips of events that began before a time, and the oldest ones beyond a number of bytes.
 
-        Clips that are kept for ever stay. Return the number of clips that were deleted.
+        Clips that are kept for ever stay. Clips whose folders somebody has removed do not count any more. Return the
+        number of clips that were deleted.
 
         Raises
         ------
@@ -254,6 +255,7 @@ class ClipFolder:
             If a file cannot be deleted; the other clips are.
         """
         with self._lock:
+            self._forget_removed()
             excess = self.nbytes - most_bytes
             oldest_first = sorted(self._entries.items(), key=lambda item: item[1].start_ns)
         gone, failed = 0, None
@@ -286,6 +288,12 @@ class ClipFolder:
             (self._path / event_id).rename(going)
             self._entries.pop(event_id, None)
             return going
+
+    def _forget_removed(self) -> None:
+        """Forget the clips whose folders are gone; the lock is held, so that none of them is just being replaced."""
+        there = {folder.name for folder in os.scandir(self._path)}
+        for event_id in self._entries.keys() - there:
+            del self._entries[event_id]
 
     def _finish(self, going: Path) -> None:
         """Erase a folder that was set aside; two threads may do so at once."""

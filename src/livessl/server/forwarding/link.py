@@ -185,7 +185,14 @@ class HubLink:
             )
 
     def _put(self, messages: Sequence[Outgoing]) -> None:
-        self._backlog.put(Write(partial(self._outbox.put, messages), 0, is_final=False), self._clock.monotonic_ns())
+        rows = [(kind, time_ns, orjson.dumps(message)) for kind, time_ns, message in messages]
+
+        def store() -> None:
+            self._outbox.put([Outgoing(kind, time_ns, orjson.loads(body)) for kind, time_ns, body in rows])
+
+        nbytes = sum(len(body) for *_, body in rows)  # as bytes: thousands may wait for a database
+        write = Write(store, 0, is_final=False, others=len(rows), nbytes=nbytes)
+        self._backlog.put(write, self._clock.monotonic_ns())
 
     # --- the thread
 

@@ -20,6 +20,9 @@ MAX_UNSAVED: Final = 10_000
 MAX_WRITES: Final = 50_000
 """Most writes that wait, with and without events."""
 
+MAX_BYTES: Final = 64_000_000
+"""Most bytes that wait; beyond it the oldest writes are given up, and counted. A track alone may have 10 kB."""
+
 SETTLE_S: Final = 1.0
 """Longest wait, in seconds, of a reader for what was to be written before it asked."""
 
@@ -41,18 +44,24 @@ class Write:
         Number of events in it.
     is_final : bool
         Whether it holds final events of a live run.
+    others : int
+        Number of entries of the journal, and of messages for the hub, in it.
+    nbytes : int
+        Bytes that it holds until it is written.
     """
 
     work: Callable[[], None]
     events: int
     is_final: bool
+    others: int = 0
+    nbytes: int = 0
 
 
 class Backlog:
     """Writes in the order in which they came.
 
     Until `start`, and after `stop`, the caller of `put` or `retry` does the work, as tests and stepped servers want it.
-    From `start` on a thread does, and neither method waits for it.
+    From `start` on a thread does, and neither method waits for it. What is being done may put more, which is done next.
 
     Parameters
     ----------
@@ -65,9 +74,10 @@ class Backlog:
         self._waiting: deque[Write] = deque()
         self._changed = threading.Condition()
         self._draining = threading.Lock()  # a caller may still be at work when the thread starts
+        self._drainer: int | None = None  # the thread that holds it
         self._thread: threading.Thread | None = None
         self._is_ending = self._is_writing = False
-        self._put = self._done = 0
+        self._put = self._done = self._nbytes = 0
         self._tried_ns = 0
         self.is_failing = False
         """True if the last attempt to write has failed."""
@@ -75,6 +85,8 @@ class Backlog:
         """Events that wait to be written."""
         self.unkept = 0
         """Events that were given up."""
+        self.unkept_others = 0
+        """Entries of the journal, and messages for the hub, that were given up."""
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
 
@@ -97,12 +109,17 @@ class Backlog:
             self._waiting.append(write)
             self._put += 1
             self.unsaved += write.events
+            self._nbytes += write.nbytes
             spared = 1 if self._is_writing else 0
-            while (self.unsaved > MAX_UNSAVED or len(self._waiting) > MAX_WRITES) and len(self._waiting) > spared:
-                self.unkept += self._take(spared).events
+            while self._is_full and len(self._waiting) > spared:
+                self._give_up(self._take(spared))
             self._changed.notify_all()
         if self._thread is None:
             self._try(now_ns)
+
+    @property
+    def _is_full(self) -> bool:
+        return self.unsaved > MAX_UNSAVED or len(self._waiting) > MAX_WRITES or self._nbytes > MAX_BYTES
 
     def retry(self, now_ns: int) -> None:
         """Try again what failed, if it is time to and no thread does it."""
@@ -111,7 +128,7 @@ class Backlog:
 
     def settle(self, within_s: float = SETTLE_S) -> None:
         """Return when all that was put before is written, after a time in seconds, or at once if the database fails."""
-        if self._thread is None or self._thread is threading.current_thread():
+        if self._thread is None or self._drainer == threading.get_ident():
             return
         with self._changed:
             wanted = self._put
@@ -139,8 +156,7 @@ class Backlog:
     def _work(self) -> None:
         try:
             while True:
-                with self._draining:
-                    self._drain()
+                self._drain()
                 with self._changed:
                     if self._is_ending:
                         return
@@ -154,12 +170,21 @@ class Backlog:
             raise
 
     def _try(self, now_ns: int) -> None:
+        if self._drainer == threading.get_ident():  # what this thread writes has put more: it is written next
+            return
         self._tried_ns = now_ns
-        with self._draining:
-            self._drain()
+        self._drain()
 
     def _drain(self) -> None:
-        """Write what waits until it is done or the database fails."""
+        """Write what waits until it is done or the database fails; one thread at a time."""
+        with self._draining:
+            self._drainer = threading.get_ident()
+            try:
+                self._write_waiting()
+            finally:
+                self._drainer = None
+
+    def _write_waiting(self) -> None:
         try:
             self._prepare()
             while (write := self._first()) is not None:
@@ -167,7 +192,7 @@ class Backlog:
                     write.work()
                 except RejectedError as error:  # it would be refused again, and everything else would wait for it
                     _log.error("%s", error)
-                    self.unkept += write.events
+                    self._give_up(write)
                 with self._changed:
                     self._take(0)
                     self._changed.notify_all()
@@ -192,4 +217,9 @@ class Backlog:
         del self._waiting[place]
         self._done += 1
         self.unsaved -= write.events
+        self._nbytes -= write.nbytes
         return write
+
+    def _give_up(self, write: Write) -> None:
+        self.unkept += write.events
+        self.unkept_others += write.others
