@@ -66,7 +66,8 @@ RESTORED: Final = 10_000
 on with the others."""
 
 RESTORED_AGAIN: Final = 100
-"""Newest alerts of the outbox that are put at each start into a journal that is kept in memory."""
+"""Newest alerts of the outbox that are put at each start into the messages for the hub, and into a
+journal in memory."""
 
 _log = logging.getLogger(__name__)
 
