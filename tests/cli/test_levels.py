@@ -275,7 +275,7 @@ def test_file_is_metered_at_once(run: Run, tmp_path: Path) -> None:
         ("--device a --node n", "--node: expected --site and --node together"),
         ("--wav b.wav --sample-rate 8000", "--sample-rate: applies to --device only"),
         ("--wav b.wav --inputs 4", "--inputs: applies to a device only"),
-        ("--device a --out x.wav", "--out: is the file of --listen, which is not given"),
+        ("--device a --out x.wav", "--out: needs --listen; add --listen CH, or remove --out"),
         ("--wav missing.wav", "missing.wav: expected a WAV or FLAC file, cannot read it: no such file"),
         ("--device a --listen 0", "expected a whole number >= 1, got '0'"),
     ],
