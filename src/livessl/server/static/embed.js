@@ -4,6 +4,7 @@ import { follow } from "./client.js";
 
 /** Events that stay on the map. */
 const SHOWN = 20;
+const NEEDS_TOKEN = "This map needs a valid token: /embed#token=TOKEN";
 /** Radii in metres. */
 const RADIUS = { array: 0.12, event: 0.15, update: 0.22 };
 
@@ -38,7 +39,7 @@ function show(state, text) {
 async function drawRoom() {
   const headers = token === undefined ? {} : { Authorization: `Bearer ${token}` };
   const answer = await fetch(`${server}/api/v1/site`, { headers, cache: "no-store" });
-  if (answer.status === 401) return show("refused", "This map needs a valid token: /embed#token=TOKEN");
+  if (answer.status === 401) return show("refused", NEEDS_TOKEN);
   const site = await answer.json();
   const [width, height] = site.room.size_m;
   const margin = 0.03 * Math.max(width, height);
@@ -72,7 +73,7 @@ function take(message) {
 }
 
 const confidence = query.get("min_confidence");
-const stop = follow(server, {
+follow(server, {
   kinds: ["event", "update", "poses", "zones"],
   zone: query.get("zone") ?? undefined,
   minConfidence: confidence === null ? undefined : Number(confidence),
@@ -81,18 +82,7 @@ const stop = follow(server, {
   onMessage: (message) => (["poses", "zones"].includes(message.kind) ? drawRoom() : take(message)),
   onState: (state, error) => {
     if (state === "live") drawRoom().catch((reason) => show("down", String(reason)));
-    else if (document.body.dataset.state !== "refused") {
-      show(state, state === "down" ? "Server unreachable; reconnecting" : String(error.message));
-      if (state === "down") explainRefusal();
-    }
+    else if (state === "down") show(state, "Server unreachable; reconnecting");
+    else show(state, /token/.test(error.message) ? NEEDS_TOKEN : error.message);
   },
 });
-
-/** A WebSocket without a valid token is refused without a reason; an answer to a request has one. */
-async function explainRefusal() {
-  const headers = token === undefined ? {} : { Authorization: `Bearer ${token}` };
-  const answer = await fetch(`${server}/api/v1/tracks`, { headers, cache: "no-store" }).catch(() => null);
-  if (answer?.status !== 401) return;
-  stop();
-  show("refused", "This map needs a valid token: /embed#token=TOKEN");
-}
