@@ -79,7 +79,7 @@ def device(*scripts: str, channels: int = 3) -> Iterator[tuple[SoundDevice, Runs
     config = SoundDeviceConfig(name="UMC", sample_rate_hz=8000)
     with SoundDevice(config, channels, SystemClock(), runs) as entered:
         yield entered, runs
-    assert all(run.exit_code is not None for run in runs.started)
+    wait_until(lambda: all(run.exit_code is not None for run in runs.started), "the end of the processes")
 
 
 def blocks_until(entered: SoundDevice, over: Callable[[list[Block]], bool]) -> tuple[list[Block], list[str | None]]:

@@ -346,6 +346,7 @@ def test_events_of_before_the_journal_are_found_by_their_exclusion(place: Path |
         for sql in (
             "DELETE FROM event_tags WHERE kind = 'flag'",
             "DROP TABLE journal",
+            "DROP TABLE life",
             "DROP INDEX IF EXISTS event_tags_search",
             "UPDATE alembic_version SET version_num = '0002'",
         ):

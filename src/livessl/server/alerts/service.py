@@ -145,6 +145,7 @@ class Alerts:
         self._is_caught_up = not self._in_force.judges_events
         self._live_ns: tuple[int, int] | None = None  # site time that was judged before the past could be read
         self._news, self._end, self._replaced = asyncio.Event(), asyncio.Event(), asyncio.Event()
+        self._starting = threading.Lock()
         self._changing = threading.Lock()  # a rule is armed either before or after it is replaced
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -263,11 +264,12 @@ class Alerts:
             If an action cannot be made, or the outbox cannot be used; then nothing has changed.
         """
         site = self._site.model_copy(update={"alerts": config})
-        loop = self._loop
-        if loop is None:
-            self._replace(site)
-            self.start()
-            return
+        with self._starting:
+            loop = self._loop
+            if loop is None:
+                self._replace(site)
+                self._start()
+                return
         change = _Change()
         replacing = asyncio.run_coroutine_threadsafe(self._replace_on_thread(site, change), loop)
         try:
@@ -307,8 +309,12 @@ class Alerts:
     # --- the thread
 
     def start(self) -> None:
-        """Begin to judge and to deliver; a site that never had rules needs no thread."""
-        if not self.config.rules and self.outbox.path is None:
+        """Begin to judge and to deliver, unless it has begun; a site that never had rules needs no thread."""
+        with self._starting:
+            self._start()
+
+    def _start(self) -> None:
+        if self._loop is not None or (not self.config.rules and self.outbox.path is None):
             return
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, args=(self._loop,), name="alerts", daemon=True)
