@@ -22,7 +22,7 @@ def test_stalled_clients_delay_no_other_client_and_cost_little_memory() -> None:
     # a server that waits for the stalled ones would be late by SEND_TIMEOUT_S, 30 s; a busy machine, by less than one
     assert outcome.delay_p50_ms < 1000.0
     assert outcome.received > outcome.expected / 2
-    # what all share besides, with two clients as with forty: 256 messages as Python objects, validators, a first request
+    # what all share besides, with two clients as with forty: 256 messages as Python objects, imports of a first request
     assert outcome.rss_peak_mb - outcome.rss_before_mb < 12 * MAX_CLIENT_KB / 1000 + 30.0
 
 
