@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, Any, Final
 
 import orjson
@@ -21,9 +20,9 @@ from livessl.federation.intake import Intake
 from livessl.schema.answers import errors
 from livessl.server.api.auth import HEALTH
 from livessl.server.api.encode import API_VERSION, JsonObject
-from livessl.server.api.history_routes import Time, cached
 from livessl.server.api.metrics import CONTENT_TYPE
-from livessl.server.api.queries import instant, page_cursor, unprocessable
+from livessl.server.api.paging import cached, page_answer, paged
+from livessl.server.api.queries import Time, instant, require_no_nul
 from livessl.server.api.routes import as_json
 from livessl.server.history.database import StoreError
 from livessl.server.history.query import Query as EventQuery
@@ -97,9 +96,7 @@ def _filters() -> Callable[..., EventQuery]:
             str | None, Query(description="only events that an array of this name detected or contributed to")
         ] = None,
     ) -> EventQuery:
-        for name, value in (("site", site), ("zone", zone), ("array", array)):
-            if value is not None and "\0" in value:
-                raise unprocessable(name, f"{name}: expected a text without NUL")
+        require_no_nul(site=site, zone=zone, array=array)
         return EventQuery(
             since_ns=instant("since", since),
             until_ns=instant("until", until),
@@ -114,32 +111,12 @@ def _filters() -> Callable[..., EventQuery]:
 
 
 def _add_events(router: APIRouter, archive: Archive) -> None:
-    searched: Any = Depends(_filters())
+    listed: Any = paged(Depends(_filters()))
 
     @router.get("/api/v1/events", tags=["estimates"], response_model=schema.SiteEventPage, responses=errors(503))
-    def get_events(
-        request: Request,
-        query: EventQuery = searched,
-        limit: Annotated[int, Query(ge=1, le=1000, description="most events on a page")] = 50,
-        cursor: Annotated[
-            str | None, Query(description="`next_cursor` of a page, unchanged: the events after its last one")
-        ] = None,
-        after: Annotated[
-            str | None, Query(description="`previous_cursor` of a page, unchanged: the events before its first one")
-        ] = None,
-    ) -> Response:
+    def get_events(request: Request, query: EventQuery = listed) -> Response:
         """Final events of all sites, the latest start first."""
-        if cursor is not None and after is not None:
-            raise unprocessable("after", "after: expected cursor or after, got both; leave one out")
-        query = replace(query, limit=limit, before=page_cursor(cursor), after=page_cursor(after, "after"))
-        page = archive.store.page(query)
-        head = {
-            "v": API_VERSION,
-            "next_cursor": None if page.older is None else str(page.older),
-            "previous_cursor": None if page.newer is None else str(page.newer),
-        }
-        listed = ",".join(row.body for row in page.rows).encode()
-        return cached(request, orjson.dumps(head)[:-1] + b',"events":[' + listed + b"]}")
+        return page_answer(request, archive.store.page(query))
 
     @router.get(
         "/api/v1/sites/{site}/events/{event_id}",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field
 
 from livessl.schema.alerts import Alert
-from livessl.schema.values import ArrayCondition, Event, Track, UtcTime, Version
+from livessl.schema.values import ArrayCondition, Event, Track, UtcTime, Versioned
 
 SiteName = Annotated[str, Field(description="Name of the site.", examples=["lab"])]
 
@@ -33,10 +33,6 @@ class HubCondition(StrEnum):
     DEGRADED = "degraded"
 
 
-class _Versioned(BaseModel):
-    v: Version
-
-
 class SiteState(BaseModel):
     """A site, as the hub knows it."""
 
@@ -54,7 +50,7 @@ class SiteState(BaseModel):
     newest_event_utc: UtcTime | None = Field(description="Start of its newest event; null if there is none.")
 
 
-class Sites(_Versioned):
+class Sites(Versioned):
     """All sites that the hub has heard of."""
 
     sites: list[SiteState]
@@ -66,7 +62,7 @@ class SiteEvent(Event):
     site: SiteName
 
 
-class SiteEventPage(_Versioned):
+class SiteEventPage(Versioned):
     """A page of events of all sites, the latest start first."""
 
     events: list[SiteEvent]
@@ -81,7 +77,7 @@ class SiteEventPage(_Versioned):
     )
 
 
-class OneSiteEvent(_Versioned, SiteEvent):
+class OneSiteEvent(Versioned, SiteEvent):
     """One event."""
 
 
@@ -98,7 +94,7 @@ class SiteArray(BaseModel):
     time_utc: UtcTime = Field(description="When the state changed.")
 
 
-class SiteArrays(_Versioned):
+class SiteArrays(Versioned):
     """Arrays of all sites."""
 
     arrays: list[SiteArray]
@@ -110,13 +106,13 @@ class SiteTrack(Track):
     site: SiteName
 
 
-class SiteTracks(_Versioned):
+class SiteTracks(Versioned):
     """Tracks of all sites that have begun and not ended."""
 
     tracks: list[SiteTrack]
 
 
-class SiteAlertPage(_Versioned):
+class SiteAlertPage(Versioned):
     """A page of alerts of all sites, those that the hub received last first."""
 
     alerts: list[Alert]
@@ -125,7 +121,7 @@ class SiteAlertPage(_Versioned):
     )
 
 
-class HubHealthStatus(_Versioned):
+class HubHealthStatus(Versioned):
     """Health as everyone may read it, without a token."""
 
     status: HubCondition

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
-from livessl.schema.values import ArrayCondition, Event, Membership, UtcTime, Version
+from livessl.schema.values import ArrayCondition, Event, Membership, UtcTime, Versioned
 from livessl.schema.zones import ZoneChange
 
 RuleName = Annotated[str, Field(description="Name of the rule in the site file.", examples=["door"])]
@@ -112,11 +112,7 @@ class DeadLetter(Delivery):
     alert: Alert
 
 
-class _Versioned(Model):
-    v: Version
-
-
-class AlertPage(_Versioned):
+class AlertPage(Versioned):
     """A page of alerts, the latest first."""
 
     alerts: list[KeptAlert]
@@ -125,7 +121,7 @@ class AlertPage(_Versioned):
     )
 
 
-class DeadLetterPage(_Versioned):
+class DeadLetterPage(Versioned):
     """A page of dead letters, the latest first."""
 
     dead_letters: list[DeadLetter]
@@ -168,7 +164,7 @@ class Rule(Model):
     )
 
 
-class Rules(_Versioned):
+class Rules(Versioned):
     """All rules of the site."""
 
     rules: list[Rule]
@@ -182,20 +178,20 @@ class ArmSwitch(BaseModel):
     armed: bool = Field(description="`false` disarms the rule, `true` arms it.", examples=[True])
 
 
-class Armed(_Versioned):
+class Armed(Versioned):
     """Confirmation that a rule was armed or disarmed."""
 
     name: RuleName
     armed: bool = Field(description="Whether it can alert from now on.", examples=[True])
 
 
-class Resent(_Versioned):
+class Resent(Versioned):
     """Confirmation that a dead letter waits for delivery again."""
 
     number: int = Field(ge=1, description="Number of the delivery.", examples=[17])
 
 
-class Dismissed(_Versioned):
+class Dismissed(Versioned):
     """Confirmation that dead letters were dismissed."""
 
     dismissed: Count = Field(description="Number of dead letters that were dismissed.", examples=[1])
@@ -208,7 +204,7 @@ class TriedAlert(Model):
     time_utc: UtcTime | None = Field(description="When the sound began.")
 
 
-class Tried(_Versioned):
+class Tried(Versioned):
     """Result of a dry run: the alerts that an armed rule would have raised."""
 
     name: RuleName

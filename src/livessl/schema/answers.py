@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.core.commission.finding import Severity
 from livessl.schema.base import Model
-from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Version
+from livessl.schema.values import Array, ArrayCondition, Event, Mode, PositionM, RoleName, Track, UtcTime, Versioned
 from livessl.schema.zones import BoundsM, IntervalM, ZoneShape
 
 BandHz = Annotated[
@@ -48,10 +48,6 @@ class Door(StrEnum):
 
     NODES = "nodes"
     HTTP = "http"
-
-
-class _Versioned(Model):
-    v: Version
 
 
 class RoomSize(Model):
@@ -104,7 +100,7 @@ class Privacy(Model):
     )
 
 
-class Site(_Versioned):
+class Site(Versioned):
     """Geometry and settings of the site."""
 
     site: str = Field(description="Name of the site.", examples=["lab"])
@@ -134,7 +130,7 @@ class PlacedArray(Array):
     )
 
 
-class Arrays(_Versioned):
+class Arrays(Versioned):
     """State of every array, and where it is."""
 
     now_utc: UtcTime = Field(description="Site time now; in a replay, the recording's time.")
@@ -165,20 +161,20 @@ class Finding(Model):
     )
 
 
-class Findings(_Versioned):
+class Findings(Versioned):
     """Faults of the set-up that the last sounds show, errors first."""
 
     sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
     findings: list[Finding]
 
 
-class Tracks(_Versioned):
+class Tracks(Versioned):
     """The tracks that live now."""
 
     tracks: list[Track]
 
 
-class EventPage(_Versioned):
+class EventPage(Versioned):
     """A page of events, the latest start first."""
 
     events: list[Event]
@@ -193,7 +189,7 @@ class EventPage(_Versioned):
     )
 
 
-class EventLog(_Versioned):
+class EventLog(Versioned):
     """Events in the order in which they were stored."""
 
     position: str = Field(
@@ -210,11 +206,11 @@ class EventLog(_Versioned):
     events: list[Event]
 
 
-class OneEvent(_Versioned, Event):
+class OneEvent(Versioned, Event):
     """One event."""
 
 
-class HeatMap(_Versioned):
+class HeatMap(Versioned):
     """Number of events in each square cell of the floor plan."""
 
     since_utc: UtcTime | None = Field(description="Earliest start of an event; null for the beginning.")
@@ -283,7 +279,7 @@ class Load(Model):
     )
 
 
-class HealthStatus(_Versioned):
+class HealthStatus(Versioned):
     """Health as everyone may read it, without a token."""
 
     status: HealthState
@@ -322,7 +318,7 @@ class RefusedCaller(Model):
     last_utc: UtcTime = Field(description="When it was refused last.")
 
 
-class AccessList(_Versioned):
+class AccessList(Versioned):
     """Clients, nodes and refusals."""
 
     clients: list[KnownClient] = Field(description="Clients that have a token; empty where the site uses none.")
@@ -340,7 +336,7 @@ class Switch(BaseModel):
     enabled: bool = Field(description="`false` disables the array, `true` enables it again.", examples=[False])
 
 
-class Switched(_Versioned):
+class Switched(Versioned):
     """Confirmation that an array was enabled or disabled."""
 
     name: str = Field(description="Name of the array.", examples=["north"])

@@ -73,6 +73,12 @@ StartS = Annotated[
 LatencyS = Annotated[float, Field(description="Seconds from the end of the sound to this answer.", examples=[0.41])]
 
 
+class Versioned(Model):
+    """The base of all answers: they say of which version they are."""
+
+    v: Version
+
+
 class Mode(StrEnum):
     """Source of the server's sound: nodes that capture it now, or a recorded session."""
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from livessl.schema.base import Model
-from livessl.schema.values import PositionM, StartS, UtcTime, Version, Zones
+from livessl.schema.values import PositionM, StartS, UtcTime, Versioned, Zones
 
 IntervalM = Annotated[
     list[float], Field(min_length=2, max_length=2, description="Lowest and highest coordinate in metres.")
@@ -69,31 +69,27 @@ class ZoneChange(Model):
     zones: Zones
 
 
-class _Versioned(Model):
-    v: Version
-
-
-class ZoneList(_Versioned):
+class ZoneList(Versioned):
     """The zones in force, by name."""
 
     zones: dict[str, ZoneShape] = Field(description="Zones by name.")
     can_draw: bool = Field(description="Whether the site file names a file for drawn zones.", examples=[True])
 
 
-class OneZone(_Versioned):
+class OneZone(Versioned):
     """A zone that has been drawn or changed."""
 
     name: ZoneName
     zone: ZoneShape
 
 
-class Deleted(_Versioned):
+class Deleted(Versioned):
     """Confirmation that a zone was deleted."""
 
     name: ZoneName
 
 
-class Changes(_Versioned):
+class Changes(Versioned):
     """Changes of tracks in zones, newest first."""
 
     changes: list[ZoneChange]

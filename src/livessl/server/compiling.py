@@ -26,10 +26,10 @@ COMPILE: Final = (sys.executable, "-m", "livessl.server.compiling")
 """The command that compiles the kernels and exits."""
 
 UNTIL_STDIN_ENDS: Final = "--until-stdin-ends"
-"""Argument that makes the command end with whoever holds its standard input: a server that is killed cannot stop it."""
+"""Argument that makes the command end when its standard input is closed: a killed server cannot stop it."""
 
 NICENESS: Final = 10
-"""By how much the compiler gives way to the server, as of nice(1)."""
+"""Niceness of the compiler, as of nice(1), so that the server comes first."""
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class KernelLoader:
 
 
 def machine_code_folder(compiled: ModuleType) -> Path | None:
-    """Where numba keeps the machine code of a module of kernels; None if it keeps none."""
+    """Return the folder of numba's machine code for a module of kernels; None if numba keeps none."""
     statistics = getattr(compiled.highest, "stats", None)  # a function on NumPy, or with NUMBA_DISABLE_JIT, has none
     folder: str | None = getattr(statistics, "cache_path", None)
     return None if folder is None else Path(folder)
@@ -122,7 +122,7 @@ def main() -> None:
         warm_up()
         return
     stamp.parent.mkdir(parents=True, exist_ok=True)
-    # a server that was killed leaves its compiler behind, and the next one begins its own
+    # several servers may start at once, each with a compiler
     with (stamp.parent / "compiling.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not stamp.exists():

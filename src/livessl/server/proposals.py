@@ -91,7 +91,7 @@ class ClapFit:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether it agrees with the proposed poses; None where that cannot be said."""
+        """True if it agrees with the proposed poses; None where that cannot be said."""
         return None if self.after_m is None else self.after_m <= AGREES_M
 
 

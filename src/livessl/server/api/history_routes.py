@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from hashlib import sha256
 from importlib.util import find_spec
 from typing import Annotated, Any, Final, Literal
 
@@ -12,15 +10,15 @@ import numpy as np
 import orjson
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import WithJsonSchema
 
 from livessl.clock import utc_text
 from livessl.core.types import Status
 from livessl.schema import answers
 from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
+from livessl.server.api.paging import UNCHANGED, cached, page_answer, paged
 from livessl.server.api.png import map_png
-from livessl.server.api.queries import array_names, instant, page_cursor, unprocessable
+from livessl.server.api.queries import Time, array_names, instant, require_no_nul, unprocessable
 from livessl.server.history.export import FORMATS
 from livessl.server.history.heat_map import Cells
 from livessl.server.parts import Parts
@@ -30,13 +28,8 @@ from livessl.site.build.grid import search_grid
 MAX_CELLS: Final = 250_000
 """Most cells of a heat map: those of a hall of 50 m x 50 m at 0.1 m."""
 
-Time = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
-
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 _NAMES: Final = errors(404, 503, texts={404: "There is no zone or array of that name."})
-_UNCHANGED: Final[dict[int | str, dict[str, Any]]] = {
-    304: {"description": "Nothing has changed since the answer with the ETag in `If-None-Match`."}
-}
 
 
 def history_routes(parts: Parts) -> APIRouter:
@@ -85,8 +78,7 @@ def _filters(parts: Parts) -> Callable[..., EventQuery]:
         known = [*dict.fromkeys([*array_names(site), *(spec.name for spec in site.specs)])]
         if array is not None and array not in known:
             raise HTTPException(404, f"no array {array!r}; there are {', '.join(known)}")
-        if text is not None and "\0" in text:
-            raise unprocessable("text", "text: expected a text without NUL")
+        require_no_nul(text=text)
         return EventQuery(
             since_ns=instant("since", since),
             until_ns=instant("until", until),
@@ -103,40 +95,20 @@ def _filters(parts: Parts) -> Callable[..., EventQuery]:
 
 
 def _add_events(router: APIRouter, parts: Parts, searched: Any) -> None:
-    store = parts.store
+    store, listed = parts.store, paged(searched)
 
     @router.get(
-        "/api/v1/events", tags=["estimates"], response_model=answers.EventPage, responses={**_NAMES, **_UNCHANGED}
+        "/api/v1/events", tags=["estimates"], response_model=answers.EventPage, responses={**_NAMES, **UNCHANGED}
     )
-    def get_events(
-        request: Request,
-        query: EventQuery = searched,
-        limit: Annotated[int, Query(ge=1, le=1000, description="most events on a page")] = 50,
-        cursor: Annotated[
-            str | None, Query(description="`next_cursor` of a page, unchanged: the events after its last one")
-        ] = None,
-        after: Annotated[
-            str | None, Query(description="`previous_cursor` of a page, unchanged: the events before its first one")
-        ] = None,
-    ) -> Response:
+    def get_events(request: Request, query: EventQuery = listed) -> Response:
         """Finished events, newest first."""
-        if cursor is not None and after is not None:
-            raise unprocessable("after", "after: expected cursor or after, got both; leave one out")
-        query = replace(query, limit=limit, before=page_cursor(cursor), after=page_cursor(after, "after"))
-        page = store.page(query)
-        head = {
-            "v": API_VERSION,
-            "next_cursor": None if page.older is None else str(page.older),
-            "previous_cursor": None if page.newer is None else str(page.newer),
-        }
-        listed = ",".join(row.body for row in page.rows).encode()
-        return cached(request, orjson.dumps(head)[:-1] + b',"events":[' + listed + b"]}")
+        return page_answer(request, store.page(query))
 
     @router.get(
         "/api/v1/events/{event_id}",
         tags=["estimates"],
         response_model=answers.OneEvent,
-        responses={**errors(404, 503, texts={404: "There is no event of that id."}), **_UNCHANGED},
+        responses={**errors(404, 503, texts={404: "There is no event of that id."}), **UNCHANGED},
     )
     def get_event(event_id: str, request: Request) -> Response:
         """One event."""
@@ -184,7 +156,7 @@ def _add_heat_map(router: APIRouter, parts: Parts, searched: Any) -> None:
         "/api/v1/history/heat-map",
         tags=["estimates"],
         response_model=answers.HeatMap,
-        responses={200: {"content": {"image/png": _BINARY}}, **_NAMES, **_UNCHANGED},
+        responses={200: {"content": {"image/png": _BINARY}}, **_NAMES, **UNCHANGED},
     )
     def get_heat_map(
         request: Request,
@@ -212,12 +184,3 @@ def _add_heat_map(router: APIRouter, parts: Parts, searched: Any) -> None:
             "elsewhere": found.elsewhere,
         }
         return cached(request, orjson.dumps(answer, option=orjson.OPT_SERIALIZE_NUMPY))
-
-
-def cached(request: Request, body: bytes, media_type: str = "application/json") -> Response:
-    """Answer with an ETag, or with 304 if the client has this answer already."""
-    tag = f'"{sha256(body).hexdigest()[:32]}"'
-    known = [each.strip().removeprefix("W/") for each in request.headers.get("if-none-match", "").split(",")]
-    if tag in known or "*" in known:
-        return Response(status_code=304, headers={"ETag": tag})
-    return Response(body, media_type=media_type, headers={"ETag": tag})

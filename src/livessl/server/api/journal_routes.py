@@ -6,18 +6,15 @@ from typing import Annotated
 
 import orjson
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import WithJsonSchema
 
 from livessl.clock import utc_text
 from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION
-from livessl.server.api.history_routes import cached
 from livessl.server.api.journal_schema import JournalAnswer
-from livessl.server.api.queries import instant, page_cursor, unprocessable
+from livessl.server.api.paging import UNCHANGED, cached
+from livessl.server.api.queries import Time, instant, page_cursor, require_no_nul
 from livessl.server.history.journal import EntryKind, JournalQuery
 from livessl.server.parts import Parts
-
-Time = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
 
 
 def journal_routes(parts: Parts) -> APIRouter:
@@ -28,10 +25,7 @@ def journal_routes(parts: Parts) -> APIRouter:
         "/api/v1/history/journal",
         tags=["estimates"],
         response_model=JournalAnswer,
-        responses={
-            304: {"description": "Nothing has changed since the answer with the ETag in `If-None-Match`."},
-            **errors(503),
-        },
+        responses={**UNCHANGED, **errors(503)},
     )
     def get_journal(
         request: Request,
@@ -49,9 +43,7 @@ def journal_routes(parts: Parts) -> APIRouter:
         cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page, unchanged")] = None,
     ) -> Response:
         """Alerts, tracks, and changes of arrays and of the configuration, newest first."""
-        for parameter, value in (("name", name), ("text", text)):
-            if value is not None and "\0" in value:
-                raise unprocessable(parameter, f"{parameter}: expected a text without NUL")
+        require_no_nul(name=name, text=text)
         page = parts.store.journal(
             JournalQuery(kind, name, instant("since", since), instant("until", until), text, limit, page_cursor(cursor))
         )

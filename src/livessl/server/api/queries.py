@@ -5,18 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
-from typing import Final
+from typing import Annotated, Final
 
 from fastapi import HTTPException, Request
 from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, WithJsonSchema
 
 from livessl.clock import utc_ns
 from livessl.server.fanout import Filter
 from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
 from livessl.site.models import Site
+
+Time = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
+"""A time in a query, for `instant`."""
 
 KINDS: Final = frozenset({"update", "event", "track", "arrays", "alert", "poses", "zone", "zones"})
 """Message kinds that a subscriber can choose from; `hello` and `gap` are always sent."""
@@ -146,6 +149,19 @@ def instant(name: str, text: str | None) -> int | None:
     except (ValueError, OverflowError) as error:
         raise unprocessable(name, f"{name}: {error}") from error
     return max(-(2**63), min(2**63 - 1, time_ns))
+
+
+def require_no_nul(**texts: str | None) -> None:
+    """Check that parameters have no NUL, which PostgreSQL cannot compare.
+
+    Raises
+    ------
+    HTTPException
+        422 if one has.
+    """
+    for name, text in texts.items():
+        if text is not None and "\0" in text:
+            raise unprocessable(name, f"{name}: expected a text without NUL")
 
 
 def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
