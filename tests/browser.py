@@ -6,9 +6,10 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from playwright.sync_api import Browser, Error, Page, Request, sync_playwright
+from playwright.sync_api import Browser, Error, FloatRect, Locator, Page, Request, sync_playwright
 
 from conftest import require
+from small_site import wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -40,6 +41,20 @@ def faultless_page(browser: Browser) -> Iterator[Page]:
         error.add_note(f"errors of the page: {faults}; requests that failed: {failed}")
         raise
     assert faults == []
+
+
+def box_of(locator: Locator) -> FloatRect:
+    """Wait until an element stands still, and return where: a page that draws itself anew has none in between."""
+    boxes: list[FloatRect | None] = [None]
+
+    def stands() -> bool:
+        boxes.append(locator.bounding_box())
+        return boxes[-1] is not None and boxes[-1] == boxes[-2]
+
+    wait_until(stands, "an element that stands still")
+    box = boxes[-1]
+    assert box is not None
+    return box
 
 
 def visit(page: Page, url: str) -> None:

@@ -16,9 +16,11 @@ import pytest
 
 from livessl import wire
 from livessl.capture.link import Link
+from livessl.capture.spool import Spool
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS, Frame, Mark, Message
 from livessl.lab.processes import free_port
+from livessl.site.node_models import SpoolConfig
 from small_site import HANG_S, RATE_HZ, started, wait_until, write_site
 
 ARRAYS = 24
@@ -71,16 +73,18 @@ CLOCK = SystemClock()
 
 
 class Nodes:
-    """Arrays that send the same sounds in real time, in a thread, over one link."""
+    """Arrays that send the same sounds in real time, in a thread, over one link with the usual spool of a node."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, directory: Path) -> None:
         self.sounds = 0
         """Number of sounds that have been sent to their end."""
         self._ending = threading.Event()
         self._rng = np.random.default_rng(3)
         self._sequence = dict.fromkeys((name_of(k) for k in range(ARRAYS)), 0)
         hello = wire.Hello("nodes", "run-1", dict.fromkeys(self._sequence, float(RATE_HZ)))
-        self._link = Link(endpoint, hello, CLOCK)
+        usual = SpoolConfig()
+        spool = Spool(directory, round(usual.max_mb * 1e6), usual.max_age_s)
+        self._link = Link(endpoint, hello, CLOCK, spool=spool)
         self._quiet = threading.Event()
         self._thread = threading.Thread(target=self._play)
 
@@ -187,6 +191,12 @@ def stored(url: str) -> list[dict[str, Any]]:
     return events
 
 
+def lost(url: str) -> list[str]:
+    """Names of the arrays that the server calls lost."""
+    arrays = httpx.get(f"{url}/api/v1/arrays", timeout=HANG_S).json()["arrays"]
+    return [array["name"] for array in arrays if array["state"] == "lost"]
+
+
 def memory_mb(pid: int) -> float:
     """The greatest memory that a process has had, in megabytes: see proc(5)."""
     lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
@@ -196,10 +206,15 @@ def memory_mb(pid: int) -> float:
 @pytest.mark.processes
 def test_an_overloaded_server_says_so_keeps_up_and_stores_every_event(tmp_path: Path) -> None:
     with slow_server(tmp_path) as (url, endpoint, pid):
-        nodes = Nodes(endpoint)
+        nodes = Nodes(endpoint, tmp_path / "spool")
         nodes.begin()
         try:
-            wait_until(lambda: "arrays" in health_of(url)["load"]["shed"], "an overload that sheds arrays")
+
+            def sheds_arrays() -> bool:
+                assert not lost(url), "an array is not lost while its sound waits for the server"
+                return "arrays" in health_of(url)["load"]["shed"]
+
+            wait_until(sheds_arrays, "an overload that sheds arrays")
             health = health_of(url)
             assert health["status"] == "overloaded"
             assert health["reasons"][0] == health["load"]["message"]

@@ -49,10 +49,10 @@ class Desk:
         self.published: list[JsonObject] = []
         self.store = Store() if store is None else store
         site_time = SiteTime(self.clock)
-        overload = Overload(self.clock)
-        self.watch = SetUpWatch(SITE, overload)
+        self.overload = Overload(self.clock)
+        self.watch = SetUpWatch(SITE, self.overload)
         self.states = ArrayStates(
-            SITE, self.clock, self.store, site_time, self.ingest, overload, self.watch, self.published.append
+            SITE, self.clock, self.store, site_time, self.ingest, self.overload, self.watch, self.published.append
         )
         self.fusion = live_run(SITE, Finalized(None, None), for_each).fusion
         self.states.follow(self.fusion)
@@ -66,7 +66,12 @@ class Desk:
         self.pace += 1
         self.clock.time_ns += FRAME_NS
         marks = [mark(0, START + self.pace - 1, array) for array in arrays]
+        self.take()
         self.fusion.step(marks, self.clock.now_ns())
+
+    def take(self, waited_s: float = 0.0) -> None:
+        """The fusion takes what has arrived, of which the first message has waited for so long."""
+        self.overload.note(waited_s, 1, 0, sheds=False)
 
     def report(
         self, array: str, level: ChannelLevel, host: HostState | None = None, drift_error_ppm: float | None = None
@@ -146,10 +151,23 @@ def test_array_whose_node_greets_without_sound_is_quiet_and_not_lost() -> None:
     desk = Desk()
     desk.quiet("north", "south")
     desk.clock.time_ns += 3_000_000_000
+    desk.take()
     assert desk.array("north")["state"] == "lost"
     desk.greet()
     north = desk.array("north")
     assert (north["state"], north["reason"]) == ("quiet", "its node is there, but no sound comes from its device")
+
+
+@pytest.mark.parametrize("waited_s", [0.0, 1.2, 7.0])
+def test_array_whose_messages_wait_for_the_server_is_not_lost(waited_s: float) -> None:
+    desk = Desk()
+    desk.quiet("north", "south")
+    desk.clock.time_ns += round(1e9 * waited_s)
+    desk.take(waited_s)  # of a queue that is not empty: north's next message may be in it
+    desk.clock.time_ns += 3_000_000_000  # a long turn
+    assert (desk.array("north")["state"], desk.array("north")["age_s"]) == ("healthy", 0.0)
+    desk.take()  # all that came is taken, and nothing of north was in it
+    assert desk.array("north")["state"] == "lost"
 
 
 def test_a_clock_that_is_behind_is_named_and_only_then() -> None:

@@ -123,12 +123,16 @@ class ArrayStates:
     def describe(self, *, levels: bool = True) -> list[JsonObject]:
         """Return the state of every array as JSON objects, without waiting for a localization in progress.
 
+        It is that of the time at which the messages arrived that the fusion took last: an array whose messages wait
+        for a busy server is not silent.
+
         Without `levels` the levels of the channels are left out; they cost an FFT for each array.
         """
         if self._fusion is None:
             return []
         nodes = {spec.name: self._node_report(spec.name) for spec in self._site.processed}
-        statuses = self._fusion.status(self._site_time.now_ns(), nodes, levels=levels)
+        heard_ns = self._site_time.now_ns() - self._overload.unheard_ns()
+        statuses = self._fusion.status(heard_ns, nodes, levels=levels)
         return [self._described(status, self._fusion) for status in statuses]
 
     def watch(self) -> None:

@@ -66,6 +66,7 @@ class Overload:
         self._lasted_ns = self._waited_ns = self._messages = 0  # sums over the turns
         self._lock = threading.Lock()  # of the turns and their sums
         self._ended_ns = clock.monotonic_ns()
+        self._taken = self._ended_ns, 0.0  # when the fusion took messages last, and how long the first had waited
         self._since_ns: int | None = None
         self.relief = NOTHING_SHED
         """The work that is shed now."""
@@ -89,6 +90,7 @@ class Overload:
         now_ns = self._clock.monotonic_ns()
         self._add(_Turn(now_ns, now_ns - self._ended_ns, waited_ns, messages, delay_s), 1)
         self._ended_ns = now_ns
+        self._taken = now_ns, delay_s
         while self._turns[0].ended_ns < now_ns - MEMORY_NS:
             self._add(self._turns[0], -1)
         before = self._policy.level
@@ -102,6 +104,14 @@ class Overload:
             relief = replace(relief, update_every=None)
         self.relief = relief
         return relief
+
+    def unheard_ns(self) -> int:
+        """Return how long ago, in nanoseconds, the messages arrived that the fusion took last.
+
+        What has come since is not known yet, so that an array which seems silent for no longer may have sent sound.
+        """
+        taken_ns, delay_s = self._taken
+        return self._clock.monotonic_ns() - taken_ns + round(1e9 * delay_s)
 
     def describe(self) -> JsonObject:
         """Return the figures as the API reports them."""

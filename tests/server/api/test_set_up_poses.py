@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 from test_set_up_view import MS, clap, opened
 
-from browser import faultless_page, running_browser
+from browser import box_of, faultless_page, running_browser
 from known_sounds import events
 from livessl.core.types import FloatArray
 from livessl.server.app import Server
@@ -109,15 +109,13 @@ def test_an_array_is_dragged_and_turned_on_the_plan(browser: Browser, server: Se
         plan.scroll_into_view_if_needed()
         handle = page.get_by_test_id("turn-handle")
         expect(handle).to_be_visible()
-        outline = page.locator(".pose-outline").bounding_box()
-        assert outline is not None
+        outline = box_of(page.locator(".pose-outline"))
         x, y = outline["x"] + outline["width"] / 2, outline["y"] + outline["height"] / 2
         page.mouse.move(x, y)
         page.mouse.down()
         page.mouse.move(x - 40, y + 40, steps=4)
         page.mouse.up()
-        knob = handle.bounding_box()
-        assert knob is not None
+        knob = box_of(handle)
         page.mouse.move(knob["x"] + knob["width"] / 2, knob["y"] + knob["height"] / 2)
         page.mouse.down()
         page.mouse.move(x - 40, y - 20, steps=4)  # straight above the centre: a quarter of a turn

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from browser import faultless_page, running_browser, visit
+from browser import box_of, faultless_page, running_browser, visit
 from known_sounds import events, finish, places_m
 from livessl.core.types import Event
 from livessl.server.app import Server
@@ -82,8 +82,7 @@ def test_a_click_on_the_plan_chooses_the_place(browser: Browser, server: Server)
         opened(page, server)
         plan = page.get_by_test_id("map")
         expect(page.locator("#floor-empty")).to_be_hidden(timeout=MS)
-        box = plan.bounding_box()
-        assert box is not None
+        box = box_of(plan)
         page.wait_for_function("document.getElementById('floor').width > 300")
         plan.click(position={"x": box["width"] / 2, "y": box["height"] / 2})
         room_m = site_of().room.size_m

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from browser import faultless_page, running_browser, visit
+from browser import box_of, faultless_page, running_browser, visit
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from small_site import HANG_S, running_server, site_of, wait_until
@@ -57,8 +57,7 @@ def test_operator_draws_changes_and_deletes_a_zone_and_other_pages_see_it(browse
         opened(other, server)
         opened(page, server)
         page.get_by_label("Name").fill("desk")
-        box = page.get_by_test_id("map").bounding_box()
-        assert box is not None
+        box = box_of(page.get_by_test_id("map"))
         for across, down in ((0.45, 0.45), (0.55, 0.45), (0.55, 0.55), (0.45, 0.55)):
             page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
         corners = page.get_by_label("Corners").input_value().splitlines()
@@ -105,8 +104,7 @@ def test_picture_lies_under_the_plan(browser: Browser, server: Server) -> None:
     """It is red and half transparent, in the middle of the room where nothing else is drawn."""
     with faultless_page(browser) as page:
         visit(page, server.url)
-        box = page.get_by_test_id("map").bounding_box()
-        assert box is not None
+        box = box_of(page.get_by_test_id("map"))
         place = ["floor", box["width"] / 2 + 7, box["height"] / 2 + 7]
 
         def is_red() -> bool:
