@@ -96,21 +96,21 @@ def test_change_that_is_reported_as_refused_is_not_made_later(tmp_path: Path, mo
     site = alert_site(tmp_path, rules={"door": DOOR})
     other = site.alerts.model_copy(update={"rules": {}})
     with running_desk(site) as desk:
-        loop, busy, free, later = desk.alerts._loop, Flag(), Flag(), Flag()
-        assert loop is not None
+        busy, free = Flag(), Flag()
 
-        def work() -> None:
+        def work(_: object) -> None:
             busy.set()
             free.wait(HANG_S)
 
-        loop.call_soon_threadsafe(work)
+        desk.on_alert = work
+        desk.finish(sound(1))
         assert busy.wait(HANG_S)
         monkeypatch.setattr(service, "TAKE_OVER_S", 0.01)
         with pytest.raises(RunError, match="the former rules stay in force; reload again later"):
             desk.alerts.take_over(other)
         free.set()
-        loop.call_soon_threadsafe(loop.call_soon, loop.call_soon, later.set)
-        assert later.wait(HANG_S)
+        desk.finish(sound(2))  # it is judged by the former rules, after the change would have been made
+        wait_until(lambda: len(desk.published) == 2, "the alert of the former rules")
         assert desk.alerts.config == site.alerts
         monkeypatch.setattr(service, "TAKE_OVER_S", HANG_S)
         desk.alerts.take_over(other)

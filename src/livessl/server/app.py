@@ -13,8 +13,10 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
+from livessl.server.alerts.evidence import Evidence
+from livessl.server.alerts.in_force import Surroundings
 from livessl.server.alerts.outbox import OutboxError
-from livessl.server.alerts.service import Alerts
+from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -34,6 +36,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
+from livessl.server.pose_refiner import PoseRefiner
 from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
@@ -148,10 +151,9 @@ def assemble(
         set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        alerts = Alerts(
-            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces,
-            lambda: set_up.site,
-        )  # fmt: skip
+        evidence = Evidence(lambda: set_up.site, zones, clips)
+        around = Surroundings(clock, store, zones, url, evidence, traces)
+        alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
         undo.callback(alerts.stop)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
@@ -169,7 +171,8 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
-        proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
+        proposals = Proposals(set_up, set_up_watch.heard, clock)
+        refiner = PoseRefiner(proposals, set_up, set_up_watch.heard, overload)
         for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
@@ -193,6 +196,7 @@ def assemble(
         overload=overload,
         set_up=set_up,
         proposals=proposals,
+        refiner=refiner,
         set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
@@ -302,7 +306,7 @@ class Server:
             # what computes at leisure comes last: what has to be on the disk does not wait for it
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
-            self.parts.proposals.stop()
+            self.parts.refiner.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 
@@ -322,7 +326,7 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
-        self.parts.proposals.start()
+        self.parts.refiner.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()

@@ -71,6 +71,8 @@ class AlertsInForce:
     def __init__(self, site: Site, outbox: Outbox, around: Surroundings) -> None:
         self.config: AlertsConfig = site.alerts
         """Rules and actions as the site file has them."""
+        self.outbox = outbox
+        """Alerts, deliveries and the rules' states."""
         kinds = {rule.kind for rule in self.config.rules.values()}
         self.judges_events = "events" in kinds
         self.judges_early = any(rule.events and rule.events.early for rule in self.config.rules.values())
