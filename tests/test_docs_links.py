@@ -11,6 +11,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS_WITHOUT_DOCUMENTS = {".git", ".venv", "node_modules", "build", "dist"}
 LINK = re.compile(r"\]\(\s*<?([^()\s<>]+)>?(?:\s+\"[^\"]*\")?\s*\)")
+SOURCES = (ROOT, ROOT / "src", ROOT / "src" / "livessl")
+TABLE_ROW = re.compile(r"^\|.*\|$", re.MULTILINE)
+FILE_NAME = re.compile(r"`([\w./-]*(?:/|\.(?:py|js|sh|toml|yml|md)))`")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
 
@@ -67,3 +70,11 @@ def test_a_link_to_a_missing_file_or_heading_is_found(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert broken_links(page) == ["gone.md", "other.md#gone", "#gone"]
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_files_that_tables_name_exist(name: str) -> None:
+    rows = TABLE_ROW.findall((ROOT / name).read_text(encoding="utf-8"))
+    names = [found for row in rows for found in FILE_NAME.findall(row)]
+    assert len(names) > 20
+    assert [found for found in names if not any((source / found).exists() for source in SOURCES)] == []
