@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """How well the poses in force agree with the sounds so far.
+    """Agreement of the poses in force with the sounds so far.
 
     Parameters
     ----------

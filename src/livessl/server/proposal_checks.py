@@ -20,7 +20,7 @@ AGREES_M: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class ClapFit:
-    """How well a sound at a measured place fits the poses before and after.
+    """Distances by which a sound at a measured place misses it, with the poses before and after.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What differs between two readings of a site file, by key, and which of it a running server can take over."""
+"""Differences between two readings of a site file, by key, and those that a running server can take over."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class EventOrder:
         self.backlog = Backlog(site, store)
         """Takes the events from the fusion thread."""
         self.lacks_store = False
-        """Whether past events wait because the store cannot be read."""
+        """True while past events wait because the store cannot be read."""
 
     def look_back(self) -> None:
         """Judge the past again before the next events, because rules about events came into force."""

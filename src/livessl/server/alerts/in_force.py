@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What rules and actions need beside the site file.
+    """Parts of the server that rules and actions need beside the site file.
 
     Parameters
     ----------

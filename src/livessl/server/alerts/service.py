@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What the rules about arrays and findings look at, and when.
+    """Sources of the rules about arrays and findings.
 
     Parameters
     ----------

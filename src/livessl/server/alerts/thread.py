@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class TurnTooLongError(Exception):
-    """A turn of the thread took longer than somebody wanted to wait; the work will not be done."""
+    """A turn of the thread took longer than the caller may wait; the work will not be done."""
 
 
 class _Claim:
@@ -66,7 +66,7 @@ class AlertThread:
 
     @property
     def is_started(self) -> bool:
-        """Whether the thread was started, even if it has ended since."""
+        """True if the thread was started, even if it has ended since."""
         return self._loop is not None
 
     def start(self) -> None:

@@ -41,7 +41,7 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/set-up", response_model=set_up_schema.SetUp)
     def get_set_up() -> Response:
-        """Where the arrays are, the calibration file, and what the sounds so far say of the poses."""
+        """Poses of the arrays, the calibration file, and whether the sounds so far agree with the poses."""
         return as_json(
             {
                 "v": API_VERSION,

@@ -1,4 +1,4 @@
-"""What sounds say of a site's set-up: faults, with the inputs of the site's devices, and the poses of the arrays."""
+"""Examines a site's set-up by sounds: faults, with the inputs of the site's devices, and the poses of the arrays."""
 
 from __future__ import annotations
 
