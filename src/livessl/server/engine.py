@@ -99,7 +99,7 @@ class Engine:
         self._stop = threading.Event()
         self._prepare: Callable[[], None] | None = None
         self.has_turned = False
-        """True once the thread has taken its first turn; the kernels are loaded by then."""
+        """Whether the thread has taken its first turn: what computes is loaded by then."""
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
