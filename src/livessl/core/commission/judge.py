@@ -1,6 +1,7 @@
 """Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has.
 
-All set-ups are fitted together. Only those that explain the sounds about as well as the best one are fitted to the end.
+All set-ups are fitted together. The few that explain the sounds about as well as the best one are what matters; the
+others are not fitted to the end.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Judge:
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
-        Positions as filed, metres.
+        As filed, metres.
     delays : mapping of array to (S, K) float64
         Seconds.
     search : PlaceSearch
@@ -70,19 +71,19 @@ class Judge:
         return self._misfit_s(self._as_filed.set_up)
 
     def may_gain(self, least: float) -> bool:
-        """Return whether a set-up close to the filed one may gain a deviance of `least`."""
+        """Return whether a set-up that is nearly as filed may explain the sounds better by so much."""
         freer = self._hypotheses.freer(self._filed.places_m)
         return any(self.filed - found.deviance >= least for found in self._fitted(freer))
 
     def judged(self) -> list[Alternative]:
-        """Return the alternatives, the best first, each with its criterion and the size that fits the sounds best."""
+        """Return the alternatives, the best first, each with its criterion and its size as the sounds say best."""
         tried = [*self._hypotheses.near(self._filed.places_m), *self._hypotheses.far()]
         found = zip(tried, self._fitted(tried), strict=True)
         judged = (_adjusted(one.alternative, fit) for one, fit in found if one.alternative is not None)
         return sorted(judged, key=lambda one: one.criterion)
 
     def with_misfit(self, alternative: Alternative) -> Alternative:
-        """Return an alternative with the misfit of the sounds in a set-up that is as filed but for this alternative."""
+        """Return an alternative with the misfit of the sounds in it, which is exactly as filed otherwise."""
         return replace(alternative, misfit_s=self._misfit_s(_applied(self._as_filed.set_up, alternative)))
 
     def _misfit_s(self, set_up: SetUp) -> float:
@@ -133,7 +134,7 @@ def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
 
 
 def _adjusted(alternative: Alternative, found: Explained) -> Alternative:
-    """Return an alternative with its criterion, and with the fitted values of what it leaves free."""
+    """Return an alternative with its criterion, and with the change that was found for what it leaves free."""
     others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
     judged = replace(alternative, criterion=found.deviance + COSTS.get(alternative.fault, others))
     name = alternative.array
