@@ -13,7 +13,7 @@ from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from livessl.clock import utc_text
 from livessl.schema import alerts as alert_schema
 from livessl.schema.answers import errors
-from livessl.server.alerts.history import DryRunBusyError
+from livessl.server.alerts.history import DryRun, DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 def alert_routes(parts: Parts) -> APIRouter:
-    """Rules and alerts."""
+    """Alerts with their pictures, and the rules."""
     alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
     drawing = threading.Lock()  # one picture at a time, for the memory and the processor
 
@@ -85,7 +85,15 @@ def alert_routes(parts: Parts) -> APIRouter:
             raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
         return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
 
-    @router.get("/rules", response_model=alert_schema.Rules)
+    router.include_router(_rule_routes(parts))
+    return router
+
+
+def _rule_routes(parts: Parts) -> APIRouter:
+    """Rules: their states, their switches, and the dry run."""
+    alerts, router = parts.alerts, APIRouter(prefix="/rules")
+
+    @router.get("", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
         config, states, now_ns = alerts.config, alerts.states, parts.clock.now_ns()
@@ -93,7 +101,7 @@ def alert_routes(parts: Parts) -> APIRouter:
         return as_json({"v": API_VERSION, "rules": found})
 
     @router.put(
-        "/rules/{name}/armed",
+        "/{name}/armed",
         response_model=alert_schema.Armed,
         responses=errors(400, 404, 411, 413, 503, texts={404: _NO_RULE, 503: _OUTBOX}),
     )
@@ -108,7 +116,7 @@ def alert_routes(parts: Parts) -> APIRouter:
         return as_json({"v": API_VERSION, "name": name, "armed": switch.armed})
 
     @router.get(
-        "/rules/{name}/dry-run",
+        "/{name}/dry-run",
         response_model=alert_schema.Tried,
         responses=errors(404, 503, texts={404: _NOT_ON_EVENTS, 503: "Another dry run is under way."}),
     )
@@ -126,22 +134,7 @@ def alert_routes(parts: Parts) -> APIRouter:
         except DryRunBusyError as error:
             headers = {"Retry-After": str(DRY_RUN_RETRY_S)}
             raise HTTPException(503, "another dry run is under way; try again when it has ended", headers) from error
-        times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
-        span = "day" if days == 1 else f"{days:g} days"
-        found = {
-            "v": API_VERSION,
-            "name": name,
-            "since_utc": utc_text(since_ns),
-            "until_utc": utc_text(now_ns),
-            "events": tried.events,
-            "matched": tried.matched,
-            "alerts": tried.alerts,
-            "suppressed": _suppressed(tried.suppressed),
-            "latest": [{"event_id": event["id"], "time_utc": event["time_utc"]} for event in tried.latest],
-            "complete": tried.complete,
-            "text": f"rule {name!r} would have alerted {times} in the last {span}",
-        }
-        return as_json(found)
+        return as_json({"v": API_VERSION, "name": name, **_tried(name, tried, days, since_ns, now_ns)})
 
     return router
 
@@ -250,6 +243,22 @@ def _rule(config: AlertsConfig, name: str, state: RuleState, now_ns: int) -> Jso
         "last_utc": None if state.last_ns is None else utc_text(state.last_ns),
         "suppressed": _suppressed(state.suppressed),
         "ongoing": list(state.ongoing),
+    }
+
+
+def _tried(name: str, tried: DryRun, days: float, since_ns: int, until_ns: int) -> JsonObject:
+    times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
+    span = "day" if days == 1 else f"{days:g} days"
+    return {
+        "since_utc": utc_text(since_ns),
+        "until_utc": utc_text(until_ns),
+        "events": tried.events,
+        "matched": tried.matched,
+        "alerts": tried.alerts,
+        "suppressed": _suppressed(tried.suppressed),
+        "latest": [{"event_id": event["id"], "time_utc": event["time_utc"]} for event in tried.latest],
+        "complete": tried.complete,
+        "text": f"rule {name!r} would have alerted {times} in the last {span}",
     }
 
 
