@@ -21,7 +21,8 @@ EARLIEST_NS: Final = -30_000_000_000
 """Limit, in nanoseconds, of a frame's time minus the server's: below it, 30 s in the past, a frame is backlog."""
 
 LATEST_NS: Final = 500_000_000
-"""Limit, in nanoseconds, of a frame's time minus the server's: above it a frame is rejected. Clocks set by NTP differ by less."""
+"""Limit, in nanoseconds, of a frame's time minus the server's: above it a frame is rejected. Clocks set by NTP
+differ by less."""
 
 JUMP_FRAMES: Final = 1200
 """Gap, in frames, beyond which the frame indices in between are skipped and not closed one by one: a minute."""

@@ -140,8 +140,8 @@ def nearest(silent: Sequence[ArraySpec], detecting: Sequence[ArraySpec]) -> list
 def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: int) -> BackfilledSound | None:
     """Correlate the requested frames of an event that began at frame index `start`.
 
-    Only the unbroken run of frames at the end is used. Return None if all of it is older than the event, if their sampling rates
-    differ, or if the estimator does not correlate frames.
+    Only the unbroken run of frames at the end is used. Return None if all of it is older than the event, if
+    sampling rates differ, or if the estimator does not correlate frames.
     """
     indices = list(takewhile(lambda frame_index: frame_index in requested.frames, reversed(requested.span)))[::-1]
     frames = [requested.frames[frame_index] for frame_index in indices]
