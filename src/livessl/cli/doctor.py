@@ -83,7 +83,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
 def recordings_given(
     arguments: argparse.Namespace, command: str, otherwise: str = ""
 ) -> tuple[Site, list[AssignedRecording], tuple[int, int | None]]:
-    """Return the site, the recordings given by --session, or --site and --wav, and the time they span in nanoseconds."""
+    """Return the site, the recordings given by --session, or --site and --wav, and the time that they span in ns."""
     from livessl.recordings.assign import assign_files, assign_sessions, span_ns
     from livessl.recordings.session import read_session
     from livessl.site.load import load_site
