@@ -38,7 +38,7 @@ HOLD_NS: Final = 3_000_000_000
 twice as long the next time."""
 
 RELAPSE_NS: Final = 15_000_000_000
-"""Time, in nanoseconds, within which a level was needed again if more is shed."""
+"""Time, in nanoseconds: if more has to be shed again within it, less was shed too soon."""
 
 LONGEST_HOLD_NS: Final = 40_000_000_000
 """Longest hold, in nanoseconds."""
