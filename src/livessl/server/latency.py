@@ -51,7 +51,7 @@ class Arrivals:
         self._last[frame_index] = arrival
 
     def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
-        """Return where the time went of an answer that was there at site time `located_ns`.
+        """Return how long each stage took of an answer that was there at site time `located_ns`.
 
         None if no arrival is known of the last frame index that the answer needs.
         """
