@@ -23,7 +23,7 @@ PlaceM = Annotated[
 
 
 def _whole(value: object) -> object:
-    """Refuse what is a number in Python, but none in JSON."""
+    """Refuse values that are numbers in Python but not in JSON."""
     if isinstance(value, bool | str | bytes):
         raise ValueError("expected a whole number")
     return value
@@ -200,7 +200,7 @@ class ProposedPose(BaseModel):
 
 
 class MeasuredSpeed(BaseModel):
-    """The speed of sound that sounds say."""
+    """The speed of sound, measured by the sounds."""
 
     speed_of_sound_m_s: float = Field(gt=0, description="Metres a second.", examples=[344.2])
     std_m_s: float = Field(ge=0, description="Its standard deviation, in metres a second.", examples=[0.6])
