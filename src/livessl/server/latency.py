@@ -1,7 +1,7 @@
 """Latency from the sound to a client's socket, by stages, in histograms.
 
-It counts from the moment at which an answer could be known at the earliest: the end of the window, or, for an event, the
-end of the quiet that ends it. What lies before is not a delay of this system.
+It counts from the earliest moment at which an answer can be known: the end of the window, or, for an event, the end of
+the quiet that ends it. What lies before is not a delay of this system.
 """
 
 from __future__ import annotations
