@@ -100,7 +100,7 @@ class Alerts:
         )  # fmt: skip
         self._expired_ns = 0
         self._is_failing = False
-        self._starting = threading.Lock()
+        self._starting = threading.RLock()
         self._changing = threading.Lock()  # a rule is armed either before or after it is replaced
         self._thread = AlertThread(self._turn, lambda: self.couriers.values())
 
@@ -110,6 +110,11 @@ class Alerts:
     def unqueued(self) -> int:
         """Events and changes that did not fit into their queues; final events are judged from the store instead."""
         return self._events.backlog.unqueued
+
+    @property
+    def waiting(self) -> int:
+        """Batches of events that wait to be judged."""
+        return len(self._events.backlog)
 
     def take_early(self, event: JsonObject, time_ns: int) -> None:
         """Take in an event that may still be replaced, and its start in site time."""
@@ -166,8 +171,7 @@ class Alerts:
         """Sentences for the reasons of `health`."""
         found = []
         if self._is_failing:
-            waiting = len(self._events.backlog)
-            found.append(f"alerts.outbox: cannot be used, so that alerts wait: {waiting} batches of events")
+            found.append(f"alerts.outbox: cannot be used, so that alerts wait: {self.waiting} batches of events")
         if self._events.lacks_store:
             found.append("alerts.rules: past events are not judged until server.events_db can be read; new ones are")
         for (action, state), count in self.counts().items():
@@ -235,7 +239,7 @@ class Alerts:
         with self._starting:
             if not self._thread.is_started:
                 self._replace(site)
-                self._start()
+                self.start()
                 return
         try:
             self._thread.exchange(partial(self._replace, site), TAKE_OVER_S)
@@ -264,11 +268,8 @@ class Alerts:
     def start(self) -> None:
         """Begin to judge and to deliver, unless it has begun; a site that never had rules needs no thread."""
         with self._starting:
-            self._start()
-
-    def _start(self) -> None:
-        if not self._thread.is_started and (self.config.rules or self.outbox.path is not None):
-            self._thread.start()
+            if not self._thread.is_started and (self.config.rules or self.outbox.path is not None):
+                self._thread.start()
 
     def stop(self) -> None:
         """Stop, and close the outbox; what waits is delivered after the next start."""
