@@ -85,15 +85,15 @@ def alert_routes(parts: Parts) -> APIRouter:
             raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
         return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
 
-    router.include_router(_rule_routes(parts))
+    _add_rule_routes(router, parts)
     return router
 
 
-def _rule_routes(parts: Parts) -> APIRouter:
-    """Rules: their states, their switches, and the dry run."""
-    alerts, router = parts.alerts, APIRouter(prefix="/rules")
+def _add_rule_routes(router: APIRouter, parts: Parts) -> None:
+    """Add the routes of rules: their states, their switches, and the dry run."""
+    alerts = parts.alerts
 
-    @router.get("", response_model=alert_schema.Rules)
+    @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
         config, states, now_ns = alerts.config, alerts.states, parts.clock.now_ns()
@@ -101,7 +101,7 @@ def _rule_routes(parts: Parts) -> APIRouter:
         return as_json({"v": API_VERSION, "rules": found})
 
     @router.put(
-        "/{name}/armed",
+        "/rules/{name}/armed",
         response_model=alert_schema.Armed,
         responses=errors(400, 404, 411, 413, 503, texts={404: _NO_RULE, 503: _OUTBOX}),
     )
@@ -116,7 +116,7 @@ def _rule_routes(parts: Parts) -> APIRouter:
         return as_json({"v": API_VERSION, "name": name, "armed": switch.armed})
 
     @router.get(
-        "/{name}/dry-run",
+        "/rules/{name}/dry-run",
         response_model=alert_schema.Tried,
         responses=errors(404, 503, texts={404: _NOT_ON_EVENTS, 503: "Another dry run is under way."}),
     )
@@ -135,8 +135,6 @@ def _rule_routes(parts: Parts) -> APIRouter:
             headers = {"Retry-After": str(DRY_RUN_RETRY_S)}
             raise HTTPException(503, "another dry run is under way; try again when it has ended", headers) from error
         return as_json({"v": API_VERSION, "name": name, **_tried(name, tried, days, since_ns, now_ns)})
-
-    return router
 
 
 def dead_letter_routes(parts: Parts) -> APIRouter:
