@@ -117,6 +117,9 @@ def test_the_more_certain_of_two_places_is_told_if_there_is_time(
     for spec in arrays:
         samples = heard(spec, here_m, burst(4000)) + rng.normal(0.0, 0.01, (4, 4000)).astype(np.float32)
         sounds[spec.name] = Sound((samples,), RATE_HZ, second_looks=second_looks)
-    found_m = estimator.locate(sounds).position_m
-    assert np.linalg.norm(found_m - (there_m if height > 1.0 and second_looks else here_m)) < 0.1
+    found = estimator.locate(sounds)
+    assert found.features is not None
+    assert found.features.whole is second_looks  # onsets alone are not sure
+    off_m = np.linalg.norm(found.position_m - (there_m if height > 1.0 and second_looks else here_m))
+    assert off_m < (0.1 if second_looks else 0.2)  # onset windows cut the burst at its edges
     assert bool(averaged) is second_looks
