@@ -104,7 +104,7 @@ class Messages:
             "late": event.late,
             "replaces": list(replaces),
             "source": event.source,
-            "candidates": _candidates(event.estimate),
+            "candidates": candidates(event.estimate),
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
@@ -122,7 +122,7 @@ class Messages:
             "status": str(update.status),
             "contributions": [_contribution(c) for c in update.contributions],
             "others": [self._other(other) for other in update.others],
-            "candidates": _candidates(update.estimate),
+            "candidates": candidates(update.estimate),
             "zones": self._zones().holding(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
@@ -169,9 +169,10 @@ def where(
     return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
 
 
-def _candidates(estimate: Estimate | None) -> list[JsonObject]:
-    candidates = () if estimate is None else estimate.candidates
-    return [{"position_m": _metres(each.position_m), "probability": round(each.probability, 4)} for each in candidates]
+def candidates(estimate: Estimate | None) -> list[JsonObject]:
+    """Places that explain a sound about equally well, as they are published."""
+    found = () if estimate is None else estimate.candidates
+    return [{"position_m": _metres(each.position_m), "probability": round(each.probability, 4)} for each in found]
 
 
 def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -67,6 +67,19 @@ def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
         "duration_s": round(event.duration_s, 6),
         "position_m": None if estimate is None else [round(float(x), 4) for x in estimate.position_m],
         "files": files,
+        "c_m_s": recipe.c_m_s,
+        "arrays": {cut.spec.name: _set_up_and_frames(cut) for cut in recipe.cuts},
+    }
+
+
+def _set_up_and_frames(cut: Cut) -> dict[str, Any]:
+    """Return what locating the event again needs besides the samples: where the microphones are, and the frames."""
+    return {
+        "time_ns": cut.time_ns,
+        "sample_rate_hz": cut.sample_rate_hz,
+        "microphones_m": cut.spec.microphones_m.tolist(),
+        "uncertainty": asdict(cut.spec.uncertainty),
+        "frames": [list(astuple(frame)) for frame in cut.frames],
     }
 
 
