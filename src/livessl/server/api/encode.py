@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+import numpy as np
 import orjson
 
 from livessl.clock import utc_text
@@ -167,6 +168,29 @@ def where(
         return None, None, 0.0, []
     covariance = [_square_metres(row) for row in estimate.covariance_m2]
     return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
+
+
+def answer(event: Event) -> JsonObject:
+    """Where an event was, by which method, and how sure: the `LocationAnswer` of `livessl.schema.relocation`."""
+    position, covariance, confidence, arrays = where(event.estimate)
+    return {
+        "method": event.method,
+        "status": str(event.status),
+        "reason": event.reason,
+        "position_m": position,
+        "covariance_m2": covariance,
+        "std_m": std_m(covariance),
+        "confidence": confidence,
+        "arrays": arrays,
+        "candidates": candidates(event.estimate),
+    }
+
+
+def std_m(covariance_m2: list[list[float]] | None) -> float | None:
+    """Standard deviation, in metres, along the axis of largest uncertainty; None without a covariance."""
+    if covariance_m2 is None:
+        return None
+    return round(float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1]))), 4)
 
 
 def candidates(estimate: Estimate | None) -> list[JsonObject]:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-import numpy as np
 from fastapi import APIRouter, HTTPException, Request, Response
 
-from livessl.core.types import Event
 from livessl.schema import relocation
 from livessl.schema.answers import errors
-from livessl.server.api.encode import API_VERSION, JsonObject, candidates, where
+from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
 from livessl.server.clips.relocate import (
@@ -76,8 +74,8 @@ def relocate_route(parts: Parts) -> APIRouter:
                 "set_up": wanted.set_up,
                 "moved_arrays": list(found.moved),
                 "stored": _stored(stored),
-                "again": _answer(found.event),
-                "other_sources": [_answer(other) for other in found.others],
+                "again": answer(found.event),
+                "other_sources": [answer(other) for other in found.others],
                 "distance_m": distance_m(stored["position_m"], found.event),
                 "took_s": round(took_s, 3),
             }
@@ -92,29 +90,8 @@ def _why_none(parts: Parts) -> str:
     return "the site file has no server.clips; name a folder there, and later events can be located again"
 
 
-def _answer(event: Event) -> JsonObject:
-    position, covariance, confidence, arrays = where(event.estimate)
-    return {
-        "method": event.method,
-        "status": str(event.status),
-        "reason": event.reason,
-        "position_m": position,
-        "covariance_m2": covariance,
-        "std_m": _std_m(covariance),
-        "confidence": confidence,
-        "arrays": arrays,
-        "candidates": candidates(event.estimate),
-    }
-
-
 def _stored(event: JsonObject) -> JsonObject:
     """Return the answer in the history; an earlier release may have stored it without candidates."""
     names = ("method", "status", "reason", "position_m", "covariance_m2", "confidence", "arrays")
     known = {name: event[name] for name in names}
-    return {**known, "std_m": _std_m(event["covariance_m2"]), "candidates": event.get("candidates", [])}
-
-
-def _std_m(covariance_m2: list[list[float]] | None) -> float | None:
-    if covariance_m2 is None:
-        return None
-    return round(float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1]))), 4)
+    return {**known, "std_m": std_m(event["covariance_m2"]), "candidates": event.get("candidates", [])}

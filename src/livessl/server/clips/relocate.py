@@ -29,7 +29,7 @@ from livessl.core.types import (
     Uncertainty,
 )
 from livessl.errors import RunError
-from livessl.server.clips.folder import About, ClipFolder
+from livessl.server.clips.folder import About, ClipReader
 from livessl.server.overload import Overload
 from livessl.site.models import Site
 
@@ -90,14 +90,14 @@ def is_relocatable(about: Mapping[str, Any]) -> bool:
     return bool(about.get("arrays"))
 
 
-def relocate(site: Site, folder: ClipFolder, event_id: str, method: str, set_up: SetUp) -> Relocation:
+def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp) -> Relocation:
     """Locate an event again from its clip.
 
     Parameters
     ----------
     site : Site
         With the poses that are in force now.
-    folder : ClipFolder
+    folder : ClipReader
     event_id : str
     method : str
         One of `known_methods`.
@@ -210,7 +210,7 @@ def _is_moved(then: ArraySpec, now: ArraySpec) -> bool:
     return float(np.abs(then.microphones_m - now.microphones_m).max()) > SAME_M
 
 
-def _frames(folder: ClipFolder, event_id: str, about: About) -> list[Frame]:
+def _frames(folder: ClipReader, event_id: str, about: About) -> list[Frame]:
     """Return all frames of a clip.
 
     Raises
@@ -251,7 +251,7 @@ class Relocator:
 
     Parameters
     ----------
-    folder : ClipFolder
+    folder : ClipReader
     clock : Clock
     site : callable
         Returns the site with the poses that are in force.
@@ -259,7 +259,7 @@ class Relocator:
         Nothing is located again while the server is overloaded.
     """
 
-    def __init__(self, folder: ClipFolder, clock: Clock, site: Callable[[], Site], overload: Overload) -> None:
+    def __init__(self, folder: ClipReader, clock: Clock, site: Callable[[], Site], overload: Overload) -> None:
         self._folder = folder
         self._clock = clock
         self._site = site
