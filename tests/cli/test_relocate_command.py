@@ -9,14 +9,14 @@ import pytest
 
 from cli.command_runs import Run
 from small_site import write_site
-from stored_clips import CLIPS, Offsets, clipped, events, messages
+from stored_clips import CLIPS, clipped, events, messages
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site file beside the clips of its two events."""
     directory = tmp_path_factory.mktemp("site")
-    clipped(directory, messages(), Offsets({}, 0.0))
+    clipped(directory, messages())
     return write_site(directory, {"server.clips": CLIPS})
 
 
@@ -67,7 +67,7 @@ def test_second_run_goes_on_where_the_first_was_killed(run: Run, site: Path, tmp
 
 
 def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:
-    clipped(tmp_path, messages(), Offsets({}, 0.0))
+    clipped(tmp_path, messages())
     first = events()[0].id
     (tmp_path / "clips" / first / "array-north.flac").unlink()
     (tmp_path / "clips" / ".partial-x").mkdir()

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import orjson
 import pytest
 
-from livessl.core.types import Event, FloatArray, Frame
+from livessl.core.types import Event, FloatArray, Frame, Status
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
 from livessl.server.clips.relocate import NoClipError, RelocationError, relocate
 from livessl.server.clips.service import Clips
-from livessl.site.build.fusion import make_fusion
+from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
-from small_site import scene, site_of
-from stored_clips import Offsets, clipped, events, messages
+from small_site import RATE_HZ, hiss, scene, site_of
+from stored_clips import START_NS, Offsets, clipped, events, located, messages, sent
 
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Clips:
-    return clipped(tmp_path_factory.mktemp("site"), messages(), Offsets({}, 0.0))
+    return clipped(tmp_path_factory.mktemp("site"), messages())
 
 
 def place_m(event: Event) -> FloatArray:
@@ -83,23 +84,46 @@ def test_poses_of_then_and_of_now(clips: Clips, shift_m: float) -> None:
         now = relocate(moved(shift_m), clips.folder, event.id, "onset", "now")
         assert then.moved == now.moved == ("south",)
         np.testing.assert_allclose(place_m(then.event), place_m(event), atol=1e-3)
-        [fresh] = [other for other in events_of_site(shift_m) if other.id == event.id]
+        [fresh] = [other for other in located(moved(shift_m), messages()) if other.id == event.id]
         assert now.event.status is fresh.status
         np.testing.assert_allclose(place_m(now.event), place_m(fresh), atol=1e-3)
         assert float(np.linalg.norm(place_m(now.event) - place_m(event))) > 0.05
 
 
-@cache
-def events_of_site(shift_m: float) -> list[Event]:
-    """The events of the scene, as they are located if the server takes the south array to be elsewhere."""
-    fusion = make_fusion(moved(shift_m), updates=False)
-    last = messages()[-1].frame_index
-    outputs = [*fusion.step(messages(), last * 50_000_000, complete_until=last), *fusion.flush(last * 50_000_000)]
-    return [output for output in outputs if isinstance(output, Event)]
+def test_part_of_a_longer_sound_is_located_by_itself(tmp_path: Path) -> None:
+    """A clip begins before its event, and there with a part that was an event before."""
+    site = site_of({"fusion.max_event_s": 0.5})
+    long = make_scene(
+        site.room.size_m,
+        rt60_s=0.0,
+        sounds=[("long", hiss(1.3, 1)[0])],
+        count=1,
+        sample_rate_hz=RATE_HZ,
+        c_m_s=site.c_m_s,
+        keep_away_m=[spec.centre_m for spec in site.specs],
+        seed=2,
+        lead_s=0.7,
+    )
+    samples = {spec.name: render(long, spec.microphones_m, seed=3) for spec in site.specs}
+    taken = sent(
+        [
+            AssignedRecording(name, MemoryRecording(name, float(RATE_HZ), heard), START_NS, (1, 2, 3, 4))
+            for name, heard in samples.items()
+        ]
+    )
+    parts = located(site, taken)
+    assert [event.status for event in parts] == [Status.LOCATED] * 3
+    clips = clipped(tmp_path, taken, found=parts)
+    for part in parts:
+        again = relocate(site, clips.folder, part.id, "onset", "then").event
+        assert (again.start_ns, again.end_ns, again.heard_by) == (part.start_ns, part.end_ns, part.heard_by)
+        np.testing.assert_allclose(place_m(again), place_m(part), atol=0.02)
+        other = relocate(site, clips.folder, part.id, "srp-phat", "then").event
+        assert (other.id, other.start_ns, other.end_ns) == (again.id, part.start_ns, part.end_ns)
 
 
 def test_clip_that_does_not_fit_says_why(tmp_path: Path) -> None:
-    clips = clipped(tmp_path, messages(), Offsets({}, 0.0))
+    clips = clipped(tmp_path, messages())
     first, second = (event.id for event in events())
     folder, site = clips.folder, site_of()
     with pytest.raises(NoClipError, match="event 'none' has no recordings; it cannot be located again without"):

@@ -7,6 +7,7 @@ from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
+from livessl.errors import ConfigError
 from livessl.schema import relocation
 from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
@@ -45,7 +46,7 @@ def relocate_route(parts: Parts) -> APIRouter:
     def post_relocate(event_id: str, wanted: relocation.RelocateRequest, request: Request) -> Response:
         """Locate an event again from its recordings, and return both answers; stores nothing. For operators.
 
-        A thread of low priority does it, one event at a time, and never delays live sound.
+        A thread of low priority does it, one event at a time, and none while live sound needs the whole machine.
         """
         stored = parts.store.get(event_id)
         if stored is None:
@@ -66,6 +67,8 @@ def relocate_route(parts: Parts) -> APIRouter:
             raise HTTPException(503, str(error)) from error
         except RelocationError as error:
             raise HTTPException(409, str(error)) from error
+        except ConfigError as error:  # a method of the site's own that cannot be imported any more
+            raise HTTPException(409, "; ".join(map(str, error.faults))) from error
         _log.info("%r has located %r again by %r", request.scope["client_name"], event_id, method)
         return as_json(
             {

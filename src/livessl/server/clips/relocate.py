@@ -124,27 +124,39 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     if set_up == "then":
         processed = tuple(specs.get(spec.name, spec) for spec in site.processed)
         site = site.model_copy(update={"processed": processed, "c_m_s": float(about["c_m_s"])})
-    start_ns = int(about["start_ns"])
-    end_ns = start_ns + round(1e9 * about["duration_s"])
-    found = [
-        event
-        for event in events_of(site, _frames(folder, event_id, about), method)
-        if event.start_ns < end_ns and event.end_ns > start_ns
-    ]
-    if not found:
+    sources = _sources(site, _frames(folder, event_id, about), method, about)
+    if not sources:
         raise RelocationError(
             f"the recordings of {event_id!r} have no active frame of it: frames are missing; see its gaps_s"
         )
-    longest = max(found, key=lambda event: min(event.end_ns, end_ns) - max(event.start_ns, start_ns)).start_ns
-    sources = [event for event in found if event.start_ns == longest]
     wanted = next((event for event in sources if event.id == event_id), sources[0])
     return Relocation(wanted, tuple(event for event in sources if event is not wanted), moved)
 
 
-def events_of(site: Site, frames: Sequence[Frame], method: str) -> list[Event]:
+def _sources(site: Site, frames: Sequence[Frame], method: str, about: About) -> list[Event]:
+    """Return the events, one for each source, of the sound of a clip; none if it has no active frame of it."""
+    event_id, start_ns = str(about["event_id"]), int(about["start_ns"])
+    sources = [
+        event
+        for event in events_of(site, frames, method)
+        if event_id == event.id or event_id.startswith(f"{event.id}-") or event.id.startswith(f"{event_id}-")
+    ]
+    if sources:
+        return sources
+    # a part of a longer sound, which was split: what the clip has of the part before is no event of its own
+    start = round(start_ns / FRAME_NS)
+    quiet = [replace(frame, active=frame.active and frame.frame_index >= start) for frame in frames]
+    found = events_of(site, quiet, method, reported_until=start)
+    end_ns = start_ns + round(1e9 * about["duration_s"])
+    overlaps = {event.start_ns: min(event.end_ns, end_ns) - max(event.start_ns, start_ns) for event in found}
+    longest = max(overlaps, key=lambda at_ns: overlaps[at_ns], default=None)
+    return [event for event in found if event.start_ns == longest and overlaps[event.start_ns] > 0]
+
+
+def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: int | None = None) -> list[Event]:
     """Locate the events in frames of a site's arrays, on joint frame indices, by the fusion that locates live sound.
 
-    Requested frames are given only if the fusion requests them.
+    Requested frames are given only if the fusion requests them. Frames before `reported_until` are in no pre-roll.
 
     Raises
     ------
@@ -154,6 +166,8 @@ def events_of(site: Site, frames: Sequence[Frame], method: str) -> list[Event]:
     from livessl.site.build.fusion import make_fusion  # what computes is loaded when it is needed first
 
     fusion = make_fusion(site, method, updates=False, corrects_clocks=False)
+    if reported_until is not None:
+        fusion.begin(reported_until)
     sent = sorted((frame for frame in frames if not frame.requested), key=lambda frame: frame.frame_index)
     kept: dict[str, list[Frame]] = {}
     for frame in frames:
