@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_json, add_method, add_site, import_from_here, read_site
+from livessl.cli.options import add_joint, add_json, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import complain, xyz
 from livessl.errors import UseError
 
@@ -28,6 +28,7 @@ def add_arguments(parser: Any) -> None:
     add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
     add_site(parser)
     add_method(parser)
+    add_joint(parser)
     add(
         "--set-up",
         choices=("then", "now"),
