@@ -68,9 +68,9 @@ def clipped(
     """Clips of the scene's events, or of others that were found in the messages, written."""
     site = site_of({"server.clips": CLIPS}, directory)
     assert site.server.clips is not None
-    clock = SimpleNamespace(now_ns=lambda: START_NS, monotonic_ns=lambda: clock.ns, ns=0)
+    clock: Any = SimpleNamespace(now_ns=lambda: START_NS, monotonic_ns=lambda: clock.ns, ns=0)
     idle = cast(Any, SimpleNamespace(is_replay=False, relief=NOTHING_SHED))
-    clips = Clips(site, site.server.clips, cast(Any, clock), idle, idle)
+    clips = Clips(site, site.server.clips, clock, idle, idle)
     clips.take(taken, None)
     found = events() if found is None else found
     for event in found:
