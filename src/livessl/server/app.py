@@ -41,6 +41,7 @@ from livessl.server.recent_log import RecentLog
 from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.sign_of_life import SignOfLife
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -49,6 +50,7 @@ from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
+from livessl.service_manager import ServiceManager
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
@@ -224,6 +226,8 @@ class Server:
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
     read_site : callable or None
         Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
+    service : ServiceManager or None
+        Gets reports; None for nobody.
 
     Raises
     ------
@@ -245,6 +249,7 @@ class Server:
         receiver: Inbox | None = None,
         stepped: bool = False,
         read_site: Callable[[], Site] | None = None,
+        service: ServiceManager | None = None,
     ) -> None:
         site = _usable(site, method)
         read = None if read_site is None else lambda: _usable(read_site(), method)
@@ -256,8 +261,7 @@ class Server:
         self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
-        # per millisecond
+        # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
         first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
@@ -276,6 +280,8 @@ class Server:
         """The address that nodes connect to."""
         self.url = url
         """The address of API and dashboard."""
+        self._service = service or ServiceManager(clock)
+        self._sign_of_life = SignOfLife(self.parts, self._service, url, lambda: self.uvicorn.started)
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
@@ -328,7 +334,7 @@ class Server:
             self.parts.clips.start()
         if self.parts.hub_link is not None:
             self.parts.hub_link.start()
-        self.parts.reloader.start()
+        self.parts.reloader.start(self._service.reloading)
         if not self._stepped:
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
@@ -361,7 +367,9 @@ class Server:
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
         while self.parts.failure is None and not self.uvicorn.should_exit:
+            self._sign_of_life.give()
             await asyncio.sleep(WATCH_S)
+        self._service.stopping()
         self.stop()
         self.parts.fanout.ended.set()
 
