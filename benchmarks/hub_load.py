@@ -253,8 +253,7 @@ def filled(place: str, count: int, first: int, sites: int) -> None:
         for batch in (known[start : start + WINDOW] for start in range(0, len(known), WINDOW)):
             taken = archive.take(batch, 0.0)
             assert len(taken.done) == len(batch)
-        for site in simulated:
-            archive.note_report(site.name, json.loads(site.report()))
+        archive.note_reports({site.name: json.loads(site.report()) for site in simulated})
     finally:
         archive.close()
 

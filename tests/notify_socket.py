@@ -7,6 +7,10 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event as Flag
+from threading import Lock, Thread
+
+from small_site import HANG_S
 
 
 class NotifySocket:
@@ -24,15 +28,18 @@ class NotifySocket:
         self._socket.bind("\0" + address[1:] if address.startswith("@") else address)
         self._socket.setblocking(False)
         self._said: list[str] = []
+        self._reading, self._end = Lock(), Flag()
 
     @property
     def said(self) -> list[str]:
         """All reports so far, in order."""
-        while True:
-            try:
-                self._said += self._socket.recv(65536).decode().splitlines()
-            except BlockingIOError:
-                return list(self._said)
+        with self._reading:
+            while self._socket.fileno() >= 0:
+                try:
+                    self._said += self._socket.recv(65536).decode().splitlines()
+                except BlockingIOError:
+                    break
+            return list(self._said)
 
     def count(self, line: str) -> int:
         """Return how often something was reported."""
@@ -42,16 +49,28 @@ class NotifySocket:
         """Return this process's environment, as a service has it."""
         return {**os.environ, "NOTIFY_SOCKET": self.address, "WATCHDOG_USEC": str(round(silence_s * 1e6))}
 
+    def keep_reading(self) -> None:
+        """Read until the end: Linux keeps ten reports that nobody has read, and refuses others."""
+        while not self._end.wait(0.02):
+            assert self.said is not None
+
     def close(self) -> None:
         """Stop to listen."""
-        self._socket.close()
+        self._end.set()
+        with self._reading:
+            self._socket.close()
 
 
 @contextmanager
-def listening(directory: Path) -> Iterator[NotifySocket]:
-    """A socket in a folder."""
+def listening(directory: Path, *, reads: bool = False) -> Iterator[NotifySocket]:
+    """A socket in a folder, which is read all the time, or whenever it is asked for what was said."""
     manager = NotifySocket(str(directory / "notify"))
+    reader = Thread(target=manager.keep_reading)
+    if reads:
+        reader.start()
     try:
         yield manager
     finally:
         manager.close()
+        if reads:
+            reader.join(HANG_S)

@@ -229,7 +229,7 @@ def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fusion = Fusion(monkeypatch)
-    with listening(tmp_path) as manager:
+    with listening(tmp_path, reads=True) as manager:
         service = ServiceManager(SystemClock(), manager.address, 4_000)  # every look at a turn is a sign of life
         with running_server(site_of(), service=service) as server:
             wait_until(lambda: manager.count("WATCHDOG=1") > 1, "signs of life")
@@ -247,7 +247,7 @@ def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
 
 def test_hub_is_ready_when_it_serves_and_says_what_it_waits_for(tmp_path: Path) -> None:
     hub = make_hub("hub.sqlite", [f"nats://127.0.0.1:{free_port()}"], tmp_path)
-    with listening(tmp_path) as manager:
+    with listening(tmp_path, reads=True) as manager:
         service = ServiceManager(SystemClock(), manager.address, 4_000)
         with running_hub(hub, service) as server:
             wait_until(lambda: manager.count("WATCHDOG=1") > 1, "signs of life")

@@ -107,7 +107,7 @@ class ServiceManager:
         try:
             yield
         finally:
-            self._send("READY=1")
+            self._is_ready = self._send("READY=1")  # if it fails, `turn` sends it
 
     def stopping(self) -> None:
         """Report that this process ends; nothing is reported after that."""

@@ -327,11 +327,11 @@ def test_device_problem_and_its_end_reach_the_server_and_the_service_manager(
 ) -> None:
     unplugged = "input device 'UMC1820' is not connected"
     seen: set[str | None] = set()
-    with server() as there, listening(tmp_path) as manager:
+    with server() as there, listening(tmp_path, reads=True) as manager:
 
         def ask() -> bool:
             seen.add(there.receiver.ingest.problem_of("south"))
-            assert manager.said is not None  # read at once, before the socket is full
+            assert manager.said is not None  # read with each block, before the socket is full
             return False
 
         script = [None] * 15 + [unplugged] * 200 + [None] * 15

@@ -308,7 +308,7 @@ def test_hang_up_signal_reloads_and_a_broken_file_is_reported_while_the_server_r
     log = tmp_path / "log"
     words = (sys.executable, "-m", "livessl", "--log", "json", "serve", "--site", path)
     with (
-        listening(tmp_path) as manager,
+        listening(tmp_path, reads=True) as manager,
         log.open("w") as stderr,
         started(*words, stderr=stderr, env=manager.environment(silence_s=4.0)) as process,
     ):
