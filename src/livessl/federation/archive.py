@@ -175,7 +175,7 @@ class Archive:
                 self._touch(connection, set(reports), {}, {})
                 bodies = [{"of_site": site, "body": orjson.dumps(reports[site]).decode()} for site in sorted(reports)]
                 connection.execute(_REPORTED, bodies)
-        except Exception as error:  # noqa: BLE001 - whatever a report does to the code, it holds up no other
+        except Exception as error:  # whatever a report does to the code, it holds up no other
             if isinstance(error, StoreError) and not isinstance(error, RejectedError):
                 raise
             if len(reports) == 1:
