@@ -47,7 +47,6 @@ class ServiceManager:
         self._clock = clock
         self._address = address
         self._silence_ns = silence_ns
-        self._socket = None if address is None else socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._is_ready = self._is_stopping = self._fails = False
         self._sign_ns: int | None = None
         self._looked_ns: int | None = None
@@ -117,11 +116,12 @@ class ServiceManager:
 
     def _send(self, *lines: str) -> bool:
         """Send lines, and return whether they were sent; a service manager that takes none ends nothing here."""
-        if self._socket is None or self._address is None:
+        if self._address is None:
             return False
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
-            self._socket.sendto("\n".join(lines).encode(), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, address)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+                sender.sendto("\n".join(lines).encode(), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, address)
         except OSError as error:
             if not self._fails:
                 _log.warning(

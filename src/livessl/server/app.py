@@ -261,8 +261,6 @@ class Server:
         self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
-        first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
@@ -271,7 +269,8 @@ class Server:
             store = Store.of(site)
             undo.callback(store.close)
             url = url_of(self._listener, tls=certificate is not None)
-            fanout = Fanout(first_seq)
+            # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
+            fanout = Fanout(clock.now_ns() // 1_000_000)
             self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
@@ -342,6 +341,7 @@ class Server:
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
+            self._service.stopping()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -369,7 +369,6 @@ class Server:
         while self.parts.failure is None and not self.uvicorn.should_exit:
             self._sign_of_life.give()
             await asyncio.sleep(WATCH_S)
-        self._service.stopping()
         self.stop()
         self.parts.fanout.ended.set()
 
