@@ -5,8 +5,8 @@
     python benchmarks/hub_load.py --out results/hub --into docs/scaling.md
 
 A real NATS server, a real hub as a process, and PostgreSQL (`--sqlite`: an SQLite file instead). The sites publish an
-hour of messages as fast as the stream takes them, for `--seconds` at most: how fast the hub takes them in. Then they go
-on at the pace of real time: how long a message takes to the history, and how long answers of the API take meanwhile.
+hour of messages (`--minutes`) as fast as the stream takes them: how fast the hub takes them in. Then they go on at the
+pace of real time: how long a message takes to the history, and after that how long answers of the API take meanwhile.
 All the time, each site reports on itself every 5 s, as real ones do. `--history` fills the database of a hub instead,
 and measures the answers. `--into` writes the tables of all that lies in `--out` into a page.
 """
@@ -18,9 +18,10 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Awaitable, Iterator, Sequence
-from contextlib import ExitStack, asynccontextmanager, suppress
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -63,10 +64,10 @@ MIN_PACE: Final = 10.0
 
 @dataclass(frozen=True)
 class Demand:
-    """Sites, seconds in which they may publish, seconds at the pace of real time, and seconds to wait for the hub."""
+    """Sites, minutes that they publish at once, seconds at the pace of real time, and seconds to wait for the hub."""
 
     sites: int
-    seconds: float
+    minutes: int
     paced_s: float
     patience_s: float
 
@@ -98,9 +99,9 @@ class Progress:
         self.most_waiting = max(self.most_waiting, waiting)
         return waiting
 
-    async def watch(self) -> None:
-        """Look until cancelled."""
-        while True:
+    async def watch(self, end: asyncio.Event) -> None:
+        """Look until the end."""
+        while not end.is_set():
             await self.look()
             await asyncio.sleep(LOOK_S)
 
@@ -126,13 +127,13 @@ async def publish(progress: Progress, stream: JetStreamContext, window: Sequence
         progress.sent[each.seq] = sent
 
 
-async def publish_hour(
-    progress: Progress, stream: JetStreamContext, sites: Sequence[SimulatedSite], until: float
+async def publish_at_once(
+    progress: Progress, stream: JetStreamContext, sites: Sequence[SimulatedSite], minutes: int
 ) -> None:
-    """Publish an hour of some sites in windows, as fast as the stream acknowledges them, until a time at most."""
-    minutes = (message for _ in range(60) for site in sites for message in site.minute())
-    messages = chain((message for site in sites for message in site.begin()), minutes)
-    while (window := list(islice(messages, WINDOW))) and time.perf_counter() < until:
+    """Publish the first minutes of some sites in windows, as fast as the stream acknowledges them."""
+    following = (message for _ in range(minutes) for site in sites for message in site.minute())
+    messages = chain((message for site in sites for message in site.begin()), following)
+    while window := list(islice(messages, WINDOW)):
         await publish(progress, stream, window)
 
 
@@ -150,10 +151,10 @@ async def publish_paced(progress: Progress, sites: Sequence[SimulatedSite], seco
     return rate
 
 
-async def report(client: Client, sites: Sequence[SimulatedSite]) -> None:
-    """Publish the reports of all sites on themselves, evenly spread, until cancelled."""
+async def report(client: Client, sites: Sequence[SimulatedSite], end: asyncio.Event) -> None:
+    """Publish the reports of all sites on themselves, evenly spread, until the end."""
     begun, count = time.perf_counter(), 0
-    while True:
+    while not end.is_set():
         due = int((time.perf_counter() - begun) / REPORT_S * len(sites))
         for number in range(count, due):
             site = sites[number % len(sites)]
@@ -163,35 +164,36 @@ async def report(client: Client, sites: Sequence[SimulatedSite]) -> None:
 
 
 @asynccontextmanager
-async def meanwhile(*works: Awaitable[None]) -> AsyncIterator[None]:
-    """Do something while the context lasts; what fails in it fails here."""
-    tasks = [asyncio.ensure_future(work) for work in works]
+async def meanwhile(work: Callable[[asyncio.Event], Coroutine[None, None, None]]) -> AsyncIterator[None]:
+    """Do something while the context lasts; what fails in it fails here.
+
+    The event tells it to end: Python 3.11 may lose a cancellation of what waits for an answer of NATS.
+    """
+    end = asyncio.Event()
+    task = asyncio.create_task(work(end))
     try:
         yield
     finally:
-        for task in tasks:
-            task.cancel()
-        for task in tasks:
-            with suppress(asyncio.CancelledError):
-                await task
+        end.set()
+        await task
 
 
 async def measure_load(world: World, demand: Demand) -> JsonObject:
-    """Publish an hour as fast as it goes, then go on at the pace of real time."""
+    """Publish some minutes as fast as it goes, then go on at the pace of real time."""
     sites = [SimulatedSite(number) for number in range(demand.sites)]
     empty, clients = world.stored_bytes(), [await nats.connect(world.server.url) for _ in range(CONNECTIONS)]
     streams = [client.jetstream(timeout=60.0) for client in clients]
     progress = Progress(streams[0])
     before, begun = world.processor_s(), time.perf_counter()
-    async with meanwhile(report(clients[0], sites)):
-        async with meanwhile(progress.watch()):
+    async with meanwhile(partial(report, clients[0], sites)):
+        async with meanwhile(progress.watch):
             parts = [sites[number::CONNECTIONS] for number in range(CONNECTIONS)]
-            hours = (
-                publish_hour(progress, stream, part, begun + demand.seconds)
+            floods = (
+                publish_at_once(progress, stream, part, demand.minutes)
                 for stream, part in zip(streams, parts, strict=True)
                 if part
             )
-            await asyncio.gather(*hours)
+            await asyncio.gather(*floods)
         published_s, published = time.perf_counter() - begun, len(progress.sent)
         is_drained = await progress.drain(demand.patience_s)
         flood_s, flood = time.perf_counter() - begun, world.processor_s()
@@ -200,7 +202,7 @@ async def measure_load(world: World, demand: Demand) -> JsonObject:
             "sites": demand.sites,
             "messages": published,
             "events": progress.events,
-            "hour": published / (demand.sites * MESSAGES_PER_HOUR),
+            "minutes": demand.minutes,
             "is_drained": is_drained,
             "published_per_s": published / published_s,
             "taken_in_per_s": progress.taken / flood_s,
@@ -220,13 +222,14 @@ async def measure_load(world: World, demand: Demand) -> JsonObject:
 
 
 async def measure_paced(world: World, demand: Demand, progress: Progress, sites: Sequence[SimulatedSite]) -> JsonObject:
-    """Publish at the pace of real time, and ask the API meanwhile."""
+    """Publish at the pace of real time, and then ask the API as well for as long."""
     progress.lags_s.clear()
     before, begun = world.processor_s(), time.perf_counter()
-    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world.hub.url, demand.sites, demand.paced_s))
-    async with meanwhile(progress.watch()):
+    async with meanwhile(progress.watch):
         rate = await publish_paced(progress, sites, demand.paced_s)
     after, passed_s = world.processor_s(), time.perf_counter() - begun
+    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world.hub.url, demand.sites, demand.paced_s))
+    await publish_paced(progress, sites, demand.paced_s)
     return {
         "messages_per_s": rate,
         "lag": asdict(Times.of(progress.lags_s)),
@@ -287,7 +290,7 @@ def main() -> int:
     parser.add_argument("--sites", type=int, nargs="+", default=[], help="numbers of sites, one run each")
     parser.add_argument("--history", type=int, nargs="+", default=[], help="numbers of stored events, one step each")
     parser.add_argument("--history-sites", type=int, default=1000, help="sites of these events (default: 1000)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="longest time of publishing (default: 60)")
+    parser.add_argument("--minutes", type=int, default=60, help="minutes that are published at once (default: 60)")
     parser.add_argument("--paced", type=float, default=20.0, help="seconds at the pace of real time (default: 20)")
     parser.add_argument("--patience", type=float, default=300.0, help="longest wait for the hub (default: 300 s)")
     parser.add_argument("--sqlite", action="store_true", help="an SQLite file instead of PostgreSQL")
@@ -304,7 +307,7 @@ def main() -> int:
         (arguments.out / f"{name}.json").write_text(json.dumps({**about, **found}, indent=1), encoding="utf-8")
 
     for sites in arguments.sites:
-        demand = Demand(sites, arguments.seconds, arguments.paced, arguments.patience)
+        demand = Demand(sites, arguments.minutes, arguments.paced, arguments.patience)
         with (
             TemporaryDirectory(prefix="livessl-hub-") as name,
             running_hub_process(Path(name), arguments.sqlite) as world,

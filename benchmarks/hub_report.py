@@ -95,18 +95,13 @@ def _flood(loads: Sequence[Json]) -> Table:
 
 
 def _messages(load: Json) -> str:
-    """Return how many messages were published, and what was not done in time."""
-    parts = [f"{load['messages']}"]
-    if load["hour"] < 1:
-        parts.append(f"{load['hour']:.2f} h")
-    if not load["is_drained"]:
-        parts.append("not all taken in")
-    return ", ".join(parts)
+    """Return how many messages were published, of how many minutes, and whether all were taken in."""
+    return f"{load['messages']} of {load['minutes']} min{'' if load['is_drained'] else ', not all taken in'}"
 
 
 def _paced(loads: Sequence[Json]) -> Table:
-    titles = ("sites", "messages /s", "reports /s", "until taken in: median, 95 %, longest", "hub", "database", "NATS",
-              "most memory of the hub")  # fmt: skip
+    titles = ("sites", "messages /s", "reports /s", "age of the oldest that waits: median, 95 %, longest",
+              "hub", "database", "NATS", "most memory of the hub")  # fmt: skip
     rows = []
     for load in loads:
         paced, lag = load["paced"], load["paced"]["lag"]

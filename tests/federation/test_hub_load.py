@@ -70,7 +70,7 @@ def test_rows_of_a_large_history_are_those_that_a_hub_stores(tmp_path: Path) -> 
 def test_one_site_is_measured_from_the_stream_to_the_answers(tmp_path: Path) -> None:
     require(NATS_SERVER is not None, "NATS is not installed (Debian: apt install nats-server)")
     with running_hub_process(tmp_path, sqlite=True) as world:
-        found = asyncio.run(measure_load(world, Demand(sites=1, seconds=60.0, paced_s=0.5, patience_s=100.0)))
+        found = asyncio.run(measure_load(world, Demand(sites=1, minutes=60, paced_s=0.5, patience_s=100.0)))
     assert found["messages"] == 1 + len(ARRAYS) + MESSAGES_PER_HOUR
     assert found["events"] == 60
     assert found["is_drained"]
@@ -99,7 +99,7 @@ def load(sites: int) -> dict[str, Any]:
         "sites": sites,
         "messages": sites * 200,
         "events": sites * 60,
-        "hour": 1.0,
+        "minutes": 60,
         "is_drained": True,
         "published_per_s": 5000.0,
         "taken_in_per_s": 2000.0,
@@ -123,13 +123,13 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
         (tmp_path / f"sites-{sites}.json").write_text(json.dumps(load(sites)))
     said = document(tmp_path)
     assert said.index("| one core of the hub | 2000 |") < said.index("| what the hub takes in at most |")
-    assert said.index("| 10 | 80 | 2000 |") < said.index("| 1000 | 8000 | 200000 |")
+    assert said.index("| 10 | 80 | 2000 of 60 min |") < said.index("| 1000 | 8000 | 200000 of 60 min |")
     assert "did nothing else meanwhile (load average at the begin of each run: 0.2, 0.2)" in said
-    late = {**load(1000), "is_drained": False, "hour": 0.25}
+    late = {**load(1000), "is_drained": False, "minutes": 15}
     del late["paced"]
     (tmp_path / "sites-1000.json").write_text(json.dumps(late))
     said = document(tmp_path)
-    assert "| 1000 | 8000 | 200000, 0.25 h, not all taken in |" in said
+    assert "| 1000 | 8000 | 200000 of 15 min, not all taken in |" in said
     assert "Limits, by the figures of 10 sites:" in said, "of the most sites with figures"
 
 

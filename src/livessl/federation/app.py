@@ -25,6 +25,7 @@ from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.event_retention import delete_old_events
+from livessl.server.forwarding.stream import ended
 from livessl.server.history.database import StoreError
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.refusals import Refusals
@@ -150,9 +151,7 @@ class HubServer:
         finally:
             self._service.stopping()
             failure = receiving.exception() if receiving.done() and not receiving.cancelled() else None
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await ended(*tasks)
         if failure is not None:
             raise failure
 
