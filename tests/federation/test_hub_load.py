@@ -80,7 +80,7 @@ def test_one_site_is_measured_from_the_stream_to_the_answers(tmp_path: Path) -> 
     assert found["hub_memory_mb"] > 20.0
     (tmp_path / "sites-1.json").write_text(json.dumps({**ABOUT, **found}))
     said = document(tmp_path)
-    assert f"| 1 | 8 | {found['messages']} | " in said
+    assert f"| 1 | 8 | {found['messages']} of 60 min | " in said
     assert "Limits, by the figures of 1 sites:" in said
 
 
