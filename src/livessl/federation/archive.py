@@ -47,6 +47,8 @@ _HEARD: Final = (
     )
 )
 
+_REPORTED: Final = update(sites).where(sites.c.site == bindparam("of_site")).values(report=bindparam("body"))
+
 _log = logging.getLogger(__name__)
 
 
@@ -164,12 +166,23 @@ class Archive:
             _log.debug("a message whose place cannot be stored", exc_info=True)
         return Taken([], [], [delivery])
 
-    def note_report(self, site: str, report: JsonObject) -> None:
-        """Keep a site's newest report on itself."""
-        with self._database.writing(f"store the report of site {site!r}") as connection:
-            self._touch(connection, {site}, {}, {})
-            body = orjson.dumps(report).decode()
-            connection.execute(update(sites).where(sites.c.site == site).values(report=body))
+    def note_reports(self, reports: Mapping[str, JsonObject]) -> None:
+        """Keep the newest reports of sites on themselves; one that is refused holds up no other."""
+        if not reports:
+            return
+        try:
+            with self._database.writing(f"store the reports of {', '.join(sorted(reports)[:3])}") as connection:
+                self._touch(connection, set(reports), {}, {})
+                bodies = [{"of_site": site, "body": orjson.dumps(reports[site]).decode()} for site in sorted(reports)]
+                connection.execute(_REPORTED, bodies)
+        except Exception as error:  # whatever a report does to the code, it holds up no other
+            if isinstance(error, StoreError) and not isinstance(error, RejectedError):
+                raise
+            if len(reports) == 1:
+                _log.error("a report is left out: %s", error)
+                return
+            for site, report in reports.items():
+                self.note_reports({site: report})
 
     def _touch(
         self, connection: Connection, names: set[str], missing: Mapping[str, int], newest: Mapping[str, int]

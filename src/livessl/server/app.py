@@ -44,6 +44,7 @@ from livessl.server.recent_log import RecentLog
 from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.sign_of_life import SignOfLife
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -52,6 +53,7 @@ from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
+from livessl.service_manager import ServiceManager
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
@@ -228,6 +230,8 @@ class Server:
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
     read_site : callable or None
         Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
+    service : ServiceManager or None
+        Gets reports; None for nobody.
 
     Raises
     ------
@@ -249,6 +253,7 @@ class Server:
         receiver: Inbox | None = None,
         stepped: bool = False,
         read_site: Callable[[], Site] | None = None,
+        service: ServiceManager | None = None,
     ) -> None:
         site = _usable(site, method)
         read = None if read_site is None else lambda: _usable(read_site(), method)
@@ -260,9 +265,6 @@ class Server:
         self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
-        # per millisecond
-        first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
@@ -271,7 +273,8 @@ class Server:
             store = Store.of(site)
             undo.callback(store.close)
             url = url_of(self._listener, tls=certificate is not None)
-            fanout = Fanout(first_seq)
+            # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
+            fanout = Fanout(clock.now_ns() // 1_000_000)
             self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
@@ -280,6 +283,8 @@ class Server:
         """The address that nodes connect to."""
         self.url = url
         """The address of API and dashboard."""
+        self._service = service or ServiceManager(clock)
+        self._sign_of_life = SignOfLife(self.parts, self._service, url, lambda: self.uvicorn.started)
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
@@ -332,7 +337,7 @@ class Server:
             self.parts.clips.start()
         if self.parts.hub_link is not None:
             self.parts.hub_link.start()
-        self.parts.reloader.start()
+        self.parts.reloader.start(self._service.reloading)
         if not self._stepped:
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
@@ -340,6 +345,7 @@ class Server:
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
+            self._service.stopping()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -365,6 +371,7 @@ class Server:
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
         while self.parts.failure is None and not self.uvicorn.should_exit:
+            self._sign_of_life.give()
             await asyncio.sleep(WATCH_S)
         self.stop()
         self.parts.fanout.ended.set()

@@ -29,6 +29,7 @@ from livessl.server.forwarding.stream import (
     Place,
     connect_options,
     connected,
+    ended,
     message_id,
     nats_library,
     subject,
@@ -219,9 +220,7 @@ class HubLink:
         try:
             done, _ = await asyncio.wait((sending, ending), return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in (sending, ending):
-                task.cancel()
-            await asyncio.gather(sending, ending, return_exceptions=True)
+            await ended(sending, ending)
         if sending in done:
             sending.result()  # raises the error that ended it
 
