@@ -106,5 +106,5 @@ def test_a_sound_whose_delays_are_said_to_be_poor_counts_little() -> None:
     delays = delays_of(filed, sources(rng), rng, STD_S)
     delays["west"][:5] += rng.normal(0.0, 60e-6, (5, 4))
     known = exactly(filed)
-    told = replace(known, stds_s=known.stds_s | {"west": np.array([*np.full(5, 60e-6), *np.full(5, STD_S)])})
+    told = replace(known, stds_s=dict(known.stds_s) | {"west": np.array([*np.full(5, 60e-6), *np.full(5, STD_S)])})
     assert not diagnosed(filed, delays, told).contradicts

@@ -142,7 +142,7 @@ def most_telling(delays: Delays) -> IntArray:
     if len(received) <= MOST_SOUNDS:
         return np.arange(len(received))
     able = np.flatnonzero(received >= np.sort(received)[-MOST_SOUNDS])
-    return able[np.linspace(0, len(able) - 1, MOST_SOUNDS).round().astype(int)]
+    return np.asarray(able[np.linspace(0, len(able) - 1, MOST_SOUNDS).round().astype(int)])
 
 
 def of_sounds(delays: Delays, rows: IntArray) -> dict[str, FloatArray]:

@@ -42,7 +42,7 @@ MOST_NORMAL: Final = 8_000_000
 all arrays, so one set-up of 30 arrays has 300 000."""
 
 
-MIN_GAIN: Final = 5.0
+MIN_GAIN: Final = 7.0
 """Least gain in the deviance of sounds at unknown places from which a set-up of one array would be said to be other
 than filed. Few careful set-ups exceed what follows from it by chance (`benchmarks/doctor_chance.py`)."""
 

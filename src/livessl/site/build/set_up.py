@@ -74,7 +74,8 @@ def freedom_of(site: Site) -> dict[str, Freedom]:
     That is what a careful set-up may be off by where `uncertainty` has its default, and in proportion to it elsewhere,
     such as after a calibration, but no less than a calibration can know.
     """
-    usual, freedom = Uncertainty(), {}
+    usual = Uncertainty()
+    freedom: dict[str, Freedom] = {}
     for spec in site.processed:
         known = spec.uncertainty
         position_m = max(LEAST_POSITION_STD_M, POSITION_STD_M * known.position_m / usual.position_m)
