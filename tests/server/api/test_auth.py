@@ -82,7 +82,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Secured]:
 
 PUBLIC = {"/", "/static/app.js", "/static/index.html", "/api/v1/health"}
 FOR_ADMINS = {"/api/v1/access", "/api/v1/log"}
-FOR_OPERATORS = {"/api/v1/events/small-0/clips/north", "/api/v1/events/small-0/clips/keep"}
+FOR_OPERATORS = {f"/api/v1/events/small-0/clips/{name}" for name in ("best", "keep", "north")}
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -27,6 +27,7 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_traces import EventTraces
 from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.signed_links import SignedLinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store, StoreError
 from livessl.server.zones.shapes import ZoneMap, fixed_zones
@@ -97,6 +98,8 @@ class Alerts:
         Adds spans of alerts; None if nothing is traced.
     poses : callable or None
         Returns the site with the poses that are in force; None if they stay as they are.
+    links : SignedLinks or None
+        Signs links for people without a token; None if nobody needs one.
 
     Raises
     ------
@@ -120,6 +123,7 @@ class Alerts:
         clips: ClipSource | None = None,
         traces: EventTraces | None = None,
         poses: Callable[[], Site] | None = None,
+        links: SignedLinks | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
@@ -133,7 +137,7 @@ class Alerts:
         """Alerts, deliveries and the rules' states."""
         self.evidence = Evidence((lambda: site) if poses is None else poses, zones, clips)
         """Pictures and clips of alerts."""
-        self._around = Surroundings(clock, store, zones, url, self.evidence, traces)
+        self._around = Surroundings(clock, store, zones, url, self.evidence, traces, links)
         try:
             self._in_force = AlertsInForce(site, self.outbox, self._around)
         except BaseException:
