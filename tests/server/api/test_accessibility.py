@@ -29,8 +29,11 @@ pytestmark = [pytest.mark.browser]
 
 MS: Final = 1000 * HANG_S
 RULES: Final = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]
+OF_COLOURS: Final = ["color-contrast"]
+"""The rules on colours: in the other colours, the page is the same to all others."""
+
 BLOCKING: Final = {"serious", "critical"}
-LOOKS: Final = [(scheme, width) for width in (1440, 390) for scheme in ("light", "dark")]
+LOOKS: Final = [("light", 1440), ("dark", 1440), ("dark", 390), ("light", 390)]
 
 VIOLATIONS: Final = """
 async (rules) => {
@@ -95,7 +98,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
             "zones.fan": {"bounds_m": [[3, 4], [0, 1], [0, 3]], "exclude": True},
             "privacy": "recording",
             "store": {"retention_days": 30000},
-            "server.clips": {"folder": "clips"},
+            "server.clips": {"folder": "clips", "max_age_days": None},
             "server.http.tokens": "tokens.yaml",
         },
         actions={"run": {"command": ["false"], "attempts": 1}},
@@ -184,7 +187,7 @@ def violations(page: Page, what: str) -> list[str]:
     for scheme, width in LOOKS:
         page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=scheme, reduced_motion="reduce")  # type: ignore[arg-type]
-        faults = page.evaluate(VIOLATIONS, RULES)
+        faults = page.evaluate(VIOLATIONS, RULES if scheme == "light" else OF_COLOURS)
         found += [f"{what}, {scheme}, {width} px: {fault}" for fault in faults if fault["impact"] in BLOCKING]
     return found
 

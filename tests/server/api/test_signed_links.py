@@ -73,7 +73,7 @@ def _recording(folder: Path) -> JsonObject:
 def linking_site(folder: Path, url: str, changes: Changes | None = None, **alerts: Any) -> Any:
     return alert_site(
         folder,
-        {"server.events_db": "events.sqlite", "server.clips": {"folder": "clips"}, **(changes or {})},
+        {"server.events_db": "events.sqlite", "server.clips": {"folder": "clips", "max_age_days": None}, **(changes or {})},
         actions={"guard": {**PATIENT, "webhook": {"url": url}}},
         rules={"door": {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["guard"]}},
         **alerts,
@@ -206,9 +206,9 @@ def test_server_without_tokens_signs_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "links.secret").exists()
 
 
-def alert_about(event: Any, **changes: Any) -> JsonObject:
+def alert_about(sounded: Any, **changes: Any) -> JsonObject:
     """An alert with picture and recordings."""
-    message = encoded(event)
+    message = encoded(sounded)
     head = {"key": "alert_1", "text": "a sound", "time_utc": message["time_utc"], "link": "http://ears/#event=small-1"}
     return {**head, "picture": "http://ears/p", "clips": "http://ears/c", "event": message, **changes}
 
