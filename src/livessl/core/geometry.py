@@ -140,7 +140,8 @@ def pan_tilt_deg(
     yaw_deg, pitch_deg, roll_deg : float
         How the camera is mounted: see `posed`.
     """
-    seen_m = (np.asarray(target_m, dtype=np.float64) - position_m) @ rotation(yaw_deg, pitch_deg, roll_deg)
+    away_m = np.asarray(target_m, dtype=np.float64) - np.asarray(position_m, dtype=np.float64)
+    seen_m = np.asarray(away_m @ rotation(yaw_deg, pitch_deg, roll_deg))
     azimuth_deg, elevation_deg, distance_m = direction_deg(np.zeros(3), seen_m)
     return -azimuth_deg, elevation_deg, distance_m
 

@@ -155,8 +155,8 @@ def _fill(server: Server) -> None:
     clips = server.parts.clips
     assert clips is not None
     clips.folder.put("small-past-3", _recordings)
-    event = sound(1)
-    server.parts.event_log.add_final(FinalResults((event,), after(event)), messages, {})
+    alerting = sound(1)
+    server.parts.event_log.add_final(FinalResults((alerting,), after(alerting)), messages, {})
     wait_until(lambda: server.parts.alerts.outbox.dead(1), "the alert that was not delivered")
 
 
