@@ -73,7 +73,11 @@ def _recording(folder: Path) -> JsonObject:
 def linking_site(folder: Path, url: str, changes: Changes | None = None, **alerts: Any) -> Any:
     return alert_site(
         folder,
-        {"server.events_db": "events.sqlite", "server.clips": {"folder": "clips", "max_age_days": None}, **(changes or {})},
+        {
+            "server.events_db": "events.sqlite",
+            "server.clips": {"folder": "clips", "max_age_days": None},
+            **(changes or {}),
+        },
         actions={"guard": {**PATIENT, "webhook": {"url": url}}},
         rules={"door": {"events": {"zones": ["door"]}, "hold_off_s": 0, "actions": ["guard"]}},
         **alerts,
