@@ -45,6 +45,7 @@ from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sign_of_life import SignOfLife
+from livessl.server.signed_links import SignedLinks
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -54,6 +55,7 @@ from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
 from livessl.service_manager import ServiceManager
+from livessl.site.alert_checks import link_secret_file
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
@@ -88,6 +90,7 @@ def assemble(
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
     read_site: Callable[[], Site] | None = None,
+    links: SignedLinks | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -103,6 +106,8 @@ def assemble(
         Address of the server, for the links in alerts.
     read_site : callable or None
         Reads the site file again; None for a server without one.
+    links : SignedLinks or None
+        Signs links for people without a token; None if nobody needs one.
 
     Raises
     ------
@@ -154,7 +159,7 @@ def assemble(
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
         evidence = Evidence(lambda: set_up.site, zones, clips)
-        around = Surroundings(clock, store, zones, url, evidence, traces)
+        around = Surroundings(clock, store, zones, url, evidence, traces, links)
         alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
         undo.callback(alerts.stop)
 
@@ -258,7 +263,8 @@ class Server:
         site = _usable(site, method)
         read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
-        self._access = Access(None if http.tokens is None else site.file(http.tokens))
+        links = None if http.tokens is None else SignedLinks(clock, link_secret_file(site))
+        self._access = Access(None if http.tokens is None else site.file(http.tokens), links)
         certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
@@ -275,7 +281,9 @@ class Server:
             url = url_of(self._listener, tls=certificate is not None)
             # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
             fanout = Fanout(clock.now_ns() // 1_000_000)
-            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
+            self.parts = assemble(
+                site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read, links
+            )
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
