@@ -25,12 +25,13 @@ from livessl.core.commission.trial import Trial
 from livessl.core.types import FloatArray, IntArray
 
 MIN_LEAD: Final = 6.0
-MIN_LEAD_OF_GAIN: Final = 0.12
+MIN_LEAD_OF_GAIN: Final = 0.06
 """Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
 the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
 
 EQUAL: Final = 0.5
-"""Share of the least lead within which alternatives explain the sounds equally well."""
+"""Share of `MIN_LEAD` within which alternatives explain the sounds equally well; where much is explained, all do that
+are within the least lead."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
@@ -202,7 +203,8 @@ def _by_judge(judge: Judge, arrays: int) -> Diagnosis:
     contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
     rivals[0] = judge.with_misfit(rivals[0])
     least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
-    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, EQUAL * least_lead)
+    apart = max(EQUAL * MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
+    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, apart)
 
 
 def _decided(

@@ -51,7 +51,8 @@ class Conditions:
     set_up_watch : SetUpWatch
         Has the findings.
     site_time : SiteTime
-        Knows whether a replay runs; its events never alert.
+        Knows whether a replay runs: then conditions are not judged. Its events and changes of zones are not passed on
+        to here at all (`event_log`, `app`).
     """
 
     array_states: ArrayStates
