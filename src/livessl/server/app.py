@@ -341,15 +341,26 @@ class Server:
         if not self._stepped:
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
-        tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
+        works = self._watch(), self._sign_of_life.describe(), retention, self._access.reload_tokens()
+        tasks = [asyncio.create_task(work) for work in works]
+        for task in tasks:
+            task.add_done_callback(self._stop_on_error)
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
             self._service.stopping()
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            ends = await asyncio.gather(*tasks, return_exceptions=True)
             self.loop = None
+        for error in ends:
+            if isinstance(error, Exception):
+                raise error
+
+    def _stop_on_error(self, task: asyncio.Task[None]) -> None:
+        """Stop if a task has failed: what it did would be missed, and nobody would know."""
+        if not task.cancelled() and task.exception() is not None:
+            self.stop()
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""

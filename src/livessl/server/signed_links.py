@@ -27,7 +27,11 @@ PARAMETERS: Final = ("expires", "signature")
 
 SECRET_BYTES: Final = 32
 
-_LINKABLE: Final = re.compile(r"/api/v1/(?:alerts/[^/]+/picture\.png|events/[^/]+/clips/[^/]+|map)")
+LIVE_PATH: Final = "/api/v1/map"
+"""The one path that a link may open whose content changes: it shows what happens now."""
+
+_NAME: Final = r"[^/\x00-\x1f\x7f]+"
+_LINKABLE: Final = re.compile(rf"/api/v1/(?:alerts/{_NAME}/picture\.png|events/{_NAME}/clips/{_NAME}|map)")
 """Paths that a link may open. Whatever else was signed by mistake stays closed."""
 
 _CONTEXT: Final = b"livessl link 1\n"

@@ -186,6 +186,7 @@ def test_roles_hold(desk: Desk) -> None:
     assert desk.ask(made["link"]).content == SOUND
     made = desk.ask("/api/v1/links", "POST", "operator", json={"path": "/api/v1/map"}).json()
     assert desk.status(f"{made['link']}&view=side") == 204  # nothing has been located yet
+    assert utc_ns(made["until_utc"]) - desk.server.parts.clock.now_ns() <= 600_000_000_000, "it shows what happens now"
     for path in ("/api/v1/access", "/metrics", "https://elsewhere/api/v1/map"):
         assert desk.ask("/api/v1/links", "POST", "operator", json={"path": path}).status_code == 422
 
