@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What rules and actions need beside the site file.
+    """Parts of the server that rules and actions need beside the site file.
 
     Parameters
     ----------
@@ -76,6 +76,8 @@ class AlertsInForce:
     def __init__(self, site: Site, outbox: Outbox, around: Surroundings) -> None:
         self.config: AlertsConfig = site.alerts
         """Rules and actions as the site file has them."""
+        self.outbox = outbox
+        """Alerts, deliveries and the rules' states."""
         kinds = {rule.kind for rule in self.config.rules.values()}
         self.judges_events = "events" in kinds
         self.judges_early = any(rule.events and rule.events.early for rule in self.config.rules.values())

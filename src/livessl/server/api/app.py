@@ -32,6 +32,7 @@ from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.reload_routes import reload_route
+from livessl.server.api.relocate_routes import relocate_route
 from livessl.server.api.set_up_routes import set_up_routes
 from livessl.server.api.stream import stream_route
 from livessl.server.api.zone_routes import zone_routes
@@ -87,6 +88,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         set_up_routes(parts),
         proposal_routes(parts),
         clip_routes(parts),
+        relocate_route(parts),
         link_routes(access),
         point_route(parts),
         reload_route(parts),

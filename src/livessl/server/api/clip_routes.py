@@ -17,6 +17,7 @@ from livessl.schema.answers import errors
 from livessl.server.api import clip_schema
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
+from livessl.server.clips.relocate import is_relocatable, known_methods
 from livessl.server.clips.service import Clips, state_of
 from livessl.server.parts import Parts
 
@@ -57,6 +58,7 @@ def clip_routes(parts: Parts) -> APIRouter:
             "keep": about is not None and about["keep"],
             "position_m": None if about is None else about["position_m"],
             "files": [] if about is None else about["files"],
+            "methods": list(known_methods(parts.site)) if about is not None and is_relocatable(about) else [],
         }
         return as_json(found)
 
