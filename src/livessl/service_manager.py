@@ -121,10 +121,10 @@ class ServiceManager:
             self._send("STOPPING=1", "STATUS=stopping")
 
     def _in_words(self, describe: Callable[[], str]) -> str:
-        """Return the state in one line, or the one before if it cannot be told: the sign of life does not depend on it."""
+        """Return the state in one line, or the one before if it cannot be told: a sign of life needs no words."""
         try:
             return " ".join(describe().split())[:MAX_STATUS]
-        except Exception:
+        except Exception:  # noqa: BLE001 - whatever fails there, the process is alive
             _log.exception("the state for the service manager cannot be told")
             return self._status
 

@@ -47,7 +47,7 @@ class SignOfLife:
             try:
                 self._words = await asyncio.to_thread(self._describe)
                 has_complained = False
-            except Exception:
+            except Exception:  # noqa: BLE001 - whatever fails there, the server is alive
                 if not has_complained:
                     _log.exception("the condition for the service manager cannot be told")
                 has_complained = True

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Final
+from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.clock import utc_text
 from livessl.schema.answers import errors
@@ -14,7 +14,7 @@ from livessl.schema.values import UtcTime, Version
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.signed_links import LIVE_PATH, is_linkable
+from livessl.server.signed_links import LINKABLE, LIVE_PATH
 from livessl.site.alert_models import LIFETIME_S, LinkLifetimeS
 
 LIVE_LIFETIME_S: Final = 600.0
@@ -29,7 +29,9 @@ class LinkRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    path: Annotated[str, Field(max_length=1000)] = Field(
+    path: str = Field(
+        max_length=1000,
+        pattern=f"^{LINKABLE}$",
         description="Path of a picture of an alert, a recording of an event, or the power map; nothing else.",
         examples=["/api/v1/events/lab-1/clips/best"],
     )
@@ -38,13 +40,6 @@ class LinkRequest(BaseModel):
         description="Seconds after which the link expires. A link to the map, which shows what happens now, expires "
         "after 600 at the latest.",
     )
-
-    @field_validator("path")
-    @classmethod
-    def _linkable(cls, path: str) -> str:
-        if not is_linkable(path):
-            raise ValueError("expected the path of a picture, a recording or the map, as the API has it")
-        return path
 
 
 class Link(BaseModel):
