@@ -122,7 +122,7 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
     for sites in (10, 1000):
         (tmp_path / f"sites-{sites}.json").write_text(json.dumps(load(sites)))
     said = document(tmp_path)
-    assert said.index("| one core of the hub | 2000 |") < said.index("| what the hub takes in at most |")
+    assert said.index("| a core for the hub | 2000 |") < said.index("| what the hub takes in at most |")
     assert said.index("| 10 | 80 | 2000 of 60 min |") < said.index("| 1000 | 8000 | 200000 of 60 min |")
     assert "did nothing else meanwhile (load average at the begin of each run: 0.2, 0.2)" in said
     late = {**load(1000), "is_drained": False, "minutes": 15}
