@@ -22,7 +22,8 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import Event, FloatArray
 from livessl.errors import ConfigError, RunError
 from livessl.server.alerts import service
-from livessl.server.alerts.outbox import DeliveryState
+from livessl.server.alerts.in_force import AlertsInForce, Surroundings
+from livessl.server.alerts.outbox import DeliveryState, Outbox
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.reload import Reloader
@@ -96,25 +97,31 @@ def test_change_that_is_reported_as_refused_is_not_made_later(tmp_path: Path, mo
     """The thread that judges is busy for longer than the reload waits."""
     site = alert_site(tmp_path, rules={"door": DOOR})
     other = site.alerts.model_copy(update={"rules": {}})
-    with running_desk(site) as desk:
-        loop, busy, free, later = desk.alerts._loop, Flag(), Flag(), Flag()
-        assert loop is not None
+    made: list[object] = []
 
-        def work() -> None:
+    class Noted(AlertsInForce):
+        def __init__(self, site: Site, outbox: Outbox, around: Surroundings) -> None:
+            made.append(site.alerts)
+            super().__init__(site, outbox, around)
+
+    with running_desk(site) as desk:
+        busy, free = Flag(), Flag()
+
+        def work(_: object) -> None:
             busy.set()
             free.wait(HANG_S)
 
-        loop.call_soon_threadsafe(work)
+        desk.on_alert = work
+        desk.finish(sound(1))
         assert busy.wait(HANG_S)
+        monkeypatch.setattr(service, "AlertsInForce", Noted)
         monkeypatch.setattr(service, "TAKE_OVER_S", 0.01)
         with pytest.raises(RunError, match="the former rules stay in force; reload again later"):
             desk.alerts.take_over(other)
         free.set()
-        loop.call_soon_threadsafe(loop.call_soon, loop.call_soon, later.set)
-        assert later.wait(HANG_S)
-        assert desk.alerts.config == site.alerts
         monkeypatch.setattr(service, "TAKE_OVER_S", HANG_S)
-        desk.alerts.take_over(other)
+        desk.alerts.take_over(other)  # the thread comes to this change after the one that was given up
+        assert made == [other]
         assert desk.alerts.config == other
 
 

@@ -120,7 +120,7 @@ class HubServer:
             """The database, which other hubs may share."""
             undo.callback(self.archive.close)
             self.intake = Intake(hub, self.archive, clock)
-            """What takes messages in."""
+            """The part that takes messages in."""
             undo.pop_all()
         app = create_hub_app(hub, self.archive, self.intake, access, Refusals(clock))
         self.uvicorn = uvicorn_server(app, certificate)

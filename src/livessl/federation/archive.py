@@ -1,4 +1,4 @@
-"""What a hub keeps of its sites, in one database that several hubs may share: each message is taken in once, in order.
+"""Data that a hub keeps of its sites, in a database that hubs may share. Each message is taken in once, and in order.
 
 The number of the last message that was taken in from each outbox is in the database, and is raised in the transaction
 that stores the message. So it does not matter how often a message comes, and to which hub.
@@ -72,7 +72,7 @@ class Archive:
         self._gaps = Gaps()
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
-        """Delete events and alerts of before a time; return the number of events."""
+        """Delete events and alerts from before a time; return the number of events."""
         gone = self.store.expire(before_ns, end)
         with self._database.writing("delete old alerts") as connection:
             connection.execute(delete(alerts).where(alerts.c.time_ns < max(before_ns, 0)))
@@ -106,7 +106,7 @@ class Archive:
                 return self._skip(deliveries[0], str(error))
         except StoreError:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever a message does to the code, it holds up no other
+        except Exception as error:  # noqa: BLE001 - no message may hold up the others
             if len(deliveries) == 1:
                 _log.debug("a message that cannot be taken in", exc_info=True)
                 return self._skip(deliveries[0], f"{type(error).__name__}: {error}")

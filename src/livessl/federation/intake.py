@@ -124,7 +124,7 @@ class Intake:
 
     @property
     def problem(self) -> str | None:
-        """Why no messages can be taken in; None if they can."""
+        """Reason why no messages can be taken in; None if they can."""
         return None if self._problem is None else f"{PLACE}: {self._problem}"
 
     async def run(self) -> None:

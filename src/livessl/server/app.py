@@ -13,8 +13,10 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
+from livessl.server.alerts.evidence import Evidence
+from livessl.server.alerts.in_force import Surroundings
 from livessl.server.alerts.outbox import OutboxError
-from livessl.server.alerts.service import Alerts
+from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -34,6 +36,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
+from livessl.server.pose_refiner import PoseRefiner
 from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
@@ -42,6 +45,7 @@ from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.sign_of_life import SignOfLife
+from livessl.server.signed_links import SignedLinks
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -51,6 +55,7 @@ from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
 from livessl.service_manager import ServiceManager
+from livessl.site.alert_checks import link_secret_file
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
@@ -85,6 +90,7 @@ def assemble(
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
     read_site: Callable[[], Site] | None = None,
+    links: SignedLinks | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -100,6 +106,8 @@ def assemble(
         Address of the server, for the links in alerts.
     read_site : callable or None
         Reads the site file again; None for a server without one.
+    links : SignedLinks or None
+        Signs links for people without a token; None if nobody needs one.
 
     Raises
     ------
@@ -150,10 +158,9 @@ def assemble(
         set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        alerts = Alerts(
-            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces,
-            lambda: set_up.site,
-        )  # fmt: skip
+        evidence = Evidence(lambda: set_up.site, zones, clips)
+        around = Surroundings(clock, store, zones, url, evidence, traces, links)
+        alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
         undo.callback(alerts.stop)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
@@ -171,7 +178,8 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
-        proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
+        proposals = Proposals(set_up, set_up_watch.heard, clock)
+        refiner = PoseRefiner(proposals, set_up, set_up_watch.heard, overload)
         for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
@@ -195,6 +203,7 @@ def assemble(
         overload=overload,
         set_up=set_up,
         proposals=proposals,
+        refiner=refiner,
         set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
@@ -254,7 +263,8 @@ class Server:
         site = _usable(site, method)
         read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
-        self._access = Access(None if http.tokens is None else site.file(http.tokens))
+        links = None if http.tokens is None else SignedLinks(clock, link_secret_file(site))
+        self._access = Access(None if http.tokens is None else site.file(http.tokens), links)
         certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
@@ -271,7 +281,9 @@ class Server:
             url = url_of(self._listener, tls=certificate is not None)
             # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
             fanout = Fanout(clock.now_ns() // 1_000_000)
-            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
+            self.parts = assemble(
+                site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read, links
+            )
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
@@ -307,7 +319,7 @@ class Server:
             # what computes at leisure comes last: what has to be on the disk does not wait for it
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
-            self.parts.proposals.stop()
+            self.parts.refiner.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 
@@ -327,7 +339,7 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
-        self.parts.proposals.start()
+        self.parts.refiner.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()

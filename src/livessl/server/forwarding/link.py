@@ -123,7 +123,7 @@ class HubLink:
 
     @property
     def problem(self) -> str | None:
-        """Why messages wait, as a sentence for the reasons of `health`; None while they are sent."""
+        """Reason why messages wait, as a sentence for `health`; None while they are sent."""
         if self._problem is None:
             return None
         return f"{PLACE}: {self._problem}; {self.waiting} messages wait for the hub"
