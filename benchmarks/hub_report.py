@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR
 from livessl.lab.evaluate.markdown import Block, Table, as_markdown
+from livessl.server.forwarding.link import REPORT_S
 from performance import Fit
 
 BEGIN: Final = "<!-- begin hub load -->\n"
@@ -52,10 +53,10 @@ def document(folder: Path) -> str:
         raise ValueError(f"{folder}: expected files sites-N.json or history-N.json; measure with --sites or --history")
     blocks: list[Block] = []
     if loads:
-        blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads)]
+        blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
         paced = [load for load in loads if "paced" in load]
         if paced:
-            blocks += ["At the pace of real time:", _paced(paced), *_limits(paced[-1])]
+            blocks += ["At the pace of real time:", _paced(paced)]
             blocks += [
                 "95 % of the API's answers take at most, in ms, at the pace of real time:",
                 _answers(paced, "sites"),
@@ -129,7 +130,7 @@ def _paced(loads: Sequence[Json]) -> Table:
         shares = paced["processor_share"]
         rows.append(
             (
-                *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / 5:.1f}"),
+                *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / REPORT_S:.1f}"),
                 f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s",
                 *(_number(100 * shares[name] if name in shares else None, 1, " % of a core") for name in PARTS),
                 f"{load['hub_memory_mb']:.0f} MB",
@@ -138,23 +139,28 @@ def _paced(loads: Sequence[Json]) -> Table:
     return Table(titles, rows)
 
 
-def _limits(load: Json) -> list[Block]:
-    """Return by what the number of sites is limited, the first limit first."""
-    sites, shares = load["sites"], load["paced"]["processor_share"]
-    day = 24 * MESSAGES_PER_HOUR * load["stream_bytes_per_message"]
-    stored = 24 * EVENTS_PER_HOUR * load["database_bytes_per_event"]
-    most = {f"a core for {PARTS[name]}": sites / share for name, share in shares.items() if share > 0}
-    most["what the hub takes in at most"] = load["taken_in_per_s"] / real_time_per_s(1)
+def _limits(loads: Sequence[Json]) -> list[Block]:
+    """Return by what the number of sites is limited, the first limit first.
+
+    Processor time is that of a message with the most sites; disk is that of the longest time, in which what sites send
+    once counts least.
+    """
+    load, longest = loads[-1], max(loads, key=lambda each: (each["minutes"], each["sites"]))
+    sites, costs_ms = load["sites"], load["processor_ms_per_message"]
+    day = 24 * MESSAGES_PER_HOUR * longest["stream_bytes_per_message"]
+    stored = 24 * EVENTS_PER_HOUR * longest["database_bytes_per_event"]
+    most = {f"a core for {PARTS[name]}": 1000 / ms / real_time_per_s(1) for name, ms in costs_ms.items() if ms > 0}
+    most["what the hub took in here"] = load["taken_in_per_s"] / real_time_per_s(1)
     most["the stream's 10 GB, to keep a day"] = STREAM_BYTES / day
     rows = [(name, f"{count:.0f}") for name, count in sorted(most.items(), key=lambda each: each[1])]
-    parts = ", ".join(f"{1000 * share / sites:.2f} ms of {PARTS[name]}" for name, share in shares.items())
+    reports, real = sites / REPORT_S / load["taken_in_per_s"], 1 / REPORT_S / real_time_per_s(1)
     costs = (
         f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
-        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day. With "
-        f"{sites} sites, each takes this processor time in a second, its share of what all cost together included: "
-        f"{parts}."
+        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day (by the "
+        f"figures of {longest['sites']} sites). Processor times include those of reports: with {sites} sites, "
+        f"{reports:.1f} came with each message; at the pace of real time {real:.1f} do."
     )
-    return [costs, f"Limits, by the figures of {sites} sites:", Table(("limit", "sites"), rows)]
+    return [costs, f"Limits, by the processor times of {sites} sites:", Table(("limit", "sites"), rows)]
 
 
 def _answers(runs: Sequence[Json], key: str) -> Table:
