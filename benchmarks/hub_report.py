@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR
+from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR, MIN_PACE
 from livessl.lab.evaluate.markdown import Block, Table, as_markdown
 from livessl.server.forwarding.link import REPORT_S
 from performance import Fit
@@ -56,7 +56,7 @@ def document(folder: Path) -> str:
         blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
         paced = [load for load in loads if "paced" in load]
         if paced:
-            blocks += ["At the pace of real time:", _paced(paced)]
+            blocks += [f"At the pace of real time, or {MIN_PACE:.0f} messages a second if that is more:", _paced(paced)]
             blocks += [
                 "95 % of the API's answers take at most, in ms, at the pace of real time:",
                 _answers(paced, "sites"),
