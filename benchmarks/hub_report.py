@@ -142,14 +142,17 @@ def _paced(loads: Sequence[Json]) -> Table:
 def _limits(loads: Sequence[Json]) -> list[Block]:
     """Return by what the number of sites is limited, the first limit first.
 
-    Processor time is that of a message with the most sites; disk is that of the longest time, in which what sites send
-    once counts least.
+    Processor time is that of the most sites, at the pace of real time if it was measured; disk is that of the longest
+    time, in which what sites send once counts least.
     """
     load, longest = loads[-1], max(loads, key=lambda each: (each["minutes"], each["sites"]))
-    sites, costs_ms = load["sites"], load["processor_ms_per_message"]
+    sites, pace = load["sites"], real_time_per_s(load["sites"])
+    shares = {name: ms / 1000 * pace for name, ms in load["processor_ms_per_message"].items()}
+    if "paced" in load and pace >= MIN_PACE:
+        shares = load["paced"]["processor_share"]
     day = 24 * MESSAGES_PER_HOUR * longest["stream_bytes_per_message"]
     stored = 24 * EVENTS_PER_HOUR * longest["database_bytes_per_event"]
-    most = {f"a core for {PARTS[name]}": 1000 / ms / real_time_per_s(1) for name, ms in costs_ms.items() if ms > 0}
+    most = {f"a core for {PARTS[name]}": sites / share for name, share in shares.items() if share > 0}
     most["what the hub took in here"] = load["taken_in_per_s"] / real_time_per_s(1)
     most["the stream's 10 GB, to keep a day"] = STREAM_BYTES / day
     rows = [(name, f"{count:.0f}") for name, count in sorted(most.items(), key=lambda each: each[1])]
