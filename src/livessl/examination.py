@@ -40,7 +40,7 @@ class Examination:
     sounds: int
 
     @property
-    def is_sound(self) -> bool:
+    def is_faultless(self) -> bool:
         """True if no finding is an error."""
         return all(finding.severity is not Severity.ERROR for finding in self.findings)
 

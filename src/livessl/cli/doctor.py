@@ -35,7 +35,7 @@ def add_recordings(parser: Any) -> None:
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
-    add_wav(parser, "recording of an array, in place of --session, WAV or FLAC; repeat for each array")
+    add_wav(parser, "WAV or FLAC recording of one array, instead of --session; repeat for each array")
     add_joint(parser)
 
 
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
-    return OK if examination.is_sound else FAILED
+    return OK if examination.is_faultless else FAILED
 
 
 def _examine(arguments: argparse.Namespace) -> Examination:
@@ -83,7 +83,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
 def recordings_given(
     arguments: argparse.Namespace, command: str, otherwise: str = ""
 ) -> tuple[Site, list[AssignedRecording], tuple[int, int | None]]:
-    """Return the site and the recordings that --session, or --site and --wav, name, and their span in nanoseconds."""
+    """Return the site, the recordings given by --session, or --site and --wav, and the time that they span in ns."""
     from livessl.recordings.assign import assign_files, assign_sessions, span_ns
     from livessl.recordings.session import read_session
     from livessl.site.load import load_site

@@ -102,7 +102,7 @@ class SetUpInForce:
         Returns
         -------
         list of str
-            Names of the arrays that are elsewhere, or are known to be so differently well.
+            Names of the arrays whose pose, or the uncertainty of it, has changed.
 
         Raises
         ------
@@ -139,7 +139,7 @@ class SetUpInForce:
         return prepared.changed
 
     def _changed(self, site: Site) -> list[str]:
-        """Return the names of the arrays that a site with the same arrays has elsewhere, or knows differently well."""
+        """Return the names of the arrays whose pose, or the uncertainty of it, is another in this site."""
         before = {spec.name: spec for spec in self.site.processed}
         return [spec.name for spec in site.processed if _differs(before[spec.name], spec)]
 

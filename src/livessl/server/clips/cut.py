@@ -82,7 +82,7 @@ class Cut:
         return float(self.samples.shape[1] / self.sample_rate_hz)
 
     def sound(self, start_ns: int, end_ns: int) -> ArraySound:
-        """Return it for the enhancement of an event, given the span of the event's active frames in site time."""
+        """Return this cut as input of the enhancement; the times span the event's active frames, in site time."""
         begin, end = (round((at_ns - self.time_ns) / 1e9 * self.sample_rate_hz) for at_ns in (start_ns, end_ns))
         at = np.arange(len(self.known))
         before = at < begin - round(GUARD_NS / 1e9 * self.sample_rate_hz)

@@ -1,4 +1,4 @@
-"""Writes one event's clip: a file of each array, and the signal that is beamed at the event's place."""
+"""Writes one event's clip: a file of each array, and one signal enhanced by beams towards the event's position."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Recipe:
 
 
 def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
-    """Write the recordings of a clip into a folder, and return what to say of them.
+    """Write the recordings of a clip into a folder, and return their description for JSON.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def _write_array(event: Event, cut: Cut, folder: Path) -> dict[str, Any]:
 
 
 def _write_enhanced(recipe: Recipe, folder: Path) -> dict[str, Any] | None:
-    """Write the enhanced signal from the arrays of which the estimate was made; None if none of them has sound."""
+    """Write the enhanced signal from the arrays that the estimate used; None if none of them has sound."""
     event, estimate = recipe.event, recipe.event.estimate
     if estimate is None:
         return None
